@@ -17,7 +17,9 @@ class BuildWithData(build_py):
     def run(self) -> None:
         super().run()
         for name in CARRIED if not self.editable_mode else ():
-            shutil.copytree(name, Path(self.build_lib) / "skysim" / name, ignore=LEFT, dirs_exist_ok=True)
+            shutil.copytree(
+                name, Path(self.build_lib) / "skysim" / name, ignore=LEFT, dirs_exist_ok=True
+            )
 
 
 setup(cmdclass={"build_py": BuildWithData})

@@ -35,7 +35,10 @@ def table(rows: list[dict[str, Any]]) -> str:
             row["name"],
             f"{row['value']:.3g} {row['unit']}",
             str(row["peer"] or "-"),
-            *("-" if row[key] is None else f"{row[key]:.3g}" for key in ("peer_value", "ratio", "bar")),
+            *(
+                "-" if row[key] is None else f"{row[key]:.3g}"
+                for key in ("peer_value", "ratio", "bar")
+            ),
             {True: "yes", False: "no", None: "-"}[row["met"]],
         ]
         for row in rows
@@ -43,7 +46,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [list(HEADS), *cells]
     widths = [max(len(line[n]) for line in lines) for n in range(len(HEADS))]
     return "\n".join(
-        "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+        "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
     )
 
 

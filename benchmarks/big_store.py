@@ -39,20 +39,33 @@ figures:
   - {{kind: map, value: cross_arcsec_p95}}
   - {{kind: map, value: refused}}
 """
-ROWS, POINTS, FILE = 10_000_000, 10, "big.yaml"
-REPORT_S, REPORT_BYTES, EXPORT_S, EXPORT_BYTES, ROW_BYTES = 60.0, 2e9, 600.0, 1e9, 335.0
+ROWS = 10_000_000
+POINTS = 10
+FILE = "big.yaml"
+REPORT_S = 60.0
+REPORT_BYTES = 2e9
+EXPORT_S = 600.0
+EXPORT_BYTES = 1e9
+ROW_BYTES = 335.0
 
 
 def build(folder: Path, rows: int, points: int) -> None:
     """Write a study and its store as a run leaves it."""
     path = folder / FILE
-    path.write_text(STUDY.format(levels=np.linspace(5.0, 6.5, points).round(4).tolist(), replicates=rows // points))
+    path.write_text(
+        STUDY.format(
+            levels=np.linspace(5.0, 6.5, points).round(4).tolist(), replicates=rows // points
+        )
+    )
     study = loader.load(path)
     with store.writing(folder / store.STORE) as database:
         runner.prepare_store(study, database, False)
-        each, first, part = study.study.replicates, 0, 0
+        each = study.study.replicates
+        first = 0
+        part = 0
         while study.trials - first > store.PART_ROWS:
-            columns, part = drawn(first, store.PART_ROWS, each), part + 1
+            columns = drawn(first, store.PART_ROWS, each)
+            part = part + 1
             del columns["trial"]
             make_folder(database.parts_folder)
             row_parts.write_part(database.part_path(part), columns)
@@ -60,7 +73,9 @@ def build(folder: Path, rows: int, points: int) -> None:
             row = (part, store.PART_ROWS, int(columns["wrong"].sum()), *ends)
             with database.db:
                 database.db.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
-                database.db.execute("UPDATE meta SET value = ? WHERE key = 'format'", (str(store.FORMAT_OF_PARTS),))
+                database.db.execute(
+                    "UPDATE meta SET value = ? WHERE key = 'format'", (str(store.FORMAT_OF_PARTS),)
+                )
             first += store.PART_ROWS
         insert(database, drawn(first, study.trials - first, each))
         database.record_run("pool", 2, study.trials, study.trials / 830)
@@ -92,9 +107,15 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     wrong = solved & (rng.random(count) < 1e-6)
     status = np.array(["no attitude fits the lights", "solved"], dtype=object)[solved.astype(int)]
     columns |= {"status": status, "error": np.full(count, None, dtype=object)}
-    columns |= {"frames": np.ones(count, int), "solved": solved.astype(int), "wrong": wrong.astype(int)}
+    columns |= {
+        "frames": np.ones(count, int),
+        "solved": solved.astype(int),
+        "wrong": wrong.astype(int),
+    }
     columns["ambiguous"] = np.zeros(count, int)
-    columns |= {name: np.zeros(count) for name in ("misidentified", "roll_noise", "misled", "wrong_matches")}
+    columns |= {
+        name: np.zeros(count) for name in ("misidentified", "roll_noise", "misled", "wrong_matches")
+    }
     scale = np.where(wrong, 1e4, 1.0)
     for name, sigma_arcsec in (("x_arcsec", 6.0), ("y_arcsec", 6.0), ("roll_arcsec", 60.0)):
         columns[name] = np.where(solved, rng.normal(0, sigma_arcsec, count) * scale, np.nan)
@@ -112,9 +133,12 @@ def measure(rows: int = ROWS, points: int = POINTS) -> Iterator[dict[str, Any]]:
     """All results, as they come."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        path, what = folder / FILE, f"{rows:,} rows of {points} points"
+        path = folder / FILE
+        what = f"{rows:,} rows of {points} points"
         # In a process of its own: a command begins with the memory of the process that starts it.
-        builder = multiprocessing.get_context("spawn").Process(target=build, args=(folder, rows, points))
+        builder = multiprocessing.get_context("spawn").Process(
+            target=build, args=(folder, rows, points)
+        )
         builder.start()
         builder.join()
         size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -123,23 +147,37 @@ def measure(rows: int = ROWS, points: int = POINTS) -> Iterator[dict[str, Any]]:
         yield from timed("report", what, REPORT_S, REPORT_BYTES, str(path), *out)
         for suffix in ("parquet", "csv"):
             file = str(folder / f"rows.{suffix}")
-            yield from timed("export", f"{suffix}, {what}", EXPORT_S, EXPORT_BYTES, str(path), file, *out)
+            yield from timed(
+                "export", f"{suffix}, {what}", EXPORT_S, EXPORT_BYTES, str(path), file, *out
+            )
 
 
-def timed(command: str, what: str, most_s: float, most: float, *words: str) -> Iterator[dict[str, Any]]:
+def timed(
+    command: str, what: str, most_s: float, most: float, *words: str
+) -> Iterator[dict[str, Any]]:
     """Seconds, with those of CPU, and greatest memory of a command."""
     begin = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "skysim", "study", command, *words], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "skysim", "study", command, *words], stdout=subprocess.DEVNULL
+    )
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise RuntimeError(f"skysim study {command} {' '.join(words)}: status {status}")
     cpu_s = used.ru_utime + used.ru_stime
-    yield verdict(f"study {command}", time.perf_counter() - begin, "s", f"{what}; {cpu_s:.0f} s of CPU", most_s)
+    yield verdict(
+        f"study {command}",
+        time.perf_counter() - begin,
+        "s",
+        f"{what}; {cpu_s:.0f} s of CPU",
+        most_s,
+    )
     yield verdict(f"study {command}: memory", 1024 * used.ru_maxrss / 1e6, "MB", what, most / 1e6)
 
 
 if __name__ == "__main__":
     for one in measure(*map(int, sys.argv[1:])):
         load = os.getloadavg()[0]
-        text = f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
+        text = (
+            f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
+        )
         print(f"{one['name']}: {text}", flush=True)

@@ -68,11 +68,15 @@ class Case:
 CASES = (
     Case("steady LED, 2 ms", DIRECT | {"exposure.time": "2 ms"}),
     Case("steady LED, 8 ms", DIRECT | {"exposure.time": "8 ms"}),
-    Case("steady LED, 2 ms, 10 e read noise", DIRECT | {"exposure.time": "2 ms", "camera.detector.read_noise_e": "10"}),
+    Case(
+        "steady LED, 2 ms, 10 e read noise",
+        DIRECT | {"exposure.time": "2 ms", "camera.detector.read_noise_e": "10"},
+    ),
     Case("duty 0.25, 4 ms", {"exposure.time": "4 ms", "light.layout.levels": "[0.25]"}),
     Case(
         "flicker: duty 0.5 of 1.5 ms, 4 ms",
-        {"exposure.time": "4 ms", "light.layout.levels": "[0.5]", "light.led.pwm_period": "1.5 ms"} | WANDERING,
+        {"exposure.time": "4 ms", "light.layout.levels": "[0.5]", "light.led.pwm_period": "1.5 ms"}
+        | WANDERING,
         depth=0.15,
     ),
     Case(
@@ -88,7 +92,9 @@ CASES = (
 
 
 def lab_of(case: Case, depth: float) -> Lab:
-    return build_lab(loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)}))
+    return build_lab(
+        loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)})
+    )
 
 
 def measure(frames: int = FRAMES) -> list[dict[str, Any]]:
@@ -118,7 +124,9 @@ def bit_error_rate(case: Case, frames: int) -> tuple[float, float]:
     lab = lab_of(case, case.depth or float(3 / np.sqrt(np.nanmedian(full_e))))
     light, bits, full_e = read_lights(lab, frames)
     usable = np.isfinite(light).sum(axis=0) > 0.9 * frames
-    light, bits, full_e = light[:, usable], bits[:, usable], np.nanmedian(full_e[:, usable], axis=0)
+    light = light[:, usable]
+    bits = bits[:, usable]
+    full_e = np.nanmedian(full_e[:, usable], axis=0)
     levels = [np.nanmean(np.where(bits == bit, light, np.nan), axis=0) for bit in (False, True)]
     wrong = (light > np.mean(levels, axis=0)) != bits
     changes = float(np.mean(bits[1:] != bits[:-1]))
@@ -133,14 +141,21 @@ def window_noise_e2(lab: Lab) -> float:
     variance, and is interpolated between tiles, which leaves 4/9 of it on average.
     """
     frame, _ = render_at_rest(lab.camera, lab.start)
-    settings, detector = assumed_settings(lab.scene), lab.scene.camera.detector
+    settings = assumed_settings(lab.scene)
+    detector = lab.scene.camera.detector
     blobs = DETECTORS[settings.detector](
-        frame.image_dn, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, NO_PRIORS
+        frame.image_dn,
+        settings.threshold_sigma,
+        settings.min_area_px,
+        settings.max_blobs,
+        NO_PRIORS,
     )
     width, height = (blobs.box_px[:, 2:] - blobs.box_px[:, :2] + 1 + 2 * MARGIN_PX).T
     pixels = float(np.median(width * height))
     sky_share = 4 / 9 * 6 / 16 / (SAMPLE_ROWS * TILE_PX)  # of a pixel's variance
-    return pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
+    return (
+        pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
+    )
 
 
 def codes_of(lab: Lab) -> LedCodes:
@@ -155,8 +170,10 @@ def codes_of(lab: Lab) -> LedCodes:
 def read_lights(lab: Lab, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """(F, N) light of each LED in each frame, NaN where it is not detected; the bit in the middle of the exposure; and
     the expected electrons of a 1."""
-    camera, settings = calibration(lab.scene.camera), assumed_settings(lab.scene)
-    codes, rows = codes_of(lab), []
+    camera = calibration(lab.scene.camera)
+    settings = assumed_settings(lab.scene)
+    codes = codes_of(lab)
+    rows = []
     for number in range(frames):
         frame, truth = render_at_rest(lab.camera, lab.start, number)
         centroids = detect_and_centroid(frame.image_dn, camera, settings, Clock())
@@ -170,7 +187,11 @@ def read_lights(lab: Lab, frames: int) -> tuple[Floats, NDArray[np.bool_], Float
         level = codes.mean_level(window.open_s, window.exposure_s, number)
         full_e[row] = truth.sources.electrons / level[row]
         middle_s = window.open_s + window.exposure_s / 2
-        bit = number if codes.clock is None else int(codes.time_s(middle_s) // float(codes.config.bit_time_s))
+        bit = (
+            number
+            if codes.clock is None
+            else int(codes.time_s(middle_s) // float(codes.config.bit_time_s))
+        )
         rows.append((light, codes.words[:, bit % codes.words.shape[1]] > 0, full_e))
     light, bits, full_e = (np.array(one) for one in zip(*rows, strict=True))
     return light, bits, full_e
@@ -184,17 +205,23 @@ def theory(lab: Lab, full_e: Floats, noise_e2: float, changes: float) -> float:
     changes  : part of the successive bits that differ
     """
     assert isinstance(lab.scene.light, DomeConfig)
-    exposure_s, code = lab.scene.exposure.time_s, codes_of(lab).config
-    period_s, on_s = float(lab.camera.sources.period_s[0]), float(lab.camera.sources.on_s[0])
+    exposure_s = lab.scene.exposure.time_s
+    code = codes_of(lab).config
+    period_s = float(lab.camera.sources.period_s[0])
+    on_s = float(lab.camera.sources.on_s[0])
     phase_s = (np.arange(400) + 0.5) / 400 * period_s
-    lit_s = np.array([lit_moments_s(0.0, exposure_s, period_s, start_s, on_s)[0] for start_s in phase_s])
+    lit_s = np.array(
+        [lit_moments_s(0.0, exposure_s, period_s, start_s, on_s)[0] for start_s in phase_s]
+    )
     light_e = (full_e[:, None] * lit_s / np.median(lit_s))[..., None]
     middle_e = full_e[:, None, None] * (1 - code.depth / 2)
 
     def fails(part: Floats) -> float:
         """Mean failure where a part of the time shows the other bit."""
-        one, zero = light_e * (1 - code.depth * part), light_e * (1 - code.depth * (1 - part))
-        below, above = (middle_e - one) / np.sqrt(one + noise_e2), (zero - middle_e) / np.sqrt(zero + noise_e2)
+        one = light_e * (1 - code.depth * part)
+        zero = light_e * (1 - code.depth * (1 - part))
+        below = (middle_e - one) / np.sqrt(one + noise_e2)
+        above = (zero - middle_e) / np.sqrt(zero + noise_e2)
         return float(np.mean([ndtr(below), ndtr(above)]))
 
     if code.bit_time_s == "frame":

@@ -36,7 +36,8 @@ from skysim.tracking import factory
 Ints = NDArray[np.int64]
 
 SCENE = "coded_spiral"
-ATTITUDES, RENDERED = 10_000, 50
+ATTITUDES = 10_000
+RENDERED = 50
 RATES_DEG_S = (0.0, 5.0)
 BORDER_PX = 12.0  # half of an LED's image, which the tracker drops where the border cuts it off
 
@@ -66,16 +67,23 @@ class Bench:
         self.lab = build_lab(loader.load(SCENE, settings or {}))
         tracker = build_tracker(self.lab.camera)
         assert isinstance(tracker, CodedTracker)
-        self.tracker, self.noise = tracker, Noise()
+        self.tracker = tracker
+        self.noise = Noise()
 
-    def sequence(self, rate_deg_s: float, seed: int, frames: int | None = None, all_frames: bool = False) -> Sequence:
+    def sequence(
+        self, rate_deg_s: float, seed: int, frames: int | None = None, all_frames: bool = False
+    ) -> Sequence:
         """Follow the lights over a code's length of frames from a random attitude; ends with the first attitude."""
-        rng, frame_s = random_stream(seed), 1 / self.lab.scene.exposure.rate_hz
-        lab, start = self.lab.in_run(seed), attitude(rng)
+        rng = random_stream(seed)
+        frame_s = 1 / self.lab.scene.exposure.rate_hz
+        lab = self.lab.in_run(seed)
+        start = attitude(rng)
         axis = rng.standard_normal(3)
         turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
         begin = int(rng.integers(0, 1000))
-        first, wrong, fewest = 0, False, 99
+        first = 0
+        wrong = False
+        fewest = 99
         self.tracker.last_s = None
         for n in range(frames or self.tracker.code.bits):
             body_from_lab = Rotation.from_rotvec(turn_rad_s * n * frame_s) * start
@@ -96,15 +104,20 @@ class Bench:
 
     def rendered(self, rate_deg_s: float, seed: int, frames: int) -> Sequence:
         """As `sequence`, in rendered frames, of which all are solved."""
-        rng, scene = random_stream(seed), self.lab.scene
-        start, axis, begin = attitude(rng), rng.standard_normal(3), int(rng.integers(0, 1000))
+        rng = random_stream(seed)
+        scene = self.lab.scene
+        start = attitude(rng)
+        axis = rng.standard_normal(3)
+        begin = int(rng.integers(0, 1000))
         turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
         last = begin + frames
         t_s = np.array([exposure_window(scene, n).open_s - MARGIN_S for n in (begin, last)])
         body_from_lab = Rotation.from_rotvec(turn_rad_s * (t_s - t_s[0])[:, None]) * start
         trajectory = Trajectory(t_s, body_from_lab.inv(), np.tile(-turn_rad_s, (2, 1)))
         camera = self.lab.in_run(seed).camera
-        first, wrong, fewest = 0, False, 99
+        first = 0
+        wrong = False
+        fewest = 99
         self.tracker.last_s = None
         for n in range(begin, last):
             frame, truth = render_frame(camera, trajectory, n)
@@ -112,15 +125,21 @@ class Bench:
             fewest = min(fewest, len(report.centroids))
             if report.attitude.solved:
                 first = first or n - begin + 1
-                apart = np.linalg.norm(report.centroids.xy_px[:, None] - truth.sources.flux_xy_px, axis=2)
-                wrong |= is_wrong(report.attitude, truth.cam_from_lab, truth.sources.id[apart.argmin(axis=1)])
+                apart = np.linalg.norm(
+                    report.centroids.xy_px[:, None] - truth.sources.flux_xy_px, axis=2
+                )
+                wrong |= is_wrong(
+                    report.attitude, truth.cam_from_lab, truth.sources.id[apart.argmin(axis=1)]
+                )
         return Sequence(first, wrong, fewest)
 
     def centroids(
         self, lab: Lab, body_from_lab: Rotation, frame: int, rng: np.random.Generator
     ) -> tuple[Centroids, Ints]:
         """The lights of a frame, brightest first, and the LED of each."""
-        sources, scene, camera = lab.camera.sources, lab.scene, self.tracker.camera
+        sources = lab.camera.sources
+        scene = lab.scene
+        camera = self.tracker.camera
         xy_px = project(body_from_lab, sources.place[:, :3], self.tracker.lever, camera)
         seen = np.flatnonzero(camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX))
         dome = lab.camera.known
@@ -128,8 +147,12 @@ class Bench:
         codes = dome.timing(lab.camera.run_seed).codes
         assert codes is not None
         middle_s = frame / scene.exposure.rate_hz
-        shown = codes.shown(sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame)
-        offset_m = sources.place[seen, :3] - body_from_lab.inv().apply(self.tracker.lever.camera_body_m)
+        shown = codes.shown(
+            sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame
+        )
+        offset_m = sources.place[seen, :3] - body_from_lab.inv().apply(
+            self.tracker.lever.camera_body_m
+        )
         distance_m = np.linalg.norm(offset_m, axis=1)
         cos_out = -np.sum(offset_m * sources.normal[seen], axis=1) / distance_m
         cos_in = self.tracker.camera.rays(xy_px[seen])[:, 2]
@@ -154,8 +177,12 @@ def is_wrong(solved: Attitude, cam_from_lab: Rotation, name: Ints) -> bool:
     assert solved.match is not None
     assert solved.covariance_rad2 is not None
     error_rad = float((solved.cam_from_ref * cam_from_lab.inv()).magnitude())
-    nees = metrics.normalized_error_squared(solved.cam_from_ref, cam_from_lab, solved.covariance_rad2)
-    return metrics.is_wrong(error_rad, nees) or bool(np.any(name[solved.match.observed] != solved.match.star))
+    nees = metrics.normalized_error_squared(
+        solved.cam_from_ref, cam_from_lab, solved.covariance_rad2
+    )
+    return metrics.is_wrong(error_rad, nees) or bool(
+        np.any(name[solved.match.observed] != solved.match.star)
+    )
 
 
 # Other codes than the scene's, failing bits, and clocks of their own: a bit of 20 ms is one frame.
@@ -178,7 +205,9 @@ def measure(
     attitudes: int = ATTITUDES, rendered: int = RENDERED, variants: int = ATTITUDES // 20
 ) -> list[dict[str, Any]]:
     """All rows; bit errors against theory in benchmarks/bit_errors.py."""
-    rows = identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
+    rows = (
+        identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
+    )
     for name, settings in VARIANTS.items():
         rows += identified("centroids", variants, name, settings)
     return rows
@@ -188,7 +217,8 @@ def identified(
     kind: str, attitudes: int, variant: str = "", settings: dict[str, str] | None = None
 ) -> list[dict[str, Any]]:
     """Attitudes found within the code's length of frames, and wrong ones, at rest and turning."""
-    bench, rows = Bench(settings), list[dict[str, Any]]()
+    bench = Bench(settings)
+    rows = list[dict[str, Any]]()
     one = bench.rendered if kind == "rendered" else bench.sequence
     for rate_deg_s in RATES_DEG_S:
         bits = min(bench.tracker.code.bits, MOST_FRAMES)
@@ -197,7 +227,14 @@ def identified(
         name = f"spiral of 400, {variant or kind}, {rate_deg_s:g} deg/s"
         wrong = sum(result.wrong for result in results)
         rows += [
-            verdict(f"{name}: attitude within {bits} frames", found, "%", f"{attitudes} attitudes", 99.9, least=True),
+            verdict(
+                f"{name}: attitude within {bits} frames",
+                found,
+                "%",
+                f"{attitudes} attitudes",
+                99.9,
+                least=True,
+            ),
             verdict(f"{name}: wrong", wrong, "attitudes", f"{attitudes} attitudes", 0),
         ]
     return rows

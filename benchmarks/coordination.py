@@ -24,7 +24,12 @@ from skysim.experiments.study.execution.outcomes import FIELDS, Outcome
 from skysim.experiments.study.execution.trials import Row, Segment
 
 WORKERS = 64
-SOLVED = Outcome("solved", 1, 1, **{name: 1 / (3 + n) for n, name in enumerate(FIELDS[4:]) if name != "ambiguous"})
+SOLVED = Outcome(
+    "solved",
+    1,
+    1,
+    **{name: 1 / (3 + n) for n, name in enumerate(FIELDS[4:]) if name != "ambiguous"},
+)
 LENGTHS_S = (1.0, 0.3, 0.1, 0.03, 0.01)
 RUN_S = 4.0  # of one measurement, at least
 STUDY = """
@@ -58,7 +63,17 @@ class TimedJob:
 def row_of(segment: Segment, n: int) -> Row:
     """The row of a solved trial, with a number in every column."""
     number = segment.first + n
-    return Row(number, segment.point, segment.replicates[n], 2**62 - number, "0" * 16, "0" * 16, SOLVED, None, 0.0)
+    return Row(
+        number,
+        segment.point,
+        segment.replicates[n],
+        2**62 - number,
+        "0" * 16,
+        "0" * 16,
+        SOLVED,
+        None,
+        0.0,
+    )
 
 
 class ThreadPool(engines.Pool):
@@ -74,7 +89,8 @@ class SingleTrials:
     """Chunks of one trial each, however short it is. begin_s : when the first was asked for"""
 
     def __init__(self, chunks: Chunks) -> None:
-        self.chunks, self.begin_s = chunks, 0.0
+        self.chunks = chunks
+        self.begin_s = 0.0
 
     def next(self) -> Chunk:
         """See `engines.Chunks`."""
@@ -89,14 +105,20 @@ class Coordinated:
     """An engine that runs a TimedJob in the place of trials, and takes the time from the first to the last."""
 
     def __init__(self, engine: Engine, seconds: float) -> None:
-        self.engine, self.job = engine, TimedJob(seconds)
-        self.name, self.workers, self.seconds, self.cpu_s = engine.name, engine.workers, 0.0, 0.0
+        self.engine = engine
+        self.job = TimedJob(seconds)
+        self.name = engine.name
+        self.workers = engine.workers
+        self.seconds = 0.0
+        self.cpu_s = 0.0
 
     def run(self, job: Job, chunks: Chunks) -> Iterator[list[Row]]:
         """See `engines.Engine`."""
-        single, begin_cpu_s = SingleTrials(chunks), time.process_time()
+        single = SingleTrials(chunks)
+        begin_cpu_s = time.process_time()
         yield from self.engine.run(self.job, single)
-        self.seconds, self.cpu_s = time.perf_counter() - single.begin_s, time.process_time() - begin_cpu_s
+        self.seconds = time.perf_counter() - single.begin_s
+        self.cpu_s = time.process_time() - begin_cpu_s
 
     def close(self) -> None:
         """See `engines.Engine`."""
@@ -132,7 +154,10 @@ def storing(rows: int = 20_000, block: int = 1000) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.sqlite"
         with store.writing(path) as database:
-            segments = [Segment(0, {}, first, range(first, first + block)) for first in range(0, rows, block)]
+            segments = [
+                Segment(0, {}, first, range(first, first + block))
+                for first in range(0, rows, block)
+            ]
             blocks = [TimedJob(0.0).run((segment,)) for segment in segments]
             begin = time.process_time()
             for one in blocks:
@@ -186,13 +211,20 @@ def measure() -> list[dict[str, Any]]:
     rows = storing()
     for name in ENGINES:
         found = curve(name)
-        told = ", ".join(f"{one.hertz:.0f}/s of {WORKERS / seconds:.0f}/s" for seconds, one in found)
-        hertz, cpu_ms = max(one.hertz for _, one in found), min(one.cpu_ms for _, one in found)
-        rows.append(verdict(f"{name}: chunks a second, {WORKERS} workers", hertz, "/s", told, 2000.0, True))
+        told = ", ".join(
+            f"{one.hertz:.0f}/s of {WORKERS / seconds:.0f}/s" for seconds, one in found
+        )
+        hertz = max(one.hertz for _, one in found)
+        cpu_ms = min(one.cpu_ms for _, one in found)
+        rows.append(
+            verdict(f"{name}: chunks a second, {WORKERS} workers", hertz, "/s", told, 2000.0, True)
+        )
         rows.append(verdict(f"{name}: CPU of coordination", cpu_ms, "ms", "a chunk", 0.5))
     return rows
 
 
 if __name__ == "__main__":
     for one in measure():
-        print(f"{one['name']}: {one['value']:.3g} {one['unit']} (bar {one['bar']:g}); {one['peer']}")
+        print(
+            f"{one['name']}: {one['value']:.3g} {one['unit']} (bar {one['bar']:g}); {one['peer']}"
+        )

@@ -19,8 +19,16 @@ from skysim.core.types import Floats
 from skysim.experiments.dataset import plan, run
 from skysim.experiments.dataset.storage import Storage
 
-FRAMES, REPEATS = 32, 3
-SEEN = ((512, 512, 6.0), (512, 512, 8.0), (1024, 1024, 5.0), (1024, 1024, 7.0), (1024, 1024, 8.0), (1600, 1200, 7.0))
+FRAMES = 32
+REPEATS = 3
+SEEN = (
+    (512, 512, 6.0),
+    (512, 512, 8.0),
+    (1024, 1024, 5.0),
+    (1024, 1024, 7.0),
+    (1024, 1024, 8.0),
+    (1600, 1200, 7.0),
+)
 UNSEEN = ((800, 600, 7.5), (1280, 960, 6.5), (1400, 1400, 8.0))
 
 
@@ -41,10 +49,17 @@ class Cost(NamedTuple):
 
 def measure(width_px: int, height_px: int, limit_mag: float) -> Cost:
     """CPU seconds, bytes and sources a frame, written to a local folder by one process."""
-    keys = {"camera.width_px": f"{width_px}", "camera.height_px": f"{height_px}", "light.limit_mag": f"{limit_mag}"}
-    made = plan.load("shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES)
+    keys = {
+        "camera.width_px": f"{width_px}",
+        "camera.height_px": f"{height_px}",
+        "light.limit_mag": f"{limit_mag}",
+    }
+    made = plan.load(
+        "shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES
+    )
     with tempfile.TemporaryDirectory() as folder:
-        storage, spent = Storage(f"{folder}/frames"), []
+        storage = Storage(f"{folder}/frames")
+        spent = []
         run.prepare(made, storage)
         for shard in range(REPEATS + 1):
             begin = time.process_time()
@@ -71,10 +86,14 @@ def main() -> None:
         print(f"{name.strip('_')} a frame = {a:.4g} + {b:.4g} Mpx + {c:.4g} sources")
     for what, costs in (("seen", seen), ("unseen", [measure(*one) for one in UNSEEN])):
         for one in costs:
-            errors = [model @ one.terms() / getattr(one, name) - 1 for name, model in models.items()]
+            errors = [
+                model @ one.terms() / getattr(one, name) - 1 for name, model in models.items()
+            ]
             size = f"{one.width_px}x{one.height_px}, V {one.limit_mag}"
             cost = f"{1e3 * one.seconds:.2f} ms, {one.bytes_ / 1e6:.3f} MB"
-            print(f"{what:7s}{size:20s}{one.sources:6.0f} sources  {cost}; errors {errors[0]:+.1%}, {errors[1]:+.1%}")
+            print(
+                f"{what:7s}{size:20s}{one.sources:6.0f} sources  {cost}; errors {errors[0]:+.1%}, {errors[1]:+.1%}"
+            )
 
 
 if __name__ == "__main__":

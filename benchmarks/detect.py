@@ -15,7 +15,10 @@ from estimator.centroiding.centroid import CENTROIDERS, gaussian_fit
 from estimator.core.types import Centroids
 from estimator.detection.detect import default, maximum, sequential
 
-SIGMA_PX, FLUX_E, SKY_E, NOISE_E = 0.7, 1e4, 100.0, 15.0
+SIGMA_PX = 0.7
+FLUX_E = 1e4
+SKY_E = 100.0
+NOISE_E = 15.0
 PIXEL_NOISE_E = float(np.hypot(NOISE_E, np.sqrt(SKY_E)))
 SIZES = {"1600x1200, 30 stars": (1200, 1600, 30), "659x493, 15 stars": (493, 659, 15)}
 BAR_MS = {"1600x1200, 30 stars": 1.5, "659x493, 15 stars": 0.4}
@@ -34,7 +37,11 @@ def measure() -> list[dict[str, Any]]:
         for peer_name, peer in peers(image).items():
             results.append(versus(f"detect + centroid, {name}", ours, peer_name, peer, bar=1.0))
         own = min(row["value"] for row in results if name in row["name"])
-        results.append(verdict(f"detect + centroid, {name}: time", own, "ms", "the bar of a frame", BAR_MS[name]))
+        results.append(
+            verdict(
+                f"detect + centroid, {name}: time", own, "ms", "the bar of a frame", BAR_MS[name]
+            )
+        )
     image, _ = frame(np.random.default_rng(2), 493, 659, 15)
     results.append(
         versus(
@@ -56,9 +63,15 @@ def precision() -> list[dict[str, Any]]:
         image, places = frame(np.random.default_rng(100 + seed), 1200, 1600, 30)
         blobs = default(image)
         for name in errors:
-            found = scipy_way(image) if name == "scipy.ndimage" else CENTROIDERS[name](image, blobs).xy_px
+            found = (
+                scipy_way(image)
+                if name == "scipy.ndimage"
+                else CENTROIDERS[name](image, blobs).xy_px
+            )
             separation = np.linalg.norm(found[None] - places[:, None], axis=2)
-            errors[name].append((found[separation.argmin(axis=1)] - places)[separation.min(axis=1) < 1])
+            errors[name].append(
+                (found[separation.argmin(axis=1)] - places)[separation.min(axis=1) < 1]
+            )
     bound = cramer_rao_px()
     results = []
     for name, error in errors.items():
@@ -68,7 +81,9 @@ def precision() -> list[dict[str, Any]]:
     return results
 
 
-def frame(rng: np.random.Generator, height: int, width: int, stars: int) -> tuple[NDArray[np.uint16], Floats]:
+def frame(
+    rng: np.random.Generator, height: int, width: int, stars: int
+) -> tuple[NDArray[np.uint16], Floats]:
     """A frame of pixel-integrated Gaussian stars, at least 30 px apart, with photon and read noise; true positions."""
     places = np.empty((0, 2))
     while len(places) < stars:
@@ -77,7 +92,8 @@ def frame(rng: np.random.Generator, height: int, width: int, stars: int) -> tupl
             places = np.vstack([places, place])
     light = np.full((height, width), SKY_E)
     for x, y in places:
-        left, top = round(x) - 8, round(y) - 8
+        left = round(x) - 8
+        top = round(y) - 8
         across, down = (
             np.diff(erf((np.arange(18) - 0.5 + first - at) / (SIGMA_PX * 2**0.5))) / 2
             for first, at in ((left, x), (top, y))
@@ -93,7 +109,8 @@ def cramer_rao_px() -> float:
     It is the square root of the diagonal of the inverse Fisher matrix sum_k g_k g_k^T / var_k, where g_k is the
     gradient of pixel k with respect to x, y and flux, and var_k its photon and background noise.
     """
-    edges, step = np.arange(18) - 8.5, 1e-4
+    edges = np.arange(18) - 8.5
+    step = 1e-4
 
     def model(x: float, y: float) -> Floats:
         across, down = (np.diff(erf((edges - at) / (SIGMA_PX * 2**0.5))) / 2 for at in (x, y))
@@ -124,7 +141,11 @@ def scipy_way(image: NDArray) -> Floats:
 
 def peers(image: NDArray) -> dict[str, Callable[[], Any] | None]:
     """Functions of the peers for the same frame; None for those not installed."""
-    return {"scipy.ndimage": lambda: scipy_way(image), "cv2": cv2_way(image), "sep winpos": sep_way(image)}
+    return {
+        "scipy.ndimage": lambda: scipy_way(image),
+        "cv2": cv2_way(image),
+        "sep winpos": sep_way(image),
+    }
 
 
 def cv2_way(image: NDArray) -> Callable[[], Any] | None:

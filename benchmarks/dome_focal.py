@@ -25,9 +25,16 @@ from skysim.simulation.lab import build_lab
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
-NOISE_PX, FRAMES_A_MAP = 0.2, 2
+NOISE_PX = 0.2
+FRAMES_A_MAP = 2
 # (identifier, whether the tracker knows that its focal length is uncertain)
-IDENTIFIERS = ("led_pairs", False), ("led_pairs", True), ("pyramid", False), ("saa", False), ("non_dimensional", False)
+IDENTIFIERS = (
+    ("led_pairs", False),
+    ("led_pairs", True),
+    ("pyramid", False),
+    ("saa", False),
+    ("non_dimensional", False),
+)
 
 
 @dataclass(frozen=True)
@@ -108,16 +115,23 @@ def errors(frame: Frame, answer: Attitude, lens: Camera) -> tuple[float, float, 
     assert answer.camera is not None
     error = (answer.cam_from_ref * frame.cam_from_lab.inv()).as_rotvec()
     nees = float(error @ np.linalg.solve(answer.covariance_rad2, error))
-    return nees, float(np.degrees(np.linalg.norm(error))), answer.camera.focal_px / lens.focal_px - 1
+    return (
+        nees,
+        float(np.degrees(np.linalg.norm(error))),
+        answer.camera.focal_px / lens.focal_px - 1,
+    )
 
 
 def measure(case: Case, identifier: str, knows: bool, trials: int, seed: int) -> str:
     """One table cell: found %, number of wrong ones; then mean NEES, rms errors of attitude and focal length."""
     lab = build_lab(loader.load("afit_simsat"))
-    surface, lens = build_surface(lab.scene.light.surface), calibration(lab.scene.camera).zoomed(case.zoom)
+    surface = build_surface(lab.scene.light.surface)
+    lens = calibration(lab.scene.camera).zoomed(case.zoom)
     lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     settings = replace(SETTINGS, identifier=identifier, centroid_sigma_px=NOISE_PX)
-    outcomes, right, tracker = [], [], None
+    outcomes = []
+    right = []
+    tracker = None
     for frame in frames(case, surface, lens, lever, trials, np.random.default_rng(seed)):
         camera = replace(frame.camera, focal_sigma=case.focal / np.sqrt(3) if knows else 0.0)
         if tracker is None or tracker.leds is not frame.leds:
@@ -138,7 +152,10 @@ if __name__ == "__main__":
     trials, seed = (int(one) for one in (sys.argv[1:] + ["1000", "1"][len(sys.argv) - 1 :]))
     for case in CASES:
         count = max(int(case.share * trials), 10)
-        print(f"{case}: {count} frames; found %, wrong, NEES, attitude rms deg, focal rms %", flush=True)
+        print(
+            f"{case}: {count} frames; found %, wrong, NEES, attitude rms deg, focal rms %",
+            flush=True,
+        )
         for identifier, knows in IDENTIFIERS:
             share = 1 if identifier == "non_dimensional" else 10
             cell = measure(case, identifier, knows, max(count // share, 10), seed)

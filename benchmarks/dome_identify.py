@@ -25,7 +25,9 @@ from skysim.sources.dome.placement import optimize
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
-COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0
+COUNT = 1400
+CAP_DEG = 40.0
+TILT_DEG = 30.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,9 @@ def leds_m(places: str, count: int, surface: Surface, rng: np.random.Generator) 
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
     thinned = darts_m[optimize.thin(darts_m, np.sqrt(0.6 * area_m2 / count))]
-    return thinned[:count] if len(thinned) < count else thinned[rng.permutation(len(thinned))[:count]]
+    return (
+        thinned[:count] if len(thinned) < count else thinned[rng.permutation(len(thinned))[:count]]
+    )
 
 
 def attitude(rng: np.random.Generator) -> Rotation:
@@ -91,9 +95,12 @@ def trial(
     seen = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9), 12))
     seen = seen[rng.random(len(seen)) >= case.dead]
     false = rng.random((case.false, 2)) * [camera.width_px, camera.height_px]
-    detections_px = np.concatenate([xy[seen] + case.noise_px * rng.standard_normal((len(seen), 2)), false])
+    detections_px = np.concatenate(
+        [xy[seen] + case.noise_px * rng.standard_normal((len(seen), 2)), false]
+    )
     order = rng.permutation(len(detections_px))
-    detections_px, name = detections_px[order], np.concatenate([seen, np.full(case.false, -1)])[order]
+    detections_px = detections_px[order]
+    name = np.concatenate([seen, np.full(case.false, -1)])[order]
     sigma = np.full(len(detections_px), case.noise_px / camera.focal_px)
     begin = time.perf_counter()
     match = search.identify(camera.rays(detections_px), sigma, dome)
@@ -115,14 +122,18 @@ def measure(case: Case, trials: int, seed: int) -> str:
     camera = calibration(lab.scene.camera)
     lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     assumed_m = truth_m + case.assumed_m * rng.standard_normal(truth_m.shape)
-    leds = LedMap(np.arange(len(truth_m)), assumed_m, np.zeros(3), np.ones(3), sigma_m=case.assumed_m)
+    leds = LedMap(
+        np.arange(len(truth_m)), assumed_m, np.zeros(3), np.ones(3), sigma_m=case.assumed_m
+    )
     dome = build_dome_index(leds, lever, camera)
     trial(case, truth_m, lever, camera, dome, rng)
     results = [trial(case, truth_m, lever, camera, dome, rng) for _ in range(trials)]
     outcomes = np.array([outcome.split(":")[0] for outcome, _, _ in results])
     ms = 1e3 * np.array([elapsed_s for _, elapsed_s, _ in results])
     counts = [n for _, _, n in results]
-    percent = {name: 100 * np.mean(outcomes == name) for name in ("identified", "WRONG", "ambiguous")}
+    percent = {
+        name: 100 * np.mean(outcomes == name) for name in ("identified", "WRONG", "ambiguous")
+    }
     return (
         f"{case.name:26s} {len(truth_m):5d} {np.mean(counts):6.1f} {min(counts):4d}"
         f" {percent['identified']:9.2f} {int(np.sum(outcomes == 'WRONG')):6d} {percent['ambiguous']:9.2f}"

@@ -68,7 +68,9 @@ TRANSFORMS = {"projective": Transform(5, 4), "affine": Transform(4, 3)}
 
 def determinant(rays: Floats, i: int, j: int, k: int) -> Floats:
     """(...,) determinant of rays i, j and k of (..., L, 3)."""
-    return np.asarray(np.einsum("...a,...a->...", rays[..., i, :], np.cross(rays[..., j, :], rays[..., k, :])))
+    return np.asarray(
+        np.einsum("...a,...a->...", rays[..., i, :], np.cross(rays[..., j, :], rays[..., k, :]))
+    )
 
 
 def invariants(rays: Floats, name: str) -> Floats:
@@ -81,7 +83,9 @@ def invariants(rays: Floats, name: str) -> Floats:
         if name == "affine":
             return np.stack([det(1, 2, 4) / det(1, 2, 3), det(1, 3, 4) / det(1, 2, 3)], axis=-1)
         first = det(4, 3, 1) * det(5, 2, 1) / (det(4, 2, 1) * det(5, 3, 1))
-        return np.stack([first, det(4, 2, 1) * det(5, 3, 2) / (det(4, 3, 2) * det(5, 2, 1))], axis=-1)
+        return np.stack(
+            [first, det(4, 2, 1) * det(5, 3, 2) / (det(4, 3, 2) * det(5, 2, 1))], axis=-1
+        )
 
 
 class Bench:
@@ -89,10 +93,13 @@ class Bench:
 
     def __init__(self, leds: int, zoom: float, map_m: float, seed: int) -> None:
         lab = build_lab(loader.load("afit_simsat"))
-        self.rng, self.map_m = np.random.default_rng(seed), map_m
+        self.rng = np.random.default_rng(seed)
+        self.map_m = map_m
         self.lens: Camera = calibration(lab.scene.camera).zoomed(zoom)
         self.lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
-        self.place_m = leds_m("poisson_disk", leds, build_surface(lab.scene.light.surface), self.rng)
+        self.place_m = leds_m(
+            "poisson_disk", leds, build_surface(lab.scene.light.surface), self.rng
+        )
 
     def field(self) -> tuple[Floats, Floats, Ints, Rotation]:
         """(K, 2) true pixels of the LEDs in a random field, (K, 2) those if the pupil is where another attitude has it
@@ -105,11 +112,18 @@ class Bench:
         x, y = half_rad * self.rng.uniform(-1, 1, 2)
         other = Rotation.from_rotvec([x, y, 0.0]) * body_from_lab
         in_other = other.apply(self.place_m[seen]) - self.lever.camera_body_m
-        return xy[seen], self.lens.pixels(self.lever.cam_from_body.apply(in_other)), seen, body_from_lab
+        return (
+            xy[seen],
+            self.lens.pixels(self.lever.cam_from_body.apply(in_other)),
+            seen,
+            body_from_lab,
+        )
 
     def sigma_px(self, noise_px: float) -> float:
         """Error of a light against the map, pixels."""
-        range_m = float(np.linalg.norm(self.place_m, axis=1).mean()) - float(np.linalg.norm(self.lever.camera_body_m))
+        range_m = float(np.linalg.norm(self.place_m, axis=1).mean()) - float(
+            np.linalg.norm(self.lever.camera_body_m)
+        )
         return float(np.hypot(noise_px, self.map_m / range_m * self.lens.focal_px))
 
 
@@ -123,7 +137,8 @@ def group_bits(
     bench: Bench, name: str, xy: Floats, other: Floats, sigma_px: float, pool: Floats
 ) -> tuple[float, float]:
     """log2 of all groups over those that agree by chance with the lights' best group: with the pupil known, and not."""
-    count, rng = TRANSFORMS[name].lights, bench.rng
+    count = TRANSFORMS[name].lights
+    rng = bench.rng
     best = [0.0, 0.0]
     for _ in range(6):
         row = rng.choice(len(xy), count, replace=False)
@@ -142,7 +157,8 @@ def group_bits(
 
 def evidence_dex(bench: Bench, name: str, xy: Floats, sigma_px: float, hypotheses: float) -> float:
     """Power of ten of the match of all lights, by the fit to the lights that spread most, less the hypotheses tried."""
-    family, lens = TRANSFORMS[name], bench.lens
+    family = TRANSFORMS[name]
+    lens = bench.lens
     density = len(xy) / (lens.width_px * lens.height_px)
     x = homogeneous(xy, lens)
     best = -np.inf
@@ -157,16 +173,21 @@ def evidence_dex(bench: Bench, name: str, xy: Floats, sigma_px: float, hypothese
     return best - log10(hypotheses)
 
 
-def bounds_deg(bench: Bench, body_from_lab: Rotation, seen: Ints, sigma_px: float) -> tuple[float, float]:
+def bounds_deg(
+    bench: Bench, body_from_lab: Rotation, seen: Ints, sigma_px: float
+) -> tuple[float, float]:
     """Cross-boresight bound, deg, of a match with the focal length unknown, and with the whole calibration unknown."""
-    lens, place_m, steps = bench.lens, bench.place_m[seen], np.full(8, 1e-6)
+    lens = bench.lens
+    place_m = bench.place_m[seen]
+    steps = np.full(8, 1e-6)
 
     def image(unknown: Floats) -> Floats:
         turned = Rotation.from_rotvec(unknown[:3]) * body_from_lab
         rays = bench.lever.cam_from_body.apply(turned.apply(place_m) - bench.lever.camera_body_m)
         x, y = (rays[:, :2] / rays[:, 2:]).T
         scale, aspect, skew, *center = unknown[3:]
-        u, v = (1 + scale) * x + skew * y + center[0], (1 + scale + aspect) * y + center[1]
+        u = (1 + scale) * x + skew * y + center[0]
+        v = (1 + scale + aspect) * y + center[1]
         return np.asarray(lens.focal_px * np.concatenate([u, v]))
 
     slopes = np.array([(image(step) - image(-step)) / (2 * 1e-6) for step in np.diag(steps)]).T
@@ -174,7 +195,9 @@ def bounds_deg(bench: Bench, body_from_lab: Rotation, seen: Ints, sigma_px: floa
     sigmas = []
     for known in (slopes[:, :4], slopes):
         covariance = sigma_px**2 * np.linalg.pinv(known.T @ known, rcond=1e-15)
-        sigmas.append(float(np.degrees(np.sqrt(np.trace(covariance[:3, :3][np.ix_(across, across)]) / 2))))
+        sigmas.append(
+            float(np.degrees(np.sqrt(np.trace(covariance[:3, :3][np.ix_(across, across)]) / 2)))
+        )
     return sigmas[0], sigmas[1]
 
 
@@ -209,7 +232,10 @@ def measure(leds: int, zoom: float, map_m: float, noise_px: float, fields: int, 
     """Print a row for each family of transforms."""
     for name, family in TRANSFORMS.items():
         bench = Bench(leds, zoom, map_m, seed)
-        sigma_px, pool, rows, parallax = bench.sigma_px(noise_px), pool_of(bench, name), [], []
+        sigma_px = bench.sigma_px(noise_px)
+        pool = pool_of(bench, name)
+        rows = []
+        parallax = []
         for _ in range(fields):
             xy, other, seen, body_from_lab = bench.field()
             if len(xy) <= family.lights:
@@ -217,7 +243,12 @@ def measure(leds: int, zoom: float, map_m: float, noise_px: float, fields: int, 
                 continue
             # Groups of LEDs that share a field: each LED with its neighbors in it, in all orders.
             sets = leds / family.lights * comb(len(xy) - 1, family.lights - 1)
-            bases = leds / family.fixed_by * comb(len(xy) - 1, family.fixed_by - 1) * factorial(family.fixed_by)
+            bases = (
+                leds
+                / family.fixed_by
+                * comb(len(xy) - 1, family.fixed_by - 1)
+                * factorial(family.fixed_by)
+            )
             bits = group_bits(bench, name, xy, other, sigma_px, pool)
             shift_px = float(np.sqrt(np.mean(residual(name, xy, other, bench.lens) ** 2)))
             dex = evidence_dex(bench, name, xy, float(np.hypot(sigma_px, shift_px)), bases)
@@ -238,11 +269,14 @@ def measure(leds: int, zoom: float, map_m: float, noise_px: float, fields: int, 
 
 def residual(name: str, xy: Floats, other: Floats, lens: Camera) -> Floats:
     """(K, 2) residual, pixels, of the best transform of the other image of the lights to this one."""
-    x, y = homogeneous(other, lens), homogeneous(xy, lens)
+    x = homogeneous(other, lens)
+    y = homogeneous(xy, lens)
     if name == "affine":
         return np.asarray((x @ np.linalg.lstsq(x, y, rcond=None)[0] - y)[:, :2] * lens.focal_px)
     zero = np.zeros_like(x)
-    rows = np.concatenate([np.hstack([x, zero, -y[:, :1] * x]), np.hstack([zero, x, -y[:, 1:2] * x])])
+    rows = np.concatenate(
+        [np.hstack([x, zero, -y[:, :1] * x]), np.hstack([zero, x, -y[:, 1:2] * x])]
+    )
     matrix = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     image = x @ matrix.T
     return np.asarray((image[:, :2] / image[:, 2:] - y[:, :2]) * lens.focal_px)

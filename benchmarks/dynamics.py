@@ -37,7 +37,9 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
     """The simulation of `skysim run` without control, against bare mj_step."""
     overrides = {f"vehicle.{key}": part for key, part in more.items()}
     overrides |= {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
-    lab = build_lab(loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"}))
+    lab = build_lab(
+        loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"})
+    )
     model = lab.vehicle.model
 
     def bare() -> None:
@@ -57,14 +59,22 @@ def closed_loops() -> list[dict[str, Any]]:
 def closed_loop(name: str) -> dict[str, Any]:
     lab = build_lab(loader.load(name, {"exposure.frames": "3"}))
     ratio = lab.duration_s / best(lambda: Flight(lab).simulate_motion(), 30)
-    return verdict(f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True)
+    return verdict(
+        f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True
+    )
 
 
 def poses() -> dict[str, Any]:
     """Time to interpolate the attitudes at POSES moments of one exposure."""
     trajectory = simulate_motion(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory()
     moments = np.linspace(0.5, 0.51, POSES)
-    return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: trajectory.attitude_at(moments)), "ms", "", 0.3)
+    return verdict(
+        f"{POSES} poses in an exposure",
+        1e3 * best(lambda: trajectory.attitude_at(moments)),
+        "ms",
+        "",
+        0.3,
+    )
 
 
 def best(work: Callable[[], Any], repeats: int = 30) -> float:

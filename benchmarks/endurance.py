@@ -18,7 +18,9 @@ from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation.flight import open_flight
 
-WARM_S = 60.0  # simulated time after which all code was called once; memory growth is counted from here
+WARM_S = (
+    60.0  # simulated time after which all code was called once; memory growth is counted from here
+)
 SCENE = {
     "seed": "11",
     "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}",
@@ -33,7 +35,8 @@ def main(duration_s: float, rate_hz: float) -> None:
     frames = round(duration_s * rate_hz)
     overrides = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
     flight = open_flight(load("simsat_bump", overrides), keeps_history=False)
-    process, begin = psutil.Process(), time.monotonic()
+    process = psutil.Process()
+    begin = time.monotonic()
     memory_mb: list[float] = []
     solved = wrong = 0
     first_s = late_s = 0.0
@@ -43,7 +46,9 @@ def main(duration_s: float, rate_hz: float) -> None:
         late_s = max(late_s, abs(shot.frame.t_mid_s - first_s - (n - 1) / rate_hz))
         attitude = shot.report.attitude.cam_from_ref if shot.report else None
         solved += attitude is not None
-        wrong += attitude is not None and metrics.is_wrong((attitude * shot.truth.cam_from_lab.inv()).magnitude())
+        wrong += attitude is not None and metrics.is_wrong(
+            (attitude * shot.truth.cam_from_lab.inv()).magnitude()
+        )
         if n % round(60 * rate_hz) == 0 or n == frames:
             gc.collect()
             memory_mb.append(process.memory_info().rss / 1e6)
@@ -54,7 +59,11 @@ def main(duration_s: float, rate_hz: float) -> None:
             )
     after = memory_mb[round(WARM_S // 60) - 1 :]
     growth = max(after) / after[0] - 1
-    off = metrics.cross_and_roll_rad(attitude, shot.truth.cam_from_lab)[0] / ARCSEC_RAD if attitude else float("nan")
+    off = (
+        metrics.cross_and_roll_rad(attitude, shot.truth.cam_from_lab)[0] / ARCSEC_RAD
+        if attitude
+        else float("nan")
+    )
     print(f"memory grew by {100 * growth:.2f} % after the first minute (bar 1 %)")
     print(f"time stamps drifted by {late_s:.2g} s")
     print(f"{solved} of {n} solved, {wrong} wrong, the last off by {off:.2g} arcsec")

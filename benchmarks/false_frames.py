@@ -30,8 +30,12 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.results.metrics import WRONG_RAD
 
-LIGHTS, FALSE_LIGHTS, STARS = (3, 30), 30, (3, 5)
-PROCESSES, BATCH = 2, 1000  # frames between two lines of the counts so far
+LIGHTS = (3, 30)
+FALSE_LIGHTS = 30
+STARS = (3, 5)
+# frames between two lines of the counts so far
+PROCESSES = 2
+BATCH = 1000
 Frame = tuple[Centroids, tuple[Rotation, ...]]  # with the right answers
 
 
@@ -52,21 +56,29 @@ def few_stars(work: Workload, stars: StarCatalog, rng: np.random.Generator) -> F
     frame = field(work, stars, rng)
     true = np.flatnonzero(frame.star >= 0)
     true = rng.permutation(true)[: rng.integers(STARS[0], STARS[1] + 1)]
-    seen, false = frame.centroids, false_lights(work, stars, FALSE_LIGHTS, rng)
+    seen = frame.centroids
+    false = false_lights(work, stars, FALSE_LIGHTS, rng)
     xy_px = np.concatenate([seen.xy_px[true], false.xy_px])
     flux = np.concatenate([seen.flux[true], false.flux])
     order = np.argsort(-flux)
     few = Field(seen.take(true), frame.cam_from_icrs, frame.star[true])
     by_identity = oracle(work, stars, few)
     centroids = Centroids(xy_px[order], np.full(len(flux), work.noise_px), flux[order])
-    return centroids, (frame.cam_from_icrs,) if by_identity is None else (frame.cam_from_icrs, by_identity)
+    return centroids, (frame.cam_from_icrs,) if by_identity is None else (
+        frame.cam_from_icrs,
+        by_identity,
+    )
 
 
-def false_lights(work: Workload, stars: StarCatalog, count: int, rng: np.random.Generator) -> Centroids:
+def false_lights(
+    work: Workload, stars: StarCatalog, count: int, rng: np.random.Generator
+) -> Centroids:
     """Lights at uniform random positions with magnitudes of the catalog."""
     camera = work.camera
     xy_px = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2))
-    return Centroids(xy_px, np.full(count, work.noise_px), 10 ** (-0.4 * np.sort(rng.choice(stars.v_mag, count))))
+    return Centroids(
+        xy_px, np.full(count, work.noise_px), 10 ** (-0.4 * np.sort(rng.choice(stars.v_mag, count)))
+    )
 
 
 KINDS: dict[str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Frame], float]] = {
@@ -83,7 +95,8 @@ def trackers() -> list[tuple[Workload, StarCatalog, StarTracker]]:
     skies = {work.limit_mag: sky(work.limit_mag) for work in WORKLOADS}
     out = []
     for work in WORKLOADS:
-        stars, uncertainty = skies[work.limit_mag], 1.05 * work.focal_uncertainty
+        stars = skies[work.limit_mag]
+        uncertainty = 1.05 * work.focal_uncertainty
         camera = work.camera.zoomed(1 + work.focal_error)
         out.append((work, stars, StarTracker(camera, stars, stars.vectors, settings, uncertainty)))
     return out
@@ -91,13 +104,16 @@ def trackers() -> list[tuple[Workload, StarCatalog, StarTracker]]:
 
 def count_answers(kind: str, first: int, count: int, seed: int) -> dict[str, list[int]]:
     """Number of frames, of answers and of wrong answers, by workload, of the frames from `first` on."""
-    make, every = KINDS[kind][0], trackers()
+    make = KINDS[kind][0]
+    every = trackers()
     out = {f"{work.name} ({work.focal_uncertainty:g})": [0, 0, 0] for work in WORKLOADS}
     for n in range(first, first + count):
         work, stars, tracker = every[n % len(every)]
         centroids, truths = make(work, stars, np.random.default_rng([seed, n]))
         answer = tracker.solve_centroids(centroids).cam_from_ref
-        right = answer is not None and any((answer * truth.inv()).magnitude() < WRONG_RAD for truth in truths)
+        right = answer is not None and any(
+            (answer * truth.inv()).magnitude() < WRONG_RAD for truth in truths
+        )
         found = (1, answer is not None, answer is not None and not right)
         row = out[f"{work.name} ({work.focal_uncertainty:g})"]
         row[:] = [a + b for a, b in zip(row, found, strict=True)]
@@ -111,10 +127,14 @@ def run(count: int, seed: int, kinds: list[str]) -> None:
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
         for kind in kinds:
             share = KINDS[kind][1]
-            frames, rows, begin = round(share * count), {}, time.perf_counter()
+            frames = round(share * count)
+            rows = {}
+            begin = time.perf_counter()
             firsts = range(0, frames, BATCH)
             sizes = [min(BATCH, frames - first) for first in firsts]
-            batches = pool.map(count_answers, [kind] * len(sizes), firsts, sizes, [seed] * len(sizes))
+            batches = pool.map(
+                count_answers, [kind] * len(sizes), firsts, sizes, [seed] * len(sizes)
+            )
             for batch in batches:
                 rows = {name: np.add(rows.get(name, 0), row) for name, row in batch.items()}
                 done, answers, wrong = np.sum(list(rows.values()), axis=0)
@@ -125,7 +145,10 @@ def run(count: int, seed: int, kinds: list[str]) -> None:
                     flush=True,
                 )
             for name, (done, answers, wrong) in rows.items():
-                print(f"{kind:10s} {name:43s} {done:7d} frames, {answers} answered, {wrong} wrong", flush=True)
+                print(
+                    f"{kind:10s} {name:43s} {done:7d} frames, {answers} answered, {wrong} wrong",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -24,7 +24,9 @@ CODES = {
 }
 RATES_DEG_S = (0.0, 5.0, 10.0)
 COUNTS = (200, 400, 800)
-COUNT, RATE_DEG_S = 400, 5.0  # where the other one is varied
+# where the other one is varied
+COUNT = 400
+RATE_DEG_S = 5.0
 IMAGE = Path(__file__).parents[1] / "docs/images/first_attitude.svg"
 
 
@@ -45,10 +47,13 @@ def result(code: str, leds: int, rate_deg_s: float, sequences: int) -> Result:
     """Some sequences of a code's length, each from a random attitude; a missing attitude is late by all of it."""
     bench = Bench({"light.led.code": CODES[code], "light.layout.count": str(leds)})
     first = np.array([bench.sequence(rate_deg_s, seed).first for seed in range(sequences)])
-    bits, frame_s = bench.tracker.code.bits, 1 / bench.lab.scene.exposure.rate_hz
+    bits = bench.tracker.code.bits
+    frame_s = 1 / bench.lab.scene.exposure.rate_hz
     late_s = np.where(first > 0, first, np.inf) * frame_s
     median_s, most_s = np.quantile(late_s, [0.5, 0.95], method="higher")
-    return Result(code, leds, rate_deg_s, bits, float(median_s), float(most_s), float(np.mean(first > 0)))
+    return Result(
+        code, leds, rate_deg_s, bits, float(median_s), float(most_s), float(np.mean(first > 0))
+    )
 
 
 def results(sequences: int) -> list[Result]:
@@ -68,10 +73,12 @@ def draw(every: list[Result], path: Path) -> None:
 
     figure, panels = plt.subplots(1, 2, figsize=(8.4, 3.6), sharey=True, layout="constrained")
     by_rate = {
-        f"{rate:g} deg/s": [one for one in every if (one.leds, one.rate_deg_s) == (COUNT, rate)] for rate in RATES_DEG_S
+        f"{rate:g} deg/s": [one for one in every if (one.leds, one.rate_deg_s) == (COUNT, rate)]
+        for rate in RATES_DEG_S
     }
     by_count = {
-        f"{leds} LEDs": [one for one in every if (one.leds, one.rate_deg_s) == (leds, RATE_DEG_S)] for leds in COUNTS
+        f"{leds} LEDs": [one for one in every if (one.leds, one.rate_deg_s) == (leds, RATE_DEG_S)]
+        for leds in COUNTS
     }
     for panel, groups, title in zip(
         panels, (by_rate, by_count), (f"{COUNT} LEDs", f"{RATE_DEG_S:g} deg/s"), strict=True
@@ -80,8 +87,17 @@ def draw(every: list[Result], path: Path) -> None:
             bits = np.array([one.bits for one in group]) + shift
             median_ms = 1e3 * np.array([one.median_s for one in group])
             above_ms = 1e3 * np.array([min(one.most_s, one.bits / 50) for one in group]) - median_ms
-            panel.errorbar(bits, median_ms, [0 * above_ms, above_ms], fmt="o", capsize=3, label=label)
-        panel.plot([0, 32], [0, 640], color="#999999", linewidth=1, linestyle=":", label="whole word at 50 Hz")
+            panel.errorbar(
+                bits, median_ms, [0 * above_ms, above_ms], fmt="o", capsize=3, label=label
+            )
+        panel.plot(
+            [0, 32],
+            [0, 640],
+            color="#999999",
+            linewidth=1,
+            linestyle=":",
+            label="whole word at 50 Hz",
+        )
         panel.set(xlabel="bits of the code", title=title, xlim=(7, 33), ylim=(0, None))
         panel.legend(fontsize=9)
     panels[0].set_ylabel("time to first attitude, ms")

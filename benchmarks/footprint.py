@@ -47,7 +47,8 @@ def measured() -> Iterator[str]:
     follower.warm_up()
     yield f"warm_up, compiled before: {time.perf_counter() - begin:.1f} s, {rss_mb():.0f} MB"
     _, xy_px, light = tracker.rich_field()
-    xy_px, light = xy_px[:25], light[:25]
+    xy_px = xy_px[:25]
+    light = light[:25]
     image = draw(camera, xy_px, 3000 * light / light.max() + 100, np.dtype("u2"))
     centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), light)
     for name, call in (

@@ -63,9 +63,43 @@ LIEBE_E = 6008 * 10 ** (0.4 * 4)  # EC655, f/1.4, 50 ms: a star of magnitude 4 g
 SETUPS = (
     CameraSetup("EC655, 50 ms", EC655, LIEBE_E, 7.0, 60, 15, 16, 4095),
     CameraSetup("1024 x 1024", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9),
-    CameraSetup("1024 x 1024, smear of 12 px", SQUARE, LIEBE_E, 7.0, 60, 15, 16, 4095, psf_px=0.9, streak_px=12),
-    CameraSetup("saturated, readout smear", SQUARE, 40 * LIEBE_E, 7.5, 600, 15, 16, 4095, psf_px=0.9, leak=5e-4),
-    CameraSetup("all nuisances", SQUARE, 4 * LIEBE_E, 7.0, 100, 15, 16, 4095, psf_px=0.9, leak=2e-5, nuisances=True),
+    CameraSetup(
+        "1024 x 1024, smear of 12 px",
+        SQUARE,
+        LIEBE_E,
+        7.0,
+        60,
+        15,
+        16,
+        4095,
+        psf_px=0.9,
+        streak_px=12,
+    ),
+    CameraSetup(
+        "saturated, readout smear",
+        SQUARE,
+        40 * LIEBE_E,
+        7.5,
+        600,
+        15,
+        16,
+        4095,
+        psf_px=0.9,
+        leak=5e-4,
+    ),
+    CameraSetup(
+        "all nuisances",
+        SQUARE,
+        4 * LIEBE_E,
+        7.0,
+        100,
+        15,
+        16,
+        4095,
+        psf_px=0.9,
+        leak=2e-5,
+        nuisances=True,
+    ),
 )
 
 
@@ -77,7 +111,8 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, streak: NDArray, psf_px: f
         steps = int(np.hypot(streak[n, 0], streak[n, 1]) / STEP_PX) + 1
         for k in range(steps):
             along = (k + 0.5) / steps - 0.5
-            x, y = xy[n, 0] + along * streak[n, 0], xy[n, 1] + along * streak[n, 1]
+            x = xy[n, 0] + along * streak[n, 0]
+            y = xy[n, 1] + along * streak[n, 1]
             for row in range(max(round(y) - reach, 0), min(round(y) + reach + 1, height)):
                 down = np.exp(-((row - y) ** 2) / 2 / psf_px**2)
                 for column in range(max(round(x) - reach, 0), min(round(x) + reach + 1, width)):
@@ -85,15 +120,20 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, streak: NDArray, psf_px: f
                     light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
 
 
-def render(setup: CameraSetup, stars: catalog.StarCatalog, rng: np.random.Generator) -> tuple[NDArray, Rotation]:
+def render(
+    setup: CameraSetup, stars: catalog.StarCatalog, rng: np.random.Generator
+) -> tuple[NDArray, Rotation]:
     """One frame at a random attitude, and that attitude at mid-exposure."""
-    camera, truth = setup.camera, Rotation.random(rng=rng)
+    camera = setup.camera
+    truth = Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
     inside = camera.contains(np.nan_to_num(xy, nan=-1e9), -10.0)
     angle = rng.uniform(0, 2 * np.pi)
     streak = np.tile(setup.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1))
     light = np.full((camera.height_px, camera.width_px), float(setup.sky_e))
-    paint(light, xy[inside], setup.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), streak, setup.psf_px)
+    paint(
+        light, xy[inside], setup.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), streak, setup.psf_px
+    )
     if setup.nuisances:
         disturb(light, setup, rng)
     light += setup.leak * light.sum(axis=0)
@@ -137,7 +177,9 @@ def tetra3rs(setup: CameraSetup, stars: catalog.StarCatalog, fast: bool) -> Solv
     import tetra3rs as peer
 
     fov_deg = float(np.degrees(setup.camera.fov_rad))
-    database = peer.SolverDatabase.generate_from_gaia(max_fov_deg=fov_deg * 1.1, epoch_proper_motion_year=1991.25)
+    database = peer.SolverDatabase.generate_from_gaia(
+        max_fov_deg=fov_deg * 1.1, epoch_proper_motion_year=1991.25
+    )
     shape = (setup.camera.height_px, setup.camera.width_px)
     model = peer.CameraModel(setup.camera.focal_px, shape[1], shape[0])
     extract = peer.extract_centroids_fast if fast else peer.extract_centroids
@@ -188,11 +230,22 @@ def compare(
     for name in available:
         error = np.array(errors[name]).reshape(-1, 3)
         right = np.linalg.norm(error, axis=1) < WRONG_RAD
-        cross = np.hypot(error[right, 0], error[right, 1]) / ARCSEC_RAD if right.any() else np.full(1, np.nan)
+        cross = (
+            np.hypot(error[right, 0], error[right, 1]) / ARCSEC_RAD
+            if right.any()
+            else np.full(1, np.nan)
+        )
         solved, wrong = (100 * part.sum() / len(frames) for part in (right, ~right))
         middle, late = np.percentile(ms[name], [50, 99])
         rms = np.sqrt(np.mean(cross**2))
-        out[name] = {"solved": solved, "wrong": wrong, "ms": middle, "p99": late, "cross": np.median(cross), "rms": rms}
+        out[name] = {
+            "solved": solved,
+            "wrong": wrong,
+            "ms": middle,
+            "p99": late,
+            "cross": np.median(cross),
+            "rms": rms,
+        }
     return out
 
 
@@ -233,5 +286,9 @@ if __name__ == "__main__":
     print(f'{"":28s} {"":14s} solved %  wrong %       ms   p99 ms   cross"    rms"')
     for setup, scored in scores(count, seed):
         for name, found in scored.items():
-            numbers = "{solved:8.2f} {wrong:7.2f} {ms:8.3f} {p99:8.2f} {cross:8.2f} {rms:8.2f}".format(**found)
+            numbers = (
+                "{solved:8.2f} {wrong:7.2f} {ms:8.3f} {p99:8.2f} {cross:8.2f} {rms:8.2f}".format(
+                    **found
+                )
+            )
             print(f"{setup.name:28s} {name:14s} {numbers}", flush=True)

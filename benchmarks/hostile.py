@@ -34,9 +34,15 @@ from skysim.core.paths import CATALOGS, SCENES
 from skysim.results.metrics import WRONG_RAD
 from skysim.sources import stars as star_sources
 
-LIMIT_S_PER_MPX, MEMORY_FRAMES, MEMORY_FLOOR = 2.0, 10, 64 << 20
-CAMERA_FILE, FOV_DEG, WIDTH, HEIGHT = SCENES / "shefex2.yaml", 14.87, 659, 493
-SMALL, LARGE = (240, 320), (4096, 4096)
+LIMIT_S_PER_MPX = 2.0
+MEMORY_FRAMES = 10
+MEMORY_FLOOR = 64 << 20
+CAMERA_FILE = SCENES / "shefex2.yaml"
+FOV_DEG = 14.87
+WIDTH = 659
+HEIGHT = 493
+SMALL = (240, 320)
+LARGE = (4096, 4096)
 USUAL = ((HEIGHT, WIDTH), SMALL, LARGE)
 DEPTH = 4095
 EIGHT_BIT = 0.2  # fraction of the 16-bit images that are reduced to 8 bits
@@ -75,7 +81,8 @@ def size(rng: Rng) -> tuple[int, int]:
 
 
 def noise(rng: Rng) -> HostileInput:
-    shape, kind = size(rng), rng.integers(5)
+    shape = size(rng)
+    kind = rng.integers(5)
     if kind == 0:
         return HostileInput(rng.poisson(rng.uniform(1, 400), shape).astype(np.uint16))
     if kind == 1:
@@ -112,14 +119,24 @@ def text(rng: Rng) -> HostileInput:
     for _ in range(rng.integers(1, 30)):
         word = "".join(map(chr, rng.integers(33, 127, rng.integers(1, 40))))
         at = tuple(int(one) for one in rng.integers(0, page.shape[::-1]))
-        cv2.putText(page, word, at, int(rng.integers(8)), rng.uniform(0.2, 1.5), int(rng.integers(1, 256)), 1)
+        cv2.putText(
+            page,
+            word,
+            at,
+            int(rng.integers(8)),
+            rng.uniform(0.2, 1.5),
+            int(rng.integers(1, 256)),
+            1,
+        )
     return HostileInput(speckled(100 + 15.0 * page, rng))
 
 
 def scattered(rng: Rng) -> HostileInput:
     """Lights at uniform random positions with fluxes of stars, from few to many."""
     count = int(rng.choice([3, 6, 12, 25, 60, 200]))
-    return HostileInput(lit(rng.uniform(0, [WIDTH, HEIGHT], (count, 2)), star_light(count, rng), rng))
+    return HostileInput(
+        lit(rng.uniform(0, [WIDTH, HEIGHT], (count, 2)), star_light(count, rng), rng)
+    )
 
 
 def repeated(rng: Rng) -> HostileInput:
@@ -129,7 +146,9 @@ def repeated(rng: Rng) -> HostileInput:
     steps = np.stack(np.meshgrid(np.arange(-1, 25), np.arange(-1, 20)), axis=-1).reshape(-1, 2)
     turn = rng.uniform(0, np.pi / 2)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    xy = (steps[:, None] * [across, down] + cell).reshape(-1, 2) @ (np.eye(2) if rng.uniform() < 0.5 else rotation)
+    xy = (steps[:, None] * [across, down] + cell).reshape(-1, 2) @ (
+        np.eye(2) if rng.uniform() < 0.5 else rotation
+    )
     light = np.tile(star_light(len(cell), rng), len(steps))
     return HostileInput(lit(xy, light, rng))
 
@@ -142,28 +161,40 @@ def duplicated(rng: Rng) -> HostileInput:
         moved = np.roll(one, shift, (0, 1))
         ground = np.median(one)
         # np.roll moves rows by shift[0] (y) and columns by shift[1] (x); near the boresight that is this rotation.
-        shifted_attitude = Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * attitude
+        shifted_attitude = (
+            Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * attitude
+        )
         return HostileInput(
-            np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16), skies=(attitude, shifted_attitude)
+            np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16),
+            skies=(attitude, shifted_attitude),
         )
     other, other_attitude = starry(rng)
     return HostileInput(
-        np.clip(one + other - np.median(one), 0, DEPTH).astype(np.uint16), skies=(attitude, other_attitude)
+        np.clip(one + other - np.median(one), 0, DEPTH).astype(np.uint16),
+        skies=(attitude, other_attitude),
     )
 
 
 def mirrored(rng: Rng) -> HostileInput:
     """A mirrored sky. No rotation of the sky equals its mirror image, with any lens."""
-    lens = camera() if rng.uniform() < 0.7 else Camera.from_fov(WIDTH, HEIGHT, np.radians(rng.uniform(6, 60)))
+    lens = (
+        camera()
+        if rng.uniform() < 0.7
+        else Camera.from_fov(WIDTH, HEIGHT, np.radians(rng.uniform(6, 60)))
+    )
     picture = starry(rng, lens)[0]
-    return HostileInput(np.ascontiguousarray(picture[:, ::-1] if rng.uniform() < 0.5 else picture[::-1]))
+    return HostileInput(
+        np.ascontiguousarray(picture[:, ::-1] if rng.uniform() < 0.5 else picture[::-1])
+    )
 
 
 def kaleidoscope(rng: Rng) -> HostileInput:
     """Half of a sky and its mirror image; the true half may be solved."""
     picture, attitude = starry(rng)
     half = picture[:, : WIDTH // 2]
-    return HostileInput(np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]), skies=(attitude,))
+    return HostileInput(
+        np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]), skies=(attitude,)
+    )
 
 
 def shuffled(rng: Rng) -> HostileInput:
@@ -171,7 +202,8 @@ def shuffled(rng: Rng) -> HostileInput:
     picture, attitude = starry(rng)
     side = 82
     cells = [(r, c) for r in range(0, 6 * side, side) for c in range(0, 8 * side, side)]
-    out, skies = picture.copy(), []
+    out = picture.copy()
+    skies = []
     for (r, c), n in zip(cells, rng.permutation(len(cells)), strict=True):
         v, u = cells[n]
         out[r : r + side, c : c + side] = picture[v : v + side, u : u + side]
@@ -199,7 +231,9 @@ def flat(rng: Rng) -> HostileInput:
 
 def tiny(rng: Rng) -> HostileInput:
     shape = tuple(rng.choice([1, 2, 3, 15, 16, 17, 40, 400], 2))
-    return HostileInput(rng.integers(0, DEPTH, shape, dtype=np.uint16), str(rng.choice([".png", ".tiff"])))
+    return HostileInput(
+        rng.integers(0, DEPTH, shape, dtype=np.uint16), str(rng.choice([".png", ".tiff"]))
+    )
 
 
 def no_numbers(rng: Rng) -> HostileInput:
@@ -223,14 +257,18 @@ def broken(rng: Rng) -> HostileInput:
 def rubbish(rng: Rng) -> HostileInput:
     suffix = str(rng.choice(IMAGE_SUFFIXES))
     heads = (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"SIMPLE  = ")
-    return HostileInput(None, suffix, heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 5000))))
+    return HostileInput(
+        None, suffix, heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 5000)))
+    )
 
 
 def promises(rng: Rng) -> HostileInput:
     """The header of a very large image with truncated data."""
     side = int(rng.choice([20_000, 60_000, 2**30]))
     suffix = str(rng.choice([".png", ".bmp", ".tiff", ".jpg", ".fits"]))
-    return HostileInput(None, suffix, promise(suffix, side, side) + rng.bytes(int(rng.integers(0, 3000))))
+    return HostileInput(
+        None, suffix, promise(suffix, side, side) + rng.bytes(int(rng.integers(0, 3000)))
+    )
 
 
 def large(rng: Rng) -> HostileInput:
@@ -309,7 +347,9 @@ class Judge:
         prior : information given to the solver: "camera", "field" (of view) or "nothing"
         """
         shape = shape if shape in USUAL else ()
-        how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[prior]
+        how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[
+            prior
+        ]
         cached = self.solvers.setdefault(prior, {})
         if shape not in cached:
             cached[shape] = plate_solver.make_solver(*how)
@@ -323,7 +363,11 @@ class Judge:
         weight = np.array(list(FAMILIES.values()))
         family = list(FAMILIES)[rng.choice(len(FAMILIES), p=weight / weight.sum())]
         case = family(rng)
-        if case.picture is not None and case.picture.dtype == np.uint16 and rng.uniform() < EIGHT_BIT:
+        if (
+            case.picture is not None
+            and case.picture.dtype == np.uint16
+            and rng.uniform() < EIGHT_BIT
+        ):
             case = replace(case, picture=(case.picture >> 4).clip(0, 255).astype(np.uint8))
         fits_camera = case.picture is not None and case.picture.shape == (HEIGHT, WIDTH)
         prior = "camera" if fits_camera and rng.uniform() < 0.8 else "field"
@@ -366,9 +410,14 @@ def wrong(answer: dict, skies: Skies) -> bool:
     """Whether the solution is wrong: it displaces the image corners by more than ten arcminutes for all true skies."""
     if answer.get("ra_deg") is None:
         return False
-    cam_from_icrs = star_sources.cam_from_icrs(answer["ra_deg"], answer["dec_deg"], answer["roll_deg"])
+    cam_from_icrs = star_sources.cam_from_icrs(
+        answer["ra_deg"], answer["dec_deg"], answer["roll_deg"]
+    )
     corners = camera().rays(CORNERS * [WIDTH, HEIGHT])
-    error_rad = (np.linalg.norm((cam_from_icrs * sky.inv()).apply(corners) - corners, axis=1).max() for sky in skies)
+    error_rad = (
+        np.linalg.norm((cam_from_icrs * sky.inv()).apply(corners) - corners, axis=1).max()
+        for sky in skies
+    )
     return all(error > WRONG_RAD for error in error_rad)
 
 
@@ -384,7 +433,9 @@ def judged(count: int, seed: int, quiet: bool = True) -> dict[str, FamilyResult]
                 break
             result = results.setdefault(name, FamilyResult())
             result.looked += 1
-            result.defects += (f"{n}: {one}" for one in defects(case, answer, seconds, memory_bytes))
+            result.defects += (
+                f"{n}: {one}" for one in defects(case, answer, seconds, memory_bytes)
+            )
             result.right += answer.get("ra_deg") is not None
             result.worst_s = max(result.worst_s, seconds)
             if case.picture is not None:
@@ -411,12 +462,16 @@ if __name__ == "__main__":
     count, seed = (int(one) for one in (sys.argv[1:3] + ["10000", "1"][len(sys.argv[1:3]) :]))
     begin = time.perf_counter()
     results = judged(count, seed, quiet=False)
-    print(f"{'':14s} {'pictures':>8s} {'a true sky':>10s} {'defects':>8s} {'worst s':>8s} {'frames':>7s}")
+    print(
+        f"{'':14s} {'pictures':>8s} {'a true sky':>10s} {'defects':>8s} {'worst s':>8s} {'frames':>7s}"
+    )
     for name, one in results.items():
         print(
             f"{name:14s} {one.looked:8d} {one.right:10d} {len(one.defects):8d}"
             f" {one.worst_s:8.2f} {one.most_frames:7.1f}"
         )
-        print(*(f"    {line}" for line in one.defects[:20]), sep="\n", end="\n" if one.defects else "")
+        print(
+            *(f"    {line}" for line in one.defects[:20]), sep="\n", end="\n" if one.defects else ""
+        )
     looked = sum(one.looked for one in results.values())
     print(f"{looked} pictures, {(time.perf_counter() - begin) / looked:.3f} s each")

@@ -32,7 +32,9 @@ def promise(suffix: str, width: int, height: int) -> bytes:
             (b"IDAT", zlib.compress(b"\0" * 999)),
         ]
         chunks = [struct.pack(">I", len(data)) + kind + data for kind, data in parts]
-        return b"\x89PNG\r\n\x1a\n" + b"".join(chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks)
+        return b"\x89PNG\r\n\x1a\n" + b"".join(
+            chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks
+        )
     if suffix == ".bmp":
         head = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0)
         return b"BM" + struct.pack("<IHHI", 54 + 999, 0, 0, 54) + head

@@ -24,7 +24,9 @@ def measure() -> list[dict[str, Any]]:
     """100 random fields of 14.87 x 11.15 deg: the 15 brightest stars to V 5.75, 0.1 px noise, no false stars."""
     camera = Camera(659, 493, 25e-3 / 9.9e-6, (329.0, 246.0))
     stars = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
-    tracker = StarTracker(camera, stars, catalog.at_epoch(stars, 2020.0), Settings(centroid_sigma_px=0.1))
+    tracker = StarTracker(
+        camera, stars, catalog.at_epoch(stars, 2020.0), Settings(centroid_sigma_px=0.1)
+    )
     fields = [field(tracker, np.random.default_rng([3, n])) for n in range(FIELDS)]
     result = versus(
         f"identify + solve {FIELDS} SHEFEX fields",
@@ -38,7 +40,8 @@ def measure() -> list[dict[str, Any]]:
 
 def field(tracker: StarTracker, rng: np.random.Generator) -> Centroids:
     """The 15 brightest stars in the field at a random attitude, with noise."""
-    camera, attitude = tracker.camera, Rotation.random(rng=rng)
+    camera = tracker.camera
+    attitude = Rotation.random(rng=rng)
     pixels = camera.pixels(attitude.apply(tracker.stars.vectors))
     rows = np.flatnonzero(camera.contains(np.nan_to_num(pixels, nan=-1e9)))[:15]
     xy = pixels[rows] + 0.1 * rng.standard_normal((len(rows), 2))

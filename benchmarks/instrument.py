@@ -46,7 +46,12 @@ NOISE = {
 
 def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: Any) -> CameraConfig:
     """A camera with square 5 um pixels and a Gaussian PSF; f/10000, so that defocus is negligible."""
-    part = {"width_px": width, "height_px": height, "pixel": "5 um", "focal_length": f"{5e-6 * focal_px} m"}
+    part = {
+        "width_px": width,
+        "height_px": height,
+        "pixel": "5 um",
+        "focal_length": f"{5e-6 * focal_px} m",
+    }
     lens = {"f_number": 1e4, "psf": {"kind": "gaussian", "sigma_px": sigma_px}}
     return CameraConfig.model_validate(part | lens | {"detector": NOISE | noise})
 
@@ -63,7 +68,9 @@ def turning(rate_rad_s: float) -> Trajectory:
     return Trajectory(t, Rotation.from_rotvec((t[:, None] - EXPOSURE_S / 2) * rate[:1]), rate)
 
 
-def lights(lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1) -> Sources:
+def lights(
+    lens: CameraConfig, count: int, electrons: Floats, radius_px: float = 0.0, seed: int = 1
+) -> Sources:
     """`count` stars, or disks two meters away if radius_px > 0, at random positions in the frame.
 
     electrons : electrons of each source in one exposure
@@ -74,7 +81,8 @@ def lights(lens: CameraConfig, count: int, electrons: Floats, radius_px: float =
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     near = radius_px > 0
     place = np.column_stack([toward * (2.0 if near else 1.0), np.full(count, float(near))])
-    zero, one = np.zeros(count), np.ones(count)
+    zero = np.zeros(count)
+    one = np.ones(count)
     strength = electrons / EXPOSURE_S * (4.0 if near else 1.0)
     return Sources(
         np.arange(count),
@@ -92,8 +100,11 @@ def lights(lens: CameraConfig, count: int, electrons: Floats, radius_px: float =
 
 def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Callable[[], Any]:
     """A function that makes one frame: light with smear, then all noise."""
-    optics, detector, rng = square_meter(lens), Detector.from_camera(lens), np.random.default_rng(0)
-    path, image = turning(rate_rad_s), np.empty((lens.height_px, lens.width_px), np.float32)
+    optics = square_meter(lens)
+    detector = Detector.from_camera(lens)
+    rng = np.random.default_rng(0)
+    path = turning(rate_rad_s)
+    image = np.empty((lens.height_px, lens.width_px), np.float32)
 
     def shot() -> Any:
         fill(image, np.zeros((1, 1)), EXPOSURE_S)
@@ -106,7 +117,9 @@ def camera_shot(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Call
 def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
     """Mean photoelectrons of the same frame."""
     image = np.zeros((lens.height_px, lens.width_px))
-    render(image, sources, square_meter(lens), turning(rate_rad_s), AT_CENTER, Window(0.0, EXPOSURE_S))
+    render(
+        image, sources, square_meter(lens), turning(rate_rad_s), AT_CENTER, Window(0.0, EXPOSURE_S)
+    )
     return image
 
 
@@ -123,7 +136,8 @@ def dome_frame() -> list[dict[str, Any]]:
     lens = camera(1600, 1200, 8000.0, 1.0)
     sources = lights(lens, 45, np.full(45, 3e6), radius_px=10.0)
     rate = 20 / 8000.0 / EXPOSURE_S
-    ours, mean = camera_shot(lens, sources, rate), light_of(lens, sources, rate)
+    ours = camera_shot(lens, sources, rate)
+    mean = light_of(lens, sources, rate)
     what = "frame: 45 smeared disks, 1600x1200"
     return [
         versus(what, ours, "getframes, its noise alone", getframes(lens, mean), bar=10),
@@ -161,7 +175,8 @@ def getframes(lens: CameraConfig, mean_e: Floats) -> Callable[[], Any] | None:
         readout_channel_axis=1,
         bias_channel_spread_adu=part.column_offset_e / part.gain_e_dn,
     )
-    made, rate = gf.Camera(config, seed=1), mean_e / EXPOSURE_S
+    made = gf.Camera(config, seed=1)
+    rate = mean_e / EXPOSURE_S
     return lambda: made.expose(rate, EXPOSURE_S, include_truth=False)
 
 
@@ -184,7 +199,13 @@ def sky_frame() -> list[dict[str, Any]]:
     electrons = 2e4 * 10 ** (-0.4 * (magnitude - 4))
     sources = lights(lens, 146, electrons)
     ours = camera_shot(lens, sources, 0.0)
-    result = versus("frame: 146 stars to V 7, 1024x1024", ours, "GalSim", galsim(lens, sources, electrons), bar=15)
+    result = versus(
+        "frame: 146 stars to V 7, 1024x1024",
+        ours,
+        "GalSim",
+        galsim(lens, sources, electrons),
+        bar=15,
+    )
     return [result, verdict("the same, in ms", result["value"], "ms", "most wanted", 5.0)]
 
 
@@ -196,12 +217,15 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
 
     toward = sources.place[:, :3] / sources.place[:, 2:3]
     xy = toward[:, :2] * lens.focal_px + lens.center_px + 1  # GalSim counts from 1
-    psf, rng = galsim.Gaussian(sigma=0.8), galsim.BaseDeviate(1)
+    psf = galsim.Gaussian(sigma=0.8)
+    rng = galsim.BaseDeviate(1)
 
     def shot() -> Any:
         image = galsim.ImageF(lens.width_px, lens.height_px, scale=1.0)
         for (x, y), flux in zip(xy, electrons, strict=True):
-            stamp = psf.withFlux(flux).drawImage(center=galsim.PositionD(x, y), scale=1.0, dtype=np.float32)
+            stamp = psf.withFlux(flux).drawImage(
+                center=galsim.PositionD(x, y), scale=1.0, dtype=np.float32
+            )
             bounds = stamp.bounds & image.bounds
             image[bounds] += stamp[bounds]
         image.addNoise(galsim.CCDNoise(rng, sky_level=0.25, gain=10.0, read_noise=10.0))
@@ -213,7 +237,8 @@ def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[
 def noise_floor() -> dict[str, Any]:
     """Noise of a dark frame against the time to generate as many random bytes as the frame has."""
     lens = camera(1600, 1200, 8000.0, 1.0)
-    detector, rng = Detector.from_camera(lens), np.random.default_rng(0)
+    detector = Detector.from_camera(lens)
+    rng = np.random.default_rng(0)
     dark = np.zeros((1200, 1600), np.float32)
 
     def ours() -> None:
@@ -232,19 +257,28 @@ def noise_floor() -> dict[str, Any]:
 
 def growth() -> list[dict[str, Any]]:
     """Scaling: drawing time is linear in the number of stars and independent of the area; memory in frames."""
-    few, many = camera(1024, 1024, 3000.0, 0.8), camera(2048, 2048, 3000.0, 0.8)
+    few = camera(1024, 1024, 3000.0, 0.8)
+    many = camera(2048, 2048, 3000.0, 0.8)
 
     def drawing(lens: CameraConfig, count: int) -> Callable[[], Any]:
-        image, optics = np.zeros((lens.height_px, lens.width_px), np.float32), square_meter(lens)
-        sources, path = lights(lens, count, np.full(count, 1e4)), turning(0.0)
+        image = np.zeros((lens.height_px, lens.width_px), np.float32)
+        optics = square_meter(lens)
+        sources = lights(lens, count, np.full(count, 1e4))
+        path = turning(0.0)
         return lambda: render(image, sources, optics, path, AT_CENTER, Window(0.0, EXPOSURE_S))
 
-    stars = versus("draw 500 stars", drawing(few, 500), "ten times as many, a star", drawing(few, 5000))
-    area = versus("draw 500 stars, 1024x1024", drawing(few, 500), "on 2048x2048", drawing(many, 500))
+    stars = versus(
+        "draw 500 stars", drawing(few, 500), "ten times as many, a star", drawing(few, 5000)
+    )
+    area = versus(
+        "draw 500 stars, 1024x1024", drawing(few, 500), "on 2048x2048", drawing(many, 500)
+    )
     return [
         verdict("ten times the stars beyond 500", stars["ratio"], "times as long", "linear", 11.0),
         verdict("four times the area, drawing", area["ratio"], "times as long", "level", 1.25),
-        verdict("memory of a frame being made", memory_frames(), "frames of float32", "most wanted", 6.0),
+        verdict(
+            "memory of a frame being made", memory_frames(), "frames of float32", "most wanted", 6.0
+        ),
     ]
 
 
@@ -263,7 +297,10 @@ def memory_frames() -> float:
 def renders_a_frame() -> list[dict[str, Any]]:
     """Calls of `render_frame` for a frame in a run of each scene, with a filter or without; 1 is the least."""
     what = "renders of a frame in a run, {}"
-    return [verdict(what.format(name), renders_in_run(name), "", "one", 1.0) for name in loader.list_scenes()]
+    return [
+        verdict(what.format(name), renders_in_run(name), "", "one", 1.0)
+        for name in loader.list_scenes()
+    ]
 
 
 def renders_in_run(name: str) -> float:

@@ -45,10 +45,16 @@ exposure: {time: "20 ms", rate_hz: 40, frames: 120, first: "0.1 s"}
 SIZES = ((1280, 800), (1920, 1080))
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")
-TOKEN, WORKERS_LIMIT = "bench", 4
-HELD_S, PRESSES, CROWD = 6.0, 30, 20
-WARM_TABS, TABS = 3, int(os.environ.get("SKYSIM_BENCH_TABS", "20"))  # the first load code
-PLAY_S, LOOK_S = float(os.environ.get("SKYSIM_BENCH_PLAY_S", "120")), 2.0
+TOKEN = "bench"
+WORKERS_LIMIT = 4
+HELD_S = 6.0
+PRESSES = 30
+CROWD = 20
+# the first load code
+WARM_TABS = 3
+TABS = int(os.environ.get("SKYSIM_BENCH_TABS", "20"))
+PLAY_S = float(os.environ.get("SKYSIM_BENCH_PLAY_S", "120"))
+LOOK_S = 2.0
 COLLECTED_S = 2 * QUIET_S  # until a closed page is collected
 IDLE_S = 0.1  # processor time in a second of a server that waits
 WARM_S = 180.0  # for compiling and loading on a busy machine
@@ -87,15 +93,33 @@ class Server:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        command = [sys.executable, "-m", "skysim", "gui", scene, "--no-open", "--port", str(port), "--token", TOKEN]
+        command = [
+            sys.executable,
+            "-m",
+            "skysim",
+            "gui",
+            scene,
+            "--no-open",
+            "--port",
+            str(port),
+            "--token",
+            TOKEN,
+        ]
         places = ["--out", folder, "--folder", folder, "--workers", str(workers)]
-        self.process = psutil.Popen([*command, *places], start_new_session=True, stdout=subprocess.DEVNULL)
+        self.process = psutil.Popen(
+            [*command, *places], start_new_session=True, stdout=subprocess.DEVNULL
+        )
         self.url = f"http://127.0.0.1:{port}/?token={TOKEN}"
 
     def workers(self) -> list[psutil.Process]:
         """Its worker processes, the oldest first."""
-        templates = [one for one in self.process.children() if "gui.template" in " ".join(one.cmdline())]
-        return sorted((one for template in templates for one in template.children()), key=psutil.Process.create_time)
+        templates = [
+            one for one in self.process.children() if "gui.template" in " ".join(one.cmdline())
+        ]
+        return sorted(
+            (one for template in templates for one in template.children()),
+            key=psutil.Process.create_time,
+        )
 
     def cpu_s(self) -> float:
         """Processor time of it and its workers."""
@@ -103,7 +127,8 @@ class Server:
 
     def settle(self, workers: int) -> None:
         """Wait until it has so many workers, and all of them wait for work."""
-        end, idle = time.monotonic() + WARM_S, False
+        end = time.monotonic() + WARM_S
+        idle = False
         while not idle and time.monotonic() < end:
             before = self.cpu_s()
             time.sleep(1.0)
@@ -144,7 +169,9 @@ def browser_cpu_s() -> float:
 
 def reached(url: str) -> None:
     """Wait until a server responds at the address. Raises TimeoutError."""
-    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())  # the token is passed on as a cookie
+    opener = urllib.request.build_opener(
+        urllib.request.HTTPCookieProcessor()
+    )  # the token is passed on as a cookie
     end = time.monotonic() + WARM_S
     while time.monotonic() < end:
         with suppress(OSError):
@@ -167,7 +194,9 @@ def measure() -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         scene = Path(folder) / "square.yaml"
         scene.write_text(SCENE)
-        browser, other = (driver.chromium.launch(executable_path=chromium(), args=list(FLAGS)) for _ in range(2))
+        browser, other = (
+            driver.chromium.launch(executable_path=chromium(), args=list(FLAGS)) for _ in range(2)
+        )
         tabs = browser.new_context()
         with served(str(scene)) as server:
             opened(tabs, server).close()  # compiles what is not in the cache
@@ -211,7 +240,8 @@ def speed(tabs: Any, server: Server, size: tuple[int, int]) -> list[dict[str, An
     say(screen)
     server.settle(0)
     page = new_page(tabs, size)
-    traffic, begin = Traffic(page), time.monotonic()
+    traffic = Traffic(page)
+    begin = time.monotonic()
     page.goto(server.url)
     shown(page)
     open_s = time.monotonic() - begin
@@ -246,11 +276,39 @@ class Measured(NamedTuple):
     def rows(self, what: str) -> list[dict[str, Any]]:
         count = max(self.frames, 1)
         return [
-            verdict(f"{what}: frames shown", self.frames / self.seconds, "/s", "1024 x 1024, solved", 30.0, least=True),
-            verdict(f"{what}: websocket", self.websocket / 1e3 / count, "kB/frame", "before compression", 20.0),
-            plain(f"{what}: HTTP", self.http / 1e3 / count, "kB/frame", "shades of the screen's pixels"),
-            plain(f"{what}: processor, server", 1e3 * self.server_s / count, "ms/frame", "with its workers"),
-            plain(f"{what}: processor, browser", 1e3 * self.browser_s / count, "ms/frame", "without a graphics card"),
+            verdict(
+                f"{what}: frames shown",
+                self.frames / self.seconds,
+                "/s",
+                "1024 x 1024, solved",
+                30.0,
+                least=True,
+            ),
+            verdict(
+                f"{what}: websocket",
+                self.websocket / 1e3 / count,
+                "kB/frame",
+                "before compression",
+                20.0,
+            ),
+            plain(
+                f"{what}: HTTP",
+                self.http / 1e3 / count,
+                "kB/frame",
+                "shades of the screen's pixels",
+            ),
+            plain(
+                f"{what}: processor, server",
+                1e3 * self.server_s / count,
+                "ms/frame",
+                "with its workers",
+            ),
+            plain(
+                f"{what}: processor, browser",
+                1e3 * self.browser_s / count,
+                "ms/frame",
+                "without a graphics card",
+            ),
         ]
 
 
@@ -263,11 +321,15 @@ def measured(page: Any, server: Server, traffic: Traffic, action: Callable[[], N
     """What an action on a page takes."""
     page.evaluate("() => { window.drawn = [] }")
     traffic.websocket = traffic.http = 0
-    before, begin = (server.cpu_s(), browser_cpu_s()), time.monotonic()
+    before = (server.cpu_s(), browser_cpu_s())
+    begin = time.monotonic()
     action()
-    seconds, after = time.monotonic() - begin, (server.cpu_s(), browser_cpu_s())
+    seconds = time.monotonic() - begin
+    after = (server.cpu_s(), browser_cpu_s())
     frames = int(page.evaluate("window.drawn.length"))
-    return Measured(frames, seconds, traffic.websocket, traffic.http, after[0] - before[0], after[1] - before[1])
+    return Measured(
+        frames, seconds, traffic.websocket, traffic.http, after[0] - before[0], after[1] - before[1]
+    )
 
 
 def hold(page: Any) -> None:
@@ -325,7 +387,8 @@ def playing(tabs: Any, server: Server) -> dict[str, Any]:
     simulate(page)
     server.settle(1)
     page.evaluate(WATCH)
-    levels, end = [], time.monotonic() + PLAY_S
+    levels = []
+    end = time.monotonic() + PLAY_S
     ended = page.get_by_role("button", name="Play").locator("i", has_text="play_arrow")
     while time.monotonic() < end:
         if ended.is_visible():
@@ -334,14 +397,19 @@ def playing(tabs: Any, server: Server) -> dict[str, Any]:
         levels.append(server.memory_mb() + server.workers()[0].memory_full_info().uss / 1e6)
     frames = int(page.evaluate("window.drawn.length"))
     page.close()
-    return growth(f"memory over {PLAY_S:.0f} s of playing, {frames} frames", levels[len(levels) // 10 :])
+    return growth(
+        f"memory over {PLAY_S:.0f} s of playing, {frames} frames", levels[len(levels) // 10 :]
+    )
 
 
 def growth(name: str, levels: list[float]) -> dict[str, Any]:
     """Growth between the medians of either half of some levels of memory, MB."""
     half = len(levels) // 2
-    before, after = float(np.median(levels[:half])), float(np.median(levels[half:]))
-    return verdict(name, 100 * (after - before) / before, "%", f"{before:.0f} to {after:.0f} MB", 2.0)
+    before = float(np.median(levels[:half]))
+    after = float(np.median(levels[half:]))
+    return verdict(
+        name, 100 * (after - before) / before, "%", f"{before:.0f} to {after:.0f} MB", 2.0
+    )
 
 
 def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
@@ -350,7 +418,8 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
     first.evaluate(WATCH)
     alone = delays_ms(first, PRESSES)
     lower_priority()
-    others, during = [new_page(other.new_context()) for _ in range(CROWD - 1)], list[float]()
+    others = [new_page(other.new_context()) for _ in range(CROWD - 1)]
+    during = list[float]()
     for page in others:
         page.goto(server.url, wait_until="commit")
         during += delays_ms(first, 2).tolist()
@@ -363,10 +432,13 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
     begin = time.monotonic()
     others[0].close()
     shown(others[WORKERS_LIMIT - 1])
-    waited_s = time.monotonic() - begin - RECONNECT_S  # in which the closed page could have come back
+    waited_s = (
+        time.monotonic() - begin - RECONNECT_S
+    )  # in which the closed page could have come back
     for page in (first, *others[1:]):
         page.close()
-    median, worst = float(np.median(alone)), float(np.max(during))
+    median = float(np.median(alone))
+    worst = float(np.max(during))
     what = f"beyond {median:.0f} ms alone; median {np.median(during):.0f} ms"
     return [
         verdict("a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0),

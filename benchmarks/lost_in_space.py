@@ -82,7 +82,9 @@ SHEFEX = (14.87, 11.15)
 DENSE = ((17, 13), 1024, 6.0, 0.2)
 NARROW = (6, 6), 1024, 7.5, 0.2
 WORKLOADS = (
-    Workload("PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))),
+    Workload(
+        "PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))
+    ),
     Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15, bar_percent=100, bar_ms=0.05),
     Workload("SHEFEX, half false", SHEFEX, 659, 5.75, 0.1, brightest=15, false_share=0.5),
     Workload("SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2),
@@ -90,10 +92,24 @@ WORKLOADS = (
     Workload("hard, V < 7", (10, 7.5), 1024, 7.0, 1.0, false=3, missing=0.2),
     Workload("17 x 13 deg, half false", *DENSE, false_share=0.5, bar_percent=99.5),
     Workload("17 x 13 deg, 70 % false", *DENSE, false_share=0.7, bar_percent=97, bar_ms=5),
-    Workload("the same, half false, brighter", *DENSE, false_share=0.5, false_brighter=True, bar_percent=98, bar_ms=20),
+    Workload(
+        "the same, half false, brighter",
+        *DENSE,
+        false_share=0.5,
+        false_brighter=True,
+        bar_percent=98,
+        bar_ms=20,
+    ),
     Workload("6 x 6 deg, 70 % false", *NARROW, false_share=0.7, bar_percent=92),
     Workload("6 x 6 deg, 25 hot pixels, a lattice", *NARROW, lattice=5, bar_percent=98, bar_ms=10),
-    Workload("the same, brighter than any star", *NARROW, lattice=5, false_brighter=True, bar_percent=98, bar_ms=10),
+    Workload(
+        "the same, brighter than any star",
+        *NARROW,
+        lattice=5,
+        false_brighter=True,
+        bar_percent=98,
+        bar_ms=10,
+    ),
     Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7, bar_percent=99),
     Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7, bar_percent=97),
     Workload(
@@ -107,8 +123,22 @@ WORKLOADS = (
         bar_percent=99.5,
         bar_ms=1,
     ),
-    Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.05, focal_uncertainty=0.05),
-    Workload("SHEFEX, focal off 1 %, assumed exact", SHEFEX, 659, 5.75, 0.1, focal_error=0.01, bar_percent=99.5),
+    Workload(
+        "17 x 13 deg, half false, the same",
+        *DENSE,
+        false_share=0.5,
+        focal_error=0.05,
+        focal_uncertainty=0.05,
+    ),
+    Workload(
+        "SHEFEX, focal off 1 %, assumed exact",
+        SHEFEX,
+        659,
+        5.75,
+        0.1,
+        focal_error=0.01,
+        bar_percent=99.5,
+    ),
     Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.01),
 )
 
@@ -141,23 +171,28 @@ def fields(work: Workload, stars: catalog.StarCatalog, count: int, seed: int) ->
 
 def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) -> Field:
     """One random frame."""
-    camera, truth = work.camera, Rotation.random(rng=rng)
+    camera = work.camera
+    truth = Rotation.random(rng=rng)
     xy = camera.pixels(truth.apply(stars.vectors))
     row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
     row = row[rng.random(len(row)) >= work.missing]
     mag = stars.v_mag[row] + MAGNITUDE_SIGMA * rng.standard_normal(len(row))
     # With a limit on the centroids, the false share counts within the limit; 1000 means no limit.
     true = round(work.brightest * (1 - work.false_share)) if work.brightest < 1000 else 1000
-    row, mag = row[np.argsort(mag)[:true]], np.sort(mag)[:true]
+    row = row[np.argsort(mag)[:true]]
+    mag = np.sort(mag)[:true]
     false = work.false + round(len(row) * work.false_share / (1 - work.false_share))
     detected = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
     false_xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
     if work.lattice:
         steps = (np.arange(work.lattice) + 0.5) / work.lattice
         x, y = np.meshgrid(np.round(steps * camera.width_px), np.round(steps * camera.height_px))
-        false_xy, false = np.column_stack([x.ravel(), y.ravel()]), work.lattice**2
+        false_xy = np.column_stack([x.ravel(), y.ravel()])
+        false = work.lattice**2
     xy = np.concatenate([detected, false_xy])
-    false_mag = rng.choice(stars.v_mag, false) - (stars.v_mag.max() - mag.min(initial=0) if work.false_brighter else 0)
+    false_mag = rng.choice(stars.v_mag, false) - (
+        stars.v_mag.max() - mag.min(initial=0) if work.false_brighter else 0
+    )
     mag = np.concatenate([mag, false_mag])
     order = np.argsort(mag)
     sigma = np.full(len(xy), work.noise_px)
@@ -180,7 +215,13 @@ Solve = Callable[[Field], Rotation | None]
 
 def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
     """The skysim star tracker with one of its identifiers."""
-    settings = Settings(identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
+    settings = Settings(
+        identifier=identifier,
+        centroid_sigma_px=0.0,
+        field_stars=1e9,
+        merge_px=0.0,
+        zero_point_mag=0.0,
+    )
     camera = work.camera.zoomed(1 + work.focal_error)
     tracker = StarTracker(camera, stars, stars.vectors, settings, 1.05 * work.focal_uncertainty)
     return lambda frame: tracker.solve_centroids(frame.centroids).cam_from_ref
@@ -188,7 +229,8 @@ def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
 
 def solver(work: Workload, stars: catalog.StarCatalog, name: str) -> Solve | None:
     """A peer by name, else ours with that identifier; None for a peer that is not installed or not made for it."""
-    camera, uncertainty = work.camera.zoomed(1 + work.focal_error), 1.05 * work.focal_uncertainty
+    camera = work.camera.zoomed(1 + work.focal_error)
+    uncertainty = 1.05 * work.focal_uncertainty
     if name == "tetra3rs":
         solve = peers.tetra3rs(camera, work.noise_px, uncertainty)
     elif name == "cedar":
@@ -206,7 +248,10 @@ def score(work: Workload, count: int, seed: int, name: str) -> dict[str, float] 
     if solve is None:
         return None
     build_s = time.perf_counter() - begin
-    ms, solved, wrong, possible = [], 0, 0, 0
+    ms = []
+    solved = 0
+    wrong = 0
+    possible = 0
     for n, frame in enumerate(fields(work, stars, count, seed)):
         if n == 0:
             solve(frame)  # compiles
@@ -218,19 +263,30 @@ def score(work: Workload, count: int, seed: int, name: str) -> dict[str, float] 
         if answer is None:
             continue
         right = (answer * frame.cam_from_icrs.inv()).magnitude() < WRONG_RAD
-        oracle_right = best is not None and (best * frame.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        oracle_right = (
+            best is not None and (best * frame.cam_from_icrs.inv()).magnitude() < WRONG_RAD
+        )
         solved += right
         wrong += not right and (oracle_right or best is None)
     found, mistaken, oracles = (100 * part / count for part in (solved, wrong, possible))
     middle, late = np.percentile(ms, [50, 99])
-    return {"found": found, "wrong": mistaken, "oracle": oracles, "ms": middle, "p99": late, "build": build_s}
+    return {
+        "found": found,
+        "wrong": mistaken,
+        "oracle": oracles,
+        "ms": middle,
+        "p99": late,
+        "build": build_s,
+    }
 
 
 def line(work: Workload, name: str, scored: dict[str, float] | None) -> str:
     """One table line."""
     if scored is None:
         return f"{work.name:36s} {name:10s} not installed, or no database for this field"
-    numbers = "{found:8.2f} {wrong:7.2f} {oracle:8.2f} {ms:8.3f} {p99:8.2f} {build:7.2f}".format(**scored)
+    numbers = "{found:8.2f} {wrong:7.2f} {oracle:8.2f} {ms:8.3f} {p99:8.2f} {build:7.2f}".format(
+        **scored
+    )
     return f"{work.name:36s} {name:10s} {numbers}"
 
 
@@ -239,7 +295,8 @@ def measure(count: int = 200, seed: int = 1) -> list[dict[str, Any]]:
     rows = []
     for number, work in enumerate(WORKLOADS):
         scored = {name: score(work, count, seed, name) for name in ("default", *PEERS)}
-        mine, theirs = scored["default"], {name: scored[name] for name in PEERS if scored[name] is not None}
+        mine = scored["default"]
+        theirs = {name: scored[name] for name in PEERS if scored[name] is not None}
         assert mine is not None
         best = max(theirs, key=lambda name: theirs[name]["found"], default=None)
         for key, unit, bar, least in (
@@ -247,7 +304,9 @@ def measure(count: int = 200, seed: int = 1) -> list[dict[str, Any]]:
             ("wrong", "%", 0.0, False),
             ("ms", "ms", work.bar_ms, False),
         ):
-            row = verdict(f"{number + 1}. {work.name}: {key}", mine[key], unit, best or "-", bar, least)
+            row = verdict(
+                f"{number + 1}. {work.name}: {key}", mine[key], unit, best or "-", bar, least
+            )
             rows.append(row | {"peer_value": theirs[best][key] if best else None})
     return rows
 

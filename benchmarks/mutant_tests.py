@@ -68,7 +68,10 @@ class Recorder:
     """Notes the time, the outcome and the entered functions of each test."""
 
     def __init__(self, tree: Path, out: Path) -> None:
-        self.tree, self.out, self.tests, self.failed = tree, out, {}, set()
+        self.tree = tree
+        self.out = out
+        self.tests = {}
+        self.failed = set()
         self.entered = Entered(tree)
         self.imported: list[Key] = []
 
@@ -80,7 +83,8 @@ class Recorder:
         began_s = time.process_time()
         self.entered.start()
         result = yield
-        entered, time_s = self.entered.stop(), time.process_time() - began_s
+        entered = self.entered.stop()
+        time_s = time.process_time() - began_s
         self.tests[item.nodeid] = {"time_s": round(time_s, 4), "entered": entered}
         return result
 
@@ -90,7 +94,9 @@ class Recorder:
 
     def pytest_sessionfinish(self) -> None:
         passed = {name: test for name, test in self.tests.items() if name not in self.failed}
-        self.out.write_text(json.dumps({"imported": self.imported, "tests": passed, "failed": sorted(self.failed)}))
+        self.out.write_text(
+            json.dumps({"imported": self.imported, "tests": passed, "failed": sorted(self.failed)})
+        )
 
 
 class Program:
@@ -121,7 +127,9 @@ class Program:
 
     def calls_of(self, key: Key) -> set[Key | None]:
         """Compiled functions that a function names: a call of them enters no Python function."""
-        found = {one for function in self.functions.get(key, ()) for one in compiled_names(function)}
+        found = {
+            one for function in self.functions.get(key, ()) for one in compiled_names(function)
+        }
         return {key_of(one.py_func.__code__, self.tree) for one in found}
 
 
@@ -129,7 +137,9 @@ def compiled_names(function: FunctionType) -> Iterator[CPUDispatcher]:
     """Compiled functions that the names in a function's code stand for, in tables and modules too."""
     names = {name for code in nested(function.__code__) for name in code.co_names}
     values = [function.__globals__.get(name) for name in names]
-    values += [cell.cell_contents for cell in function.__closure__ or () if cell != CellType()]  # not an empty one
+    values += [
+        cell.cell_contents for cell in function.__closure__ or () if cell != CellType()
+    ]  # not an empty one
     for value in values:
         if isinstance(value, ModuleType):
             members = [vars(value).get(name) for name in names]
@@ -144,10 +154,13 @@ class Server:
     """Answers requests: which tests enter given functions, and what these tests say of a mutant."""
 
     def __init__(self, tree: Path, requests: Connection, recorded: dict[str, Any]) -> None:
-        self.tree, self.requests, self.recorded = tree, requests, recorded
+        self.tree = tree
+        self.requests = requests
+        self.recorded = recorded
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        self.session, self.items = session, {item.nodeid: item for item in session.items}
+        self.session = session
+        self.items = {item.nodeid: item for item in session.items}
         self.program = Program(self.tree)
         self.tests: dict[Key, set[str]] = defaultdict(set)  # that enter each function
         calls: dict[Key, set[Any]] = {}
@@ -164,7 +177,11 @@ class Server:
 
     def tests_of(self, keys: list[Key]) -> list[str]:
         """Tests that enter a function or, if it is compiled, one that calls it."""
-        users = {key_of(one.py_func.__code__, self.tree) for key in keys for one in self.program.users(key)}
+        users = {
+            key_of(one.py_func.__code__, self.tree)
+            for key in keys
+            for one in self.program.users(key)
+        }
         return sorted(set().union(*(self.tests.get(key, ()) for key in {*keys, *users})))
 
     def try_code(self, key: Key, code: bytes, names: list[str], scratch: Path) -> str:
@@ -174,7 +191,9 @@ class Server:
             return "import anew"
 
         def change() -> None:
-            numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(scratch)  # of what is imported from now on
+            numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(
+                scratch
+            )  # of what is imported from now on
             for function in self.program.functions[key]:
                 function.__code__ = marshal.loads(code)
             for one in users:
@@ -189,7 +208,9 @@ def limit_s(time_s: float) -> float:
     return 60 + 10 * time_s
 
 
-def run_items(session: pytest.Session, items: list[Any], recorded: Any, change: Callable[[], None]) -> str:
+def run_items(
+    session: pytest.Session, items: list[Any], recorded: Any, change: Callable[[], None]
+) -> str:
     """Run tests up to the first that fails; a test that uses far more processor time than before ends the process."""
     failed: list[str] = []
 
@@ -233,10 +254,15 @@ def forked(run: Callable[[], str], wall_s: float = 900) -> str:
     return said or f"{BROKEN} no answer"
 
 
-def order(names: list[str], distance: Callable[[str], float], times_s: Counter[str], budget_s: float) -> list[str]:
+def order(
+    names: list[str], distance: Callable[[str], float], times_s: Counter[str], budget_s: float
+) -> list[str]:
     """Tests of the nearest files first, the quick ones of each file first, as many as take the budget."""
-    chosen, total_s = [], 0.0
-    for name in sorted(names, key=lambda name: (distance(file := name.split("::")[0]), file, times_s[name])):
+    chosen = []
+    total_s = 0.0
+    for name in sorted(
+        names, key=lambda name: (distance(file := name.split("::")[0]), file, times_s[name])
+    ):
         if total_s + times_s[name] <= budget_s:
             chosen.append(name)
             total_s += times_s[name]

@@ -44,11 +44,24 @@ import pytest
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 
-from benchmarks.mutant_tests import BROKEN, OPTIONS, Key, Recorder, Server, forked, limit_s, nested, order
+from benchmarks.mutant_tests import (
+    BROKEN,
+    OPTIONS,
+    Key,
+    Recorder,
+    Server,
+    forked,
+    limit_s,
+    nested,
+    order,
+)
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "out" / "mutants"
-TREE, CACHE, SCRATCH, BASELINE = OUT / "tree", OUT / "cache", OUT / "scratch", OUT / "baseline.json"
+TREE = OUT / "tree"
+CACHE = OUT / "cache"
+SCRATCH = OUT / "scratch"
+BASELINE = OUT / "baseline.json"
 CONTROL = "--control" * ("--control" in sys.argv)
 PACKAGES = {  # where the tests of each are
     "estimator": ("estimator",),
@@ -67,7 +80,9 @@ NO_PLACE = ("decorator", "raise_stmt", "fstring", "import_from", "tfpdef")
 
 def is_left_out(node: Any) -> bool:
     """Whether a parso node is in an annotation, a decorator, an error's message or an import, or cannot be changed."""
-    if node.type == "except_clause" and "." in node.get_code():  # cosmic-ray replaces plain names of exceptions only
+    if (
+        node.type == "except_clause" and "." in node.get_code()
+    ):  # cosmic-ray replaces plain names of exceptions only
         return True
     while parent := node.parent:
         if parent.type in NO_PLACE:
@@ -82,11 +97,13 @@ def is_left_out(node: Any) -> bool:
 
 def places(module: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
     """Mutable places (line, column) of a module, and the operators' names and occurrences that change each."""
-    found, tree = defaultdict(list), get_ast(module.read_text())
+    found = defaultdict(list)
+    tree = get_ast(module.read_text())
     for name in sorted(set(cosmic_ray.plugins.operator_names())):
         if LEFT_OUT.search(name):
             continue
-        operator, occurrence = cosmic_ray.plugins.get_operator(name)(), 0
+        operator = cosmic_ray.plugins.get_operator(name)()
+        occurrence = 0
         for node in ast_nodes(tree):
             for begin, _ in operator.mutation_positions(node):
                 if not is_left_out(node):
@@ -98,12 +115,22 @@ def places(module: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
 def draw(count: int, seed: int) -> list[dict[str, Any]]:
     """So many mutants, in random order."""
     modules = sorted(path for package in PACKAGES for path in (TREE / package).rglob("*.py"))
-    every = [(path, at, how) for path in modules if path.name != "__init__.py" for at, how in places(path).items()]
+    every = [
+        (path, at, how)
+        for path in modules
+        if path.name != "__init__.py"
+        for at, how in places(path).items()
+    ]
     random = Random(seed)
     chosen = random.sample(every, min(count, len(every)))
     print(f"{len(every)} places in {len(modules)} modules; seed {seed}", flush=True)
     return [
-        {"file": str(path.relative_to(TREE)), "line": at[0], "column": at[1], "how": random.choice(how)}
+        {
+            "file": str(path.relative_to(TREE)),
+            "line": at[0],
+            "column": at[1],
+            "how": random.choice(how),
+        }
         for path, at, how in chosen
     ]
 
@@ -117,17 +144,23 @@ def imports(file: str) -> frozenset[str]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    files = (name.replace(".", "/") + ending for name in names for ending in (".py", "/__init__.py"))
+    files = (
+        name.replace(".", "/") + ending for name in names for ending in (".py", "/__init__.py")
+    )
     return frozenset(file for file in files if file.count("/") > 1 and (TREE / file).exists())
 
 
 @cache
 def importers(module: str) -> dict[str, int]:
     """The module (0), the files that import it (1), those that import these (2), and so on; tests included."""
-    files = [path for folder in (module.split("/")[0], "tests") for path in (TREE / folder).rglob("*.py")]
+    files = [
+        path for folder in (module.split("/")[0], "tests") for path in (TREE / folder).rglob("*.py")
+    ]
     direct = {name: imports(name) for name in (str(path.relative_to(TREE)) for path in files)}
     steps = {module: 0}
-    while more := {name for name, used in direct.items() if name not in steps and used & steps.keys()}:
+    while more := {
+        name for name, used in direct.items() if name not in steps and used & steps.keys()
+    }:
         steps |= dict.fromkeys(more, 1 + max(steps.values()))
     return steps
 
@@ -137,10 +170,14 @@ class Tests:
 
     def __init__(self) -> None:
         folders = [TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names]
-        files = sorted(str(path.relative_to(TREE)) for folder in folders for path in folder.rglob("test_*.py"))
+        files = sorted(
+            str(path.relative_to(TREE)) for folder in folders for path in folder.rglob("test_*.py")
+        )
         self.recorded = record(files)
         self.imported = set(map(tuple, self.recorded["imported"]))
-        self.times_s = Counter({name: test["time_s"] for name, test in self.recorded["tests"].items()})
+        self.times_s = Counter(
+            {name: test["time_s"] for name, test in self.recorded["tests"].items()}
+        )
         self.requests, theirs = Pipe()
         if not os.fork():
             session(files, Server(TREE, theirs, self.recorded))
@@ -154,20 +191,33 @@ class Tests:
         """Tests that enter one of these functions, nearest first, then others of the nearest files."""
         steps = importers(module)
         own = tuple(
-            f"tests/{name}/" for package in PACKAGES if module.startswith(package) for name in PACKAGES[package]
+            f"tests/{name}/"
+            for package in PACKAGES
+            if module.startswith(package)
+            for name in PACKAGES[package]
         )
 
         def distance(file: str) -> float:
             return steps.get(file, 99) + 0.5 * (not file.startswith(own))
 
         first = order(self.ask("tests_of", keys), distance, self.times_s, BUDGET_S)
-        rest = [name for name in self.times_s if name not in set(first) and distance(name.split("::")[0]) < 4]
-        return first + order(rest, distance, self.times_s, OTHERS_S - sum(self.times_s[name] for name in first))
+        rest = [
+            name
+            for name in self.times_s
+            if name not in set(first) and distance(name.split("::")[0]) < 4
+        ]
+        return first + order(
+            rest, distance, self.times_s, OTHERS_S - sum(self.times_s[name] for name in first)
+        )
 
 
 def record(files: list[str]) -> dict[str, Any]:
     """Run the tests of files that are new or changed since the last call; this fills numba's cache, too."""
-    old = json.loads(BASELINE.read_text()) if BASELINE.exists() else {"digests": {}, "imported": [], "tests": {}}
+    old = (
+        json.loads(BASELINE.read_text())
+        if BASELINE.exists()
+        else {"digests": {}, "imported": [], "tests": {}}
+    )
     digests = {file: hashlib.sha1((TREE / file).read_bytes()).hexdigest() for file in files}
     changed = [file for file in files if old["digests"].get(file) != digests[file]]
     if not changed:
@@ -179,7 +229,11 @@ def record(files: list[str]) -> dict[str, Any]:
     kept = {name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed}
     if new["failed"]:
         print("left out, for they fail without a mutant:", *new["failed"], sep="\n  ")
-    merged = {"digests": digests, "imported": old["imported"] + new["imported"], "tests": kept | new["tests"]}
+    merged = {
+        "digests": digests,
+        "imported": old["imported"] + new["imported"],
+        "tests": kept | new["tests"],
+    }
     BASELINE.write_text(json.dumps(merged))
     return merged
 
@@ -193,7 +247,10 @@ def session(words: list[str], plugin: Any) -> str:
 
 def environment() -> dict[str, str]:
     """One thread, the tree's packages and its cache of compiled code."""
-    threads = {name: "1" for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONDONTWRITEBYTECODE")}
+    threads = {
+        name: "1"
+        for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONDONTWRITEBYTECODE")
+    }
     return os.environ | threads | {"PYTHONPATH": str(TREE), "NUMBA_CACHE_DIR": str(CACHE)}
 
 
@@ -214,7 +271,8 @@ def function_at(source: str, at: tuple[int, int]) -> ast.FunctionDef | None:
     while nodes:
         node = nodes.pop()
         if isinstance(node, ast.FunctionDef):
-            begin, end = node.body[0], (node.end_lineno, node.end_col_offset)
+            begin = node.body[0]
+            end = (node.end_lineno, node.end_col_offset)
             if (begin.lineno, begin.col_offset) <= at < end:
                 return node
         elif isinstance(node, ast.Module | ast.ClassDef | ast.If):
@@ -235,7 +293,9 @@ def code_of(source: str, path: Path, function: ast.FunctionDef) -> tuple[Key, Co
     """A function's code when the module's source is compiled, and its key."""
     first = first_line(function)
     module = compile(source, str(path), "exec", dont_inherit=True)
-    code = next(one for one in nested(module) if (one.co_firstlineno, one.co_name) == (first, function.name))
+    code = next(
+        one for one in nested(module) if (one.co_firstlineno, one.co_name) == (first, function.name)
+    )
     return (str(path.relative_to(TREE)), first, function.name), code
 
 
@@ -274,10 +334,16 @@ def try_module(names: list[str], tests: Tests) -> str:
 
 def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
     """Test one mutant; the module is put back, with the time stamp that compiled code is kept for."""
-    path, began_s = TREE / mutant["file"], time.monotonic()
-    source, stamp_ns = path.read_text(), path.stat().st_mtime_ns
+    path = TREE / mutant["file"]
+    began_s = time.monotonic()
+    source = path.read_text()
+    stamp_ns = path.stat().st_mtime_ns
     name, occurrence = mutant["how"]
-    mutated = source if CONTROL else mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence)
+    mutated = (
+        source
+        if CONTROL
+        else mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence)
+    )
     lines = zip(source.splitlines(), mutated.splitlines(), strict=False)
     old, new = next((pair for pair in lines if len(set(pair)) > 1), ("", ""))
     function = function_at(source, (mutant["line"], mutant["column"]))
@@ -300,13 +366,21 @@ def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
         outcome = "survived"
     if outcome.startswith(BROKEN):
         raise SystemExit(f"{mutant}: {outcome}, {len(names)} tests")
-    facts = {"old": old.strip(), "new": new.strip(), "outcome": outcome, "tests": len(names), "fresh": function is None}
+    facts = {
+        "old": old.strip(),
+        "new": new.strip(),
+        "outcome": outcome,
+        "tests": len(names),
+        "fresh": function is None,
+    }
     return mutant | facts | {"seconds": round(time.monotonic() - began_s, 1)}
 
 
 def use_copy() -> None:
     """Import the packages from the copy, and the benchmarks, which imported them from elsewhere, once more."""
-    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")]:
+    for name in [
+        name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")
+    ]:
         del sys.modules[name]
     sys.path.insert(0, str(TREE))
     importlib.invalidate_caches()  # Python remembers that the copy's folder did not exist when it started
@@ -314,9 +388,12 @@ def use_copy() -> None:
 
 def copy_tree() -> None:
     """Bring the copy up to date; unchanged files keep their time stamps, for which numba keeps compiled code."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
     for name in filter(None, listed.split("\0")):
-        source, copy = ROOT / name, TREE / name
+        source = ROOT / name
+        copy = TREE / name
         if not copy.exists() or copy.read_bytes() != source.read_bytes():
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, copy)
@@ -332,13 +409,21 @@ def main() -> None:
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
     count, seed = (int(word) for word in (words + ["300", "1"][len(words) :]))
     if os.environ.get("NUMBA_CACHE_DIR") != str(CACHE):  # before any import reads them
-        os.execve(sys.executable, [sys.executable, "-m", "benchmarks.mutants", *sys.argv[1:]], environment())
+        os.execve(
+            sys.executable,
+            [sys.executable, "-m", "benchmarks.mutants", *sys.argv[1:]],
+            environment(),
+        )
     OUT.mkdir(parents=True, exist_ok=True)
     copy_tree()
     use_copy()
-    results, tests, drawn = OUT / f"{seed}{CONTROL}.jsonl", Tests(), draw(count, seed)
+    results = OUT / f"{seed}{CONTROL}.jsonl"
+    tests = Tests()
+    drawn = draw(count, seed)
     lines = results.read_text().splitlines() if results.exists() else []
-    done = {key_of(result): result for result in map(json.loads, lines)}  # of a mutant that was tried again, the last
+    done = {
+        key_of(result): result for result in map(json.loads, lines)
+    }  # of a mutant that was tried again, the last
     survivors = [result for result in done.values() if result["outcome"] == "survived"]
     left = [mutant for mutant in drawn if key_of(mutant) not in done]
     for mutant in survivors if "--again" in sys.argv else left:
@@ -346,11 +431,19 @@ def main() -> None:
         with results.open("a") as file:
             file.write(json.dumps(result) + "\n")
         survived = sum(each["outcome"] == "survived" for each in done.values())
-        print(f"{len(done)} tried, {len(done) - survived} killed; {result['file']}:{result['line']}", end=" ")
-        print(f"{result['old']!r} -> {result['new']!r}: {result['outcome']} ({result['seconds']} s)", flush=True)
+        print(
+            f"{len(done)} tried, {len(done) - survived} killed; {result['file']}:{result['line']}",
+            end=" ",
+        )
+        print(
+            f"{result['old']!r} -> {result['new']!r}: {result['outcome']} ({result['seconds']} s)",
+            flush=True,
+        )
     for result in done.values():
         if result["outcome"] == "survived":
-            print(f"survived: {result['file']}:{result['line']}\n  - {result['old']}\n  + {result['new']}")
+            print(
+                f"survived: {result['file']}:{result['line']}\n  - {result['old']}\n  + {result['new']}"
+            )
     killed = sum(each["outcome"] != "survived" for each in done.values())
     print(f"{killed} of {len(done)} killed, {100 * killed / max(len(done), 1):.1f} %")
 

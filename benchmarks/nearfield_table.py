@@ -39,7 +39,9 @@ class Geometry:
         return Lever(np.array([0.0, 0.0, self.lever_m]), Rotation.identity())
 
 
-def _dome(center_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]) -> LedMap:
+def _dome(
+    center_in: tuple[float, float, float], semi_axes_in: tuple[float, float, float]
+) -> LedMap:
     """A surface without lights; infinite semi-axes make it a plane."""
     nowhere = np.empty(0, dtype=np.int64), np.empty((0, 3))
     return LedMap(*nowhere, np.array(center_in) * INCH_M, np.array(semi_axes_in) * INCH_M)
@@ -71,7 +73,9 @@ class Trial:
     pixels: NDArray[np.float64]
 
 
-def trial(geometry: Geometry, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0) -> Trial:
+def trial(
+    geometry: Geometry, tilt_deg: float, rng: np.random.Generator, noise_px: float = 0.0
+) -> Trial:
     """A trial at random yaw and tilt direction, with lights where the rays of random pixels meet the true surface.
 
     The start attitude is START_OFF_RAD from the truth, about a random axis.
@@ -79,22 +83,31 @@ def trial(geometry: Geometry, tilt_deg: float, rng: np.random.Generator, noise_p
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
     tilt = np.radians(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0])
     truth = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, yaw])
-    camera, lever = geometry.camera, geometry.lever
-    pixels = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (geometry.lights, 2))
+    camera = geometry.camera
+    lever = geometry.lever
+    pixels = rng.uniform(
+        -0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (geometry.lights, 2)
+    )
     rays_lab = (lever.cam_from_body * truth).inv().apply(camera.rays(pixels))
     place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), geometry.surface)
     leds = LedMap(np.arange(geometry.lights), place, np.zeros(3), np.full(3, geometry.radius_m))
     axis = rng.standard_normal(3)
     start = Rotation.from_rotvec(START_OFF_RAD * axis / np.linalg.norm(axis)) * truth
-    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal((geometry.lights, 2))
+    seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal(
+        (geometry.lights, 2)
+    )
     return Trial(truth, start, leds, seen)
 
 
 def solved(method: str, geometry: Geometry, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
     """body_from_lab and its covariance from one method."""
     rays = geometry.camera.rays(one.pixels)
-    sigma_rad = fitted_sigma_rad(method, rays, np.full(geometry.lights, NOISE_PX / geometry.camera.focal_px))
-    return SOLVERS[method](rays, sigma_rad, one.leds.position_m, one.leds, geometry.lever, one.start)
+    sigma_rad = fitted_sigma_rad(
+        method, rays, np.full(geometry.lights, NOISE_PX / geometry.camera.focal_px)
+    )
+    return SOLVERS[method](
+        rays, sigma_rad, one.leds.position_m, one.leds, geometry.lever, one.start
+    )
 
 
 def errors_deg(
@@ -125,11 +138,17 @@ def table(trials: int, seed: int) -> None:
             for n in range(4):
                 tilts = sorted({geometry.tilts_deg[n] for geometry in GEOMETRIES.values()})
                 cells = [
-                    cross_and_roll(errors_deg(method, geometry, geometry.tilts_deg[n], trials, seed, noise_px))
+                    cross_and_roll(
+                        errors_deg(method, geometry, geometry.tilts_deg[n], trials, seed, noise_px)
+                    )
                     for geometry in GEOMETRIES.values()
                 ]
                 name = f"{method}, {' / NPS '.join(f'{tilt:g}' for tilt in reversed(tilts))}"
-                print(f"| {name} | " + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells) + " |")
+                print(
+                    f"| {name} | "
+                    + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells)
+                    + " |"
+                )
 
 
 if __name__ == "__main__":

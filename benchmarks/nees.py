@@ -23,7 +23,8 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.results import metrics
 
-FIELDS, SEED = 500, 25
+FIELDS = 500
+SEED = 25
 NEES_RANGE = 2.5, 3.5
 TAIL = float(scipy.stats.chi2.ppf(0.999, 3))
 TAIL_FACTOR = 2.0
@@ -44,14 +45,18 @@ class Condition:
         corner2_px2 = (camera.width_px**2 + camera.height_px**2) / 4
         cubic = self.corner_px / corner2_px2**1.5
         radial = 1 + self.focal_drift + cubic * np.sum(offset_px**2, axis=1)
-        xy_px, sigma_px = camera.center_px + radial[:, None] * offset_px, frame.centroids.sigma_px / self.noise_factor
+        xy_px = camera.center_px + radial[:, None] * offset_px
+        sigma_px = frame.centroids.sigma_px / self.noise_factor
         return replace(frame, centroids=replace(frame.centroids, xy_px=xy_px, sigma_px=sigma_px))
 
 
 CONDITIONS = (
     Condition("right model"),
     *(Condition(f"noise understated {factor:g}x", noise_factor=factor) for factor in (2, 3, 5)),
-    *(Condition(f"focal length off {percent:g} %", focal_drift=percent / 100) for percent in (0.1, 0.2, 0.3)),
+    *(
+        Condition(f"focal length off {percent:g} %", focal_drift=percent / 100)
+        for percent in (0.1, 0.2, 0.3)
+    ),
     *(Condition(f"distortion of {px:g} px", corner_px=px) for px in (1, 2, 3)),
 )
 WORKS = tuple(
@@ -65,13 +70,17 @@ WORKS = tuple(
 
 
 def measure(
-    works: tuple[Workload, ...] = WORKS, conditions: tuple[Condition, ...] = CONDITIONS, fields: int = FIELDS
+    works: tuple[Workload, ...] = WORKS,
+    conditions: tuple[Condition, ...] = CONDITIONS,
+    fields: int = FIELDS,
 ) -> list[dict[str, Any]]:
     """Solved and wrong share, mean NEES and its 99.9th percentile, for each camera and condition."""
     rows = []
     for work in works:
         stars = catalog.brighter_than(catalog.hipparcos(), work.limit_mag)
-        settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
+        settings = Settings(
+            centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0
+        )
         tracker = StarTracker(work.camera, stars, stars.vectors, settings)
         for condition in conditions:
             frames = (
@@ -90,23 +99,29 @@ def scores(tracker: StarTracker, frames: Iterator[Field]) -> Floats:
         if attitude.cam_from_ref is None or attitude.covariance_rad2 is None:
             continue
         error = (attitude.cam_from_ref * frame.cam_from_icrs.inv()).as_rotvec()
-        out.append((error @ np.linalg.solve(attitude.covariance_rad2, error), np.linalg.norm(error)))
+        out.append(
+            (error @ np.linalg.solve(attitude.covariance_rad2, error), np.linalg.norm(error))
+        )
     return np.array(out).reshape(-1, 2)
 
 
 def _rows(name: str, found: Floats, fields: int) -> list[dict[str, Any]]:
     """Rows of one camera and condition."""
-    nees, wrong = found[:, 0], int(np.sum(found[:, 1] > metrics.WRONG_RAD))
+    nees = found[:, 0]
+    wrong = int(np.sum(found[:, 1] > metrics.WRONG_RAD))
     rows = [
         row(f"{name}: solved", 100 * len(found) / fields, "%", None, None, None),
         row(f"{name}: wrong", wrong, "fields", None, 0, wrong == 0),
     ]
     if not len(found):
         return rows
-    mean, tail = float(nees.mean()), float(np.percentile(nees, 99.9))
+    mean = float(nees.mean())
+    tail = float(np.percentile(nees, 99.9))
     low, high = NEES_RANGE
     return [
         *rows,
         row(f"{name}: NEES", mean, "", None, high, low <= mean <= high),
-        row(f"{name}: NEES, 99.9 %", tail, "", TAIL, TAIL_FACTOR * TAIL, tail <= TAIL_FACTOR * TAIL),
+        row(
+            f"{name}: NEES, 99.9 %", tail, "", TAIL, TAIL_FACTOR * TAIL, tail <= TAIL_FACTOR * TAIL
+        ),
     ]

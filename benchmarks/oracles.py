@@ -66,7 +66,9 @@ TWEAK_ORDER = {
 }  # order of astrometry.net's distortion polynomials: 1 is a lens without distortion
 SIDE = 9  # lattice points along each side of the frame at which world coordinates are compared
 CLASSES = 12  # number of brightness classes, each with its own centroid variance
-MISTAKEN = 4.0  # ratio to the usual variance above which a frame is taken to have a misidentified star
+MISTAKEN = (
+    4.0  # ratio to the usual variance above which a frame is taken to have a misidentified star
+)
 TIMES = 3.0  # tolerance as a multiple of the predicted error
 DEEPEST_G = 7.5  # limiting magnitude of tetra3rs's stars; the frames have stars to V = 6.5
 STAR_PX = 1.0  # maximum distance of a centroid from its catalog star
@@ -94,7 +96,9 @@ class Found:
         """(K,) squared residual of each star per axis, corrected for the number of fitted coefficients."""
         coefficients = (self.order + 1) * (self.order + 2) / 2 if self.order else 1.5
         count = len(self.xy_px)
-        return np.asarray(np.sum(self.left_px**2, axis=1) / 2 * count / max(count - coefficients, 1.0))
+        return np.asarray(
+            np.sum(self.left_px**2, axis=1) / 2 * count / max(count - coefficients, 1.0)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +130,10 @@ class Agreement:
     @property
     def within(self) -> bool:
         """Whether cross-boresight and roll errors are both within TIMES the predicted error."""
-        return self.cross_rad <= TIMES * self.sigma_cross_rad and abs(self.roll_rad) <= TIMES * self.sigma_roll_rad
+        return (
+            self.cross_rad <= TIMES * self.sigma_cross_rad
+            and abs(self.roll_rad) <= TIMES * self.sigma_roll_rad
+        )
 
     @property
     def wrong(self) -> bool:
@@ -162,7 +169,9 @@ def lattice(width_px: int, height_px: int) -> NDArray:
 def directions(header: fits.Header, xy_px: NDArray) -> NDArray:
     """(N, 3) directions of pixels from the WCS of a FITS header, by astropy."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FITSFixedWarning)  # astrometry.net's header belongs to no image
+        warnings.simplefilter(
+            "ignore", FITSFixedWarning
+        )  # astrometry.net's header belongs to no image
         wcs = WCS(header, fix=False)
     return unit_vectors(*wcs.all_pix2world(xy_px, 0).T)
 
@@ -206,7 +215,9 @@ def agreements(seen: Sequence[Sighting], camera: Camera) -> list[Pair]:
     for one, sigma_px in zip(seen, star_sigmas_px([each.found for each in seen]), strict=True):
         by_stars = attitude_spread(one.rays, sigma_px / camera.focal_px)
         by_plate = plate_spread(one.found, sigma_px, camera) if one.found.order else by_stars
-        held.append((agreement(one, one.coordinates, by_plate), agreement(one, one.stars, by_stars)))
+        held.append(
+            (agreement(one, one.coordinates, by_plate), agreement(one, one.stars, by_stars))
+        )
     return held
 
 
@@ -232,11 +243,17 @@ def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
         return np.array([take(variance[member == n]) for n in range(CLASSES)])
 
     def worse(usual: NDArray) -> list[float]:
-        return [float(np.mean(one.variance_px2 / usual[member])) for one, member in zip(found, members, strict=True)]
+        return [
+            float(np.mean(one.variance_px2 / usual[member]))
+            for one, member in zip(found, members, strict=True)
+        ]
 
     rough = law(np.median, range(len(found))) / np.log(2)
     usual = law(np.mean, [n for n, times in enumerate(worse(rough)) if times < MISTAKEN])
-    return [np.sqrt(usual[member] * max(1.0, times)) for member, times in zip(members, worse(usual), strict=True)]
+    return [
+        np.sqrt(usual[member] * max(1.0, times))
+        for member, times in zip(members, worse(usual), strict=True)
+    ]
 
 
 def attitude_spread(rays: NDArray, sigma_rad: NDArray) -> tuple[float, float]:
@@ -261,7 +278,9 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
 
     def monomials(xy_px: NDArray) -> NDArray:
         x, y = ((xy_px - middle) / middle).T
-        return np.column_stack([x**p * y ** (n - p) for n in range(found.order + 1) for p in range(n + 1)])
+        return np.column_stack(
+            [x**p * y ** (n - p) for n in range(found.order + 1) for p in range(n + 1)]
+        )
 
     inverse = np.linalg.pinv(monomials(found.xy_px))
     covariance = (inverse * sigma_px**2) @ inverse.T
@@ -270,7 +289,9 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
     shift = monomials(pixels).mean(axis=0)
     arms = (pixels - middle) / np.sum((pixels - middle) ** 2)
     turns = arms.T @ monomials(pixels)
-    cross_px, roll_rad = np.sqrt([2 * shift @ covariance @ shift, np.sum((turns @ covariance) * turns)])
+    cross_px, roll_rad = np.sqrt(
+        [2 * shift @ covariance @ shift, np.sum((turns @ covariance) * turns)]
+    )
     return float(cross_px / camera.focal_px), float(roll_rad)
 
 
@@ -280,16 +301,27 @@ def astrometry_net(name: str) -> Solve | None:
         return None
     camera = load(name, "astrometry.net", 1).camera
     width_deg = float(np.degrees(onboard_model.calibration(camera).fov_rad))
-    size_px, order = (camera.width_px, camera.height_px), TWEAK_ORDER[name]
+    size_px = (camera.width_px, camera.height_px)
+    order = TWEAK_ORDER[name]
     options = ["--overwrite", "--no-plots", "--no-verify", "--crpix-center", "--cpulimit", "30"]
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
     options += ["--scale-high", f"{1.05 * width_deg}", "--tweak-order", str(order)]
-    options += ["--no-remove-lines", "--uniformize", "0"]  # skip its Python steps, which need more packages
-    options += [part for kind in ("new-fits", "rdls", "match", "index-xyls") for part in (f"--{kind}", "none")]
+    options += [
+        "--no-remove-lines",
+        "--uniformize",
+        "0",
+    ]  # skip its Python steps, which need more packages
+    options += [
+        part
+        for kind in ("new-fits", "rdls", "match", "index-xyls")
+        for part in (f"--{kind}", "none")
+    ]
 
     def solve(path: Path, frame: Frame) -> Found | None:
         stem = path.with_suffix("")
-        subprocess.run(["solve-field", *options, str(path)], capture_output=True, check=True, cwd=path.parent)
+        subprocess.run(
+            ["solve-field", *options, str(path)], capture_output=True, check=True, cwd=path.parent
+        )
         if not stem.with_suffix(".solved").exists():
             return None
         matched = fits.getdata(stem.with_suffix(".corr"))
@@ -309,7 +341,8 @@ def tetra3rs(name: str) -> Solve | None:
     if importlib.util.find_spec("tetra3rs") is None:
         return None
     scene = load(name, "tetra3rs", 1)
-    camera, settings = onboard_model.assumed_camera(scene), tracker_settings.assumed_settings(scene)
+    camera = onboard_model.assumed_camera(scene)
+    settings = tracker_settings.assumed_settings(scene)
     nothing = np.zeros(0)
     tracker = tetra3rs_tracker.Tetra3rs(
         adapter.build_setup(scene, camera, settings, Stars(nothing.astype(int), nothing, nothing))
@@ -319,7 +352,9 @@ def tetra3rs(name: str) -> Solve | None:
     def solve(path: Path, frame: Frame) -> Found | None:
         seen = tracker.extract(fits.getdata(path).astype(np.uint16), max_centroids=60, threads=1)
         answer = tracker.database.solve_from_centroids(
-            seen.centroids, camera_model=tracker.camera, observer_velocity_km_s=tracker.velocity_km_s
+            seen.centroids,
+            camera_model=tracker.camera,
+            observer_velocity_km_s=tracker.velocity_km_s,
         )
         if not answer:
             return None
@@ -339,14 +374,17 @@ def its_stars(
     """
     radius_deg = 0.7 * tracker.camera.fov_deg
     listed = tracker.database.cone_search(answer.crval_ra_deg, answer.crval_dec_deg, radius_deg)
-    places = np.array([(star.ra_deg, star.dec_deg) for star in listed if star.magnitude < DEEPEST_G])
+    places = np.array(
+        [(star.ra_deg, star.dec_deg) for star in listed if star.magnitude < DEEPEST_G]
+    )
     moved = unit_vectors(*places.T) + np.array(tracker.velocity_km_s) / SPEED_OF_LIGHT_KM_S
     moved /= np.linalg.norm(moved, axis=1, keepdims=True)
     there_px = np.nan_to_num(np.column_stack(answer.world_to_pixel(*radec_deg(moved))), nan=1e6)
     seen = np.array([(one.x, one.y, one.brightness) for one in centroids])
     apart_px, star = cKDTree(there_px).query(seen[:, :2])
     near = apart_px < STAR_PX
-    (x, y, brightness), star = seen[near].T, star[near]
+    star = star[near]
+    (x, y, brightness) = seen[near].T
     xy_px = np.column_stack([x, y])
     return xy_px + tracker.image_center_px, xy_px - there_px[star], brightness, moved[star]
 
@@ -356,7 +394,8 @@ ORACLES = {"tetra3rs": tetra3rs, "astrometry.net": astrometry_net}
 
 def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list[Pair]:
     """Errors and predictions of every frame that the oracle solves."""
-    seen, scene = [], load(name, who, frames)
+    seen = []
+    scene = load(name, who, frames)
     for frame, truth in render_frames(scene, seed):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "frame.fits"
@@ -369,7 +408,9 @@ def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list
 
 def squares(solved: Sequence[Agreement]) -> NDArray:
     """(2,) mean of (error / predicted sigma)^2, cross-boresight and roll; 1 if the prediction is correct."""
-    ratio = [(one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad) for one in solved]
+    ratio = [
+        (one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad) for one in solved
+    ]
     return np.asarray(np.mean(np.square(ratio), axis=0))
 
 

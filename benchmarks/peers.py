@@ -26,7 +26,9 @@ from estimator.core.types import Centroids
 TIMEOUT_MS = 1000
 LEAST_FIELD_ERROR = 0.02  # relative
 CENTROIDS = 40  # tetra3rs: centroids that form patterns
-PATTERN_ERROR, PATTERN_NOISE = 0.001, 5.0  # tetra3rs: least error of a ratio of edges; noise of one, of a field's width
+# tetra3rs: least error of a ratio of edges; noise of one, of a field's width
+PATTERN_ERROR = 0.001
+PATTERN_NOISE = 5.0
 CEDAR_DEG = 10.0, 30.0  # fields of its database
 
 Solve = Callable[[Centroids], Rotation | None]
@@ -55,7 +57,11 @@ def tetra3rs(camera: Camera, noise_px: float, focal_uncertainty: float = 0.0) ->
             solve_timeout_ms=TIMEOUT_MS,
             pattern_checking_stars=CENTROIDS,
         )
-        return Rotation.from_matrix(np.asarray(answer.rotation_matrix_icrs_to_camera)) if answer else None
+        return (
+            Rotation.from_matrix(np.asarray(answer.rotation_matrix_icrs_to_camera))
+            if answer
+            else None
+        )
 
     return solve
 
@@ -88,8 +94,16 @@ def cedar(camera: Camera, focal_uncertainty: float = 0.0) -> Solve | None:
 
 def cam_from_icrs(ra_rad: float, dec_rad: float, roll_rad: float) -> Rotation:
     """The attitude of a boresight; the roll is the angle from the image's up to north, counter-clockwise."""
-    sa, ca, sd, cd = math.sin(ra_rad), math.cos(ra_rad), math.sin(dec_rad), math.cos(dec_rad)
-    north, east, boresight = [-sd * ca, -sd * sa, cd], [-sa, ca, 0.0], [cd * ca, cd * sa, sd]
-    s, c = math.sin(roll_rad), math.cos(roll_rad)
-    seen: Floats = np.array([[-s, -c, 0.0], [-c, s, 0.0], [0.0, 0.0, 1.0]])  # of north, east and the boresight
+    sa = math.sin(ra_rad)
+    ca = math.cos(ra_rad)
+    sd = math.sin(dec_rad)
+    cd = math.cos(dec_rad)
+    north = [-sd * ca, -sd * sa, cd]
+    east = [-sa, ca, 0.0]
+    boresight = [cd * ca, cd * sa, sd]
+    s = math.sin(roll_rad)
+    c = math.cos(roll_rad)
+    seen: Floats = np.array(
+        [[-s, -c, 0.0], [-c, s, 0.0], [0.0, 0.0, 1.0]]
+    )  # of north, east and the boresight
     return Rotation.from_matrix(seen.T @ np.array([north, east, boresight]))

@@ -85,7 +85,8 @@ class Row:
 def build_setup() -> Setup:
     """The test geometry of scene afit_simsat."""
     lab = build_lab(loader.load("afit_simsat"))
-    light, camera = lab.scene.light, calibration(lab.scene.camera)
+    light = lab.scene.light
+    camera = calibration(lab.scene.camera)
     lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     assert isinstance(light, DomeConfig)
     assert isinstance(light.layout, layouts.PatchBoardsConfig)
@@ -123,7 +124,9 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
     if kind == "optimized":
         configs = [optimized_config(setup, count, seed)]
     elif kind == "Fibonacci":
-        configs = [layouts.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
+        configs = [
+            layouts.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)
+        ]
     area_m2 = 2 * np.pi * np.square(setup.surface.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(setup.cap_deg))) / count
     # Candidates with up to 50% more LEDs than asked for, in small steps; the first with enough of them is used.
@@ -134,7 +137,10 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
         else:
             disk = {"kind": "poisson_disk", "spacing": f"{np.sqrt(0.66 * each_m2 / density)} m"}
             configs.append(layouts.PoissonDiskConfig.model_validate(disk | cap))
-    candidates = (registry.LAYOUTS[config.kind](config, setup.surface, setup.led, setup.band) for config in configs)
+    candidates = (
+        registry.LAYOUTS[config.kind](config, setup.surface, setup.led, setup.band)
+        for config in configs
+    )
     sources = next(candidate for candidate in candidates if len(candidate) >= count)
     selected = np.sort(np.random.default_rng(seed).permutation(len(sources))[:count])
     return sources.place[selected, :3], registry.board_of(configs[0], sources.id[selected])
@@ -147,9 +153,12 @@ def sigmas_arcsec(setup: Setup, place_m: Floats) -> tuple[Floats, Floats, Floats
     truth, (sum_i J_i^T J_i)^-1 sigma^2; body z is the boresight. Sigmas are infinite for fewer than two LEDs.
     """
     config = optimized_config(setup, len(place_m), 0)
-    attitudes = optimize.sample_attitudes(config, TEST_ATTITUDES, np.random.default_rng(ATTITUDE_SEED))
+    attitudes = optimize.sample_attitudes(
+        config, TEST_ATTITUDES, np.random.default_rng(ATTITUDE_SEED)
+    )
     total = fisher.total_information(place_m, attitudes, *optimize.camera_geometry(config))
-    solved, variance = total[:, 6] >= 2, np.full((TEST_ATTITUDES, 3), np.inf)
+    solved = total[:, 6] >= 2
+    variance = np.full((TEST_ATTITUDES, 3), np.inf)
     # Unpack the six elements of the symmetric information matrix (xx, yy, zz, xy, xz, yz).
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
@@ -163,13 +172,20 @@ def summarize(each: Floats) -> tuple[float, float, float]:
     return float(np.median(each)), float(worst.mean()), float(worst[-1])
 
 
-def tracker_results(setup: Setup, place_m: Floats, board: Ints | None, frames: int, seed: int) -> NDArray[np.str_]:
+def tracker_results(
+    setup: Setup, place_m: Floats, board: Ints | None, frames: int, seed: int
+) -> NDArray[np.str_]:
     """(frames,) result of the tracker for each frame, with equal LEDs and the noise and map errors of `Case`."""
-    case, rng = Case("placement"), np.random.default_rng(seed)
+    case = Case("placement")
+    rng = np.random.default_rng(seed)
     assumed_m = place_m + case.assumed_m * rng.standard_normal(place_m.shape)
-    led_map = LedMap(np.arange(len(place_m)), assumed_m, np.zeros(3), np.ones(3), board, sigma_m=case.assumed_m)
+    led_map = LedMap(
+        np.arange(len(place_m)), assumed_m, np.zeros(3), np.ones(3), board, sigma_m=case.assumed_m
+    )
     dome = build_dome_index(led_map, setup.lever, setup.camera)
-    outcomes = [trial(case, place_m, setup.lever, setup.camera, dome, rng)[0] for _ in range(frames)]
+    outcomes = [
+        trial(case, place_m, setup.lever, setup.camera, dome, rng)[0] for _ in range(frames)
+    ]
     return np.array([result.split(":")[0] for result in outcomes])
 
 
@@ -179,10 +195,8 @@ def row(setup: Setup, kind: str, count: int, seed: int, frames: int) -> Row:
     place_m, board = leds(setup, kind, count, seed)
     layout_s = time.process_time() - begin
     roll, cross, seen = sigmas_arcsec(setup, place_m)
-    ambiguity, outcomes = (
-        optimize.layout_ambiguity(optimized_config(setup, count, seed), place_m),
-        tracker_results(setup, place_m, board, frames, seed),
-    )
+    ambiguity = optimize.layout_ambiguity(optimized_config(setup, count, seed), place_m)
+    outcomes = tracker_results(setup, place_m, board, frames, seed)
     return Row(
         kind,
         count,
@@ -206,7 +220,9 @@ def compare(count: int, frames: int, seed: int) -> Iterator[Row]:
 
 def format_row(one: Row) -> str:
     """A row of the table in the docs."""
-    arcsec = ["—" if np.isinf(value) else f"{value:.3g}" for value in one.roll_arcsec + one.cross_arcsec]
+    arcsec = [
+        "—" if np.isinf(value) else f"{value:.3g}" for value in one.roll_arcsec + one.cross_arcsec
+    ]
     cells = [
         f"{one.count:,} {one.layout}",
         f"{one.seen[0]:.1f} ({one.seen[1]})",
@@ -222,7 +238,9 @@ def format_row(one: Row) -> str:
 
 
 if __name__ == "__main__":
-    print("| LEDs | seen (min) | roll: median, worst 1 %, worst | cross | alike | ambiguous | found | wrong | made |")
+    print(
+        "| LEDs | seen (min) | roll: median, worst 1 %, worst | cross | alike | ambiguous | found | wrong | made |"
+    )
     print("|---" * 9 + "|")
     arguments = [int(word) for word in sys.argv[1:]]
     for one in compare(*arguments, *DEFAULTS[len(arguments) :]):

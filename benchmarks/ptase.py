@@ -16,12 +16,14 @@ from benchmarks.timing import verdict
 from skysim.experiments.papers.ptase.monte_carlo import catalog, run_version, simulate, version
 
 PAPER = "mf1_2 in the paper: 99.12 +- .25 %, 4.79 (its Frobenius norm 6.77 / sqrt 2), 4.69 +- .14, .962 +- .013"
-PAPER_S, BAR_S = 24.06, 0.3
+PAPER_S = 24.06
+BAR_S = 0.3
 
 
 def table_row(name: str, limit_mag: float, runs: int, seed: int) -> str:
     """One table line: success, wrong attitudes, mean errors, and seconds per 1000 runs."""
-    known, by = catalog(limit_mag), version(name)
+    known = catalog(limit_mag)
+    by = version(name)
     simulate(known, by, 2, seed)
     begin = time.perf_counter()
     done = run_version(known, by, runs, seed)
@@ -32,14 +34,19 @@ def table_row(name: str, limit_mag: float, runs: int, seed: int) -> str:
 
 def measure() -> list[dict[str, Any]]:
     """Time of 1000 runs of the version that the paper timed, with V < 6: the minimum of five."""
-    known, by = catalog(6.0), version("fialho_2")
+    known = catalog(6.0)
+    by = version("fialho_2")
     simulate(known, by, 2, 1)
     spent_s = []
     for _ in range(5):
         begin = time.perf_counter()
         simulate(known, by, 1000, 1)
         spent_s.append(time.perf_counter() - begin)
-    return [verdict("1000 PTASE runs, V < 6", min(spent_s), "s", f"paper: {PAPER_S} s at 450 MHz", BAR_S)]
+    return [
+        verdict(
+            "1000 PTASE runs, V < 6", min(spent_s), "s", f"paper: {PAPER_S} s at 450 MHz", BAR_S
+        )
+    ]
 
 
 if __name__ == "__main__":

@@ -35,7 +35,10 @@ DELFT = SiteAir(51.98, 4.34, DATE, PRESSURE_HPA, 15.0)
 FOV_DEG = 11.42
 SIGMA_PX = 0.1  # of a centroid at least
 LOWEST_DEG = 8.0  # altitude of a star
-FILES = tuple(f"2019-07-29T204726_Alt{view}_Try1.tiff" for view in ("40_Azi-135", "40_Azi45", "60_Azi-45", "60_Azi135"))
+FILES = tuple(
+    f"2019-07-29T204726_Alt{view}_Try1.tiff"
+    for view in ("40_Azi-135", "40_Azi45", "60_Azi-45", "60_Azi135")
+)
 
 
 def star_frames(folder: Path) -> tuple[list[StarFrame], Camera]:
@@ -49,9 +52,12 @@ def star_frames(folder: Path) -> tuple[list[StarFrame], Camera]:
     def tracker(camera: Camera, focal_uncertainty: float) -> StarTracker:
         return StarTracker(camera, stars, vectors, focal_uncertainty=focal_uncertainty)
 
-    found = [with_floor(detect_and_centroid(picture, sheet, Settings(), Clock())) for picture in pictures]
+    found = [
+        with_floor(detect_and_centroid(picture, sheet, Settings(), Clock())) for picture in pictures
+    ]
     camera = self_calibrate(found, tracker, sheet).camera
-    final, frames = tracker(camera, 0.002), []
+    final = tracker(camera, 0.002)
+    frames = []
     for centroids in found:
         match = final.solve_centroids(centroids).match
         assert match is not None
@@ -70,15 +76,22 @@ def fitted(frames: Sequence[StarFrame], camera: Camera) -> tuple[Calibration, Fl
     outlying = {tuple(row) for row in calibration.report.outliers.tolist()}
     rms = []
     for n, frame in enumerate(frames):
-        seen = calibration.camera.pixels(calibration.report.cam_from_ref[n].apply(frame.vectors_ref))
+        seen = calibration.camera.pixels(
+            calibration.report.cam_from_ref[n].apply(frame.vectors_ref)
+        )
         kept = np.array([(n, k) not in outlying for k in range(len(seen))])
         rms.append(np.sqrt(np.mean((seen - frame.xy_px)[kept] ** 2)))
     return calibration, np.array(rms)
 
 
-def through(frames: Sequence[StarFrame], zenith: Floats, constants: tuple[float, float]) -> list[StarFrame]:
+def through(
+    frames: Sequence[StarFrame], zenith: Floats, constants: tuple[float, float]
+) -> list[StarFrame]:
     """The same stars as the air under a zenith raises them."""
-    return [replace(frame, vectors_ref=raised(frame.vectors_ref, zenith, *constants)) for frame in frames]
+    return [
+        replace(frame, vectors_ref=raised(frame.vectors_ref, zenith, *constants))
+        for frame in frames
+    ]
 
 
 def best_zenith(frames: Sequence[StarFrame], camera: Camera, start: Floats) -> Floats:
@@ -94,19 +107,28 @@ def best_zenith(frames: Sequence[StarFrame], camera: Camera, start: Floats) -> F
 
     off = start + 0.08 * np.array([1.0, -1.0, 1.0])
     first = np.array([np.arctan2(off[1], off[0]), np.arcsin(off[2] / np.linalg.norm(off))])
-    return direction(*minimize(rms_px, first, method="Nelder-Mead", options={"maxfev": 60, "xatol": 0.004}).x)
+    return direction(
+        *minimize(rms_px, first, method="Nelder-Mead", options={"maxfev": 60, "xatol": 0.004}).x
+    )
 
 
 def direction(ra_rad: float, dec_rad: float) -> Floats:
-    return np.array([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
+    return np.array(
+        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)]
+    )
 
 
-def fitted_scale(frames: Sequence[StarFrame], camera: Camera, zenith: Floats) -> tuple[float, float]:
+def fitted_scale(
+    frames: Sequence[StarFrame], camera: Camera, zenith: Floats
+) -> tuple[float, float]:
     """The factor of the refraction with the least residuals, and its standard deviation: a parabola of chi-square."""
     a_rad, b_rad = refraction_constants(PRESSURE_HPA, 15.0, 600e-9)
-    scales, reports = np.array([0.0, 0.5, 1.0, 1.5]), []
+    scales = np.array([0.0, 0.5, 1.0, 1.5])
+    reports = []
     for scale in scales:
-        reports.append(calibrate(through(frames, zenith, (scale * a_rad, scale * b_rad)), camera).report)
+        reports.append(
+            calibrate(through(frames, zenith, (scale * a_rad, scale * b_rad)), camera).report
+        )
     squares = np.array([report.rms_px**2 for report in reports])
     curve, slope, _ = np.polyfit(scales, squares, 2)
     return -slope / (2 * curve), float(np.sqrt(squares.min() / (2 * reports[0].stars * curve)))
@@ -123,10 +145,14 @@ def main(folder: Path) -> None:
         boresight = calibration.report.cam_from_ref[n].inv().apply([0.0, 0.0, 1.0])
         altitude_deg = np.degrees(np.arcsin(boresight @ zenith))
         stars = len(frames[n].xy_px)
-        print(f"{file:45s} {stars:4d} stars  {altitude_deg:5.1f} deg  {without[n]:.3f} px  {with_air[n]:.3f} px")
+        print(
+            f"{file:45s} {stars:4d} stars  {altitude_deg:5.1f} deg  {without[n]:.3f} px  {with_air[n]:.3f} px"
+        )
     scale, sigma = fitted_scale(frames, camera, zenith)
     off_deg = np.degrees(np.arccos(best_zenith(frames, camera, zenith) @ zenith))
-    print(f"refraction {scale:.2f} +- {sigma:.2f} of the model's; zenith from refraction alone {off_deg:.1f} deg off")
+    print(
+        f"refraction {scale:.2f} +- {sigma:.2f} of the model's; zenith from refraction alone {off_deg:.1f} deg off"
+    )
 
 
 if __name__ == "__main__":

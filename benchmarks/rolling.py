@@ -36,9 +36,14 @@ from skysim.tracking import factory
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)
 GYRO_RAD_S = np.radians(0.01)
-ROLL_SHARE = 0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
-BAR_NEES, BAR_ERROR = 0.3, 1.2
-CHI2_MEDIAN = 2.366  # of chi-square with three degrees of freedom: double stars do not count in a median
+ROLL_SHARE = (
+    0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
+)
+BAR_NEES = 0.3
+BAR_ERROR = 1.2
+CHI2_MEDIAN = (
+    2.366  # of chi-square with three degrees of freedom: double stars do not count in a median
+)
 ONE_FRAME = {"exposure.first": "0 s", "exposure.frames": "1"}
 
 
@@ -61,7 +66,12 @@ class Work:
         return build_lab(load(self.scene, ONE_FRAME | self.changes | {"camera.shutter": shutter}))
 
 
-PHONE = {"camera.preset": "imx477", "camera.focal_length": "16 mm", "camera.f_number": "1.4", "exposure.time": "20 ms"}
+PHONE = {
+    "camera.preset": "imx477",
+    "camera.focal_length": "16 mm",
+    "camera.f_number": "1.4",
+    "exposure.time": "20 ms",
+}
 SURVEY = {"tracker.survey.lever_sigma": "0 mm", "tracker.survey.led_sigma": "0.02 mm"}
 WORKS = (
     Work("SHEFEX", "shefex2", "80 us", 100, {"exposure.time": "50 ms"}),
@@ -86,7 +96,9 @@ class Solved(NamedTuple):
 NOT_SOLVED = Solved(np.nan, np.nan, np.nan)
 
 
-def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RATES_DEG_S) -> list[dict[str, Any]]:
+def measure(
+    works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RATES_DEG_S
+) -> list[dict[str, Any]]:
     """NEES, error ratios and solved share of each scene, rate and source of the rate."""
     rows = []
     for work in works:
@@ -98,7 +110,12 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
                 pooled.setdefault(mode, []).append((ours[:, 0], peer[:, 0]))
         for mode, nees in pooled.items():
             both = (np.concatenate(each) for each in zip(*nees, strict=True))
-            rows.append(nees_row(f"{work.name}, all rates, {mode}: NEES", *(each[np.isfinite(each)] for each in both)))
+            rows.append(
+                nees_row(
+                    f"{work.name}, all rates, {mode}: NEES",
+                    *(each[np.isfinite(each)] for each in both),
+                )
+            )
     return rows
 
 
@@ -120,21 +137,31 @@ def _compare(
         yield mode, np.array(errors[mode, 0]), np.array(errors[mode, 1])
 
 
-def frame_of(work: Work, lab: Lab, rate_deg_s: float, seed: int) -> tuple[Frame, Truth, factory.Estimator]:
+def frame_of(
+    work: Work, lab: Lab, rate_deg_s: float, seed: int
+) -> tuple[Frame, Truth, factory.Estimator]:
     """One frame at a random attitude and axis, and its tracker; a dome is surveyed anew for each."""
     rng = np.random.default_rng([seed, 1])
     camera = lab.in_run(int(rng.integers(2**62))).camera
     middle = Rotation.random(rng=rng)
     if work.tilt_deg is not None:
         azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
-        tilt = np.radians(work.tilt_deg) * rng.uniform() * np.array([np.cos(azimuth), np.sin(azimuth), 0])
+        tilt = (
+            np.radians(work.tilt_deg)
+            * rng.uniform()
+            * np.array([np.cos(azimuth), np.sin(azimuth), 0])
+        )
         middle = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, yaw])
     axis = rng.standard_normal(3) * ([1, 1, ROLL_SHARE] if work.tilt_deg is None else [1, 1, 1])
     rate_cam = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
-    trajectory = constant_rate(camera.scene, middle, camera.mount.cam_from_body.inv().apply(rate_cam))
+    trajectory = constant_rate(
+        camera.scene, middle, camera.mount.cam_from_body.inv().apply(rate_cam)
+    )
     frame, truth = render_frame(camera, trajectory, 0)
     tracker = camera.scene.tracker
-    surveyed = tracker.model_copy(update={"survey": tracker.survey.model_copy(update={"seed": seed})})
+    surveyed = tracker.model_copy(
+        update={"survey": tracker.survey.model_copy(update={"seed": seed})}
+    )
     scene = camera.scene.model_copy(update={"tracker": surveyed})
     return frame, truth, factory.build_tracker(scene, camera.mount, camera.sources)
 
@@ -150,34 +177,48 @@ def score(attitude: Attitude, truth: Truth) -> Solved:
     if attitude.cam_from_ref is None or attitude.covariance_rad2 is None:
         return NOT_SOLVED
     cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
-    nees = metrics.normalized_error_squared(attitude.cam_from_ref, truth.cam_from_lab, attitude.covariance_rad2)
+    nees = metrics.normalized_error_squared(
+        attitude.cam_from_ref, truth.cam_from_lab, attitude.covariance_rad2
+    )
     return Solved(nees, cross / ARCSEC_RAD, roll / ARCSEC_RAD)
 
 
-def with_bound(solved: Solved, tracker: factory.Estimator, report: Report, truth: Truth, exposure_s: float) -> Solved:
+def with_bound(
+    solved: Solved, tracker: factory.Estimator, report: Report, truth: Truth, exposure_s: float
+) -> Solved:
     """The errors of a frame with its bound, from the information of its matched lights about attitude and rate."""
-    attitude, match = report.attitude, report.attitude.match
+    attitude = report.attitude
+    match = report.attitude.match
     assert match is not None
     assert attitude.cam_from_ref is not None
-    camera, seen = tracker.camera, report.centroids.take(match.observed)
+    camera = tracker.camera
+    seen = report.centroids.take(match.observed)
     if isinstance(tracker, StarTracker):
-        seen, place_ref, lever_m = tracker.with_errors(seen), tracker.stars.vectors[match.star], np.zeros(3)
+        seen = tracker.with_errors(seen)
+        place_ref = tracker.stars.vectors[match.star]
+        lever_m = np.zeros(3)
     else:
         assert isinstance(tracker, DomeTracker)
-        seen, place_ref = tracker._with_errors(seen, match.star), tracker.leds.position_m[match.star]
+        seen = tracker._with_errors(seen, match.star)
+        place_ref = tracker.leds.position_m[match.star]
         lever_m = tracker.lever.cam_from_body.apply(tracker.lever.camera_body_m)
     place = truth.cam_from_lab.apply(place_ref)
     jacobian = tangent_jacobian(place, place - lever_m).reshape(-1, 2, 3)
     velocity = -jacobian @ truth.rate_cam_rad_s
-    gain, delay_s = error_gain(camera, velocity), camera.row_delays_s(seen.xy_px)[:, None, None]
-    information = camera.focal_px**2 * np.linalg.inv(gain @ covariance_of(seen) @ np.swapaxes(gain, 1, 2))
+    gain = error_gain(camera, velocity)
+    delay_s = camera.row_delays_s(seen.xy_px)[:, None, None]
+    information = camera.focal_px**2 * np.linalg.inv(
+        gain @ covariance_of(seen) @ np.swapaxes(gain, 1, 2)
+    )
     slopes = np.concatenate([jacobian, -delay_s * jacobian], axis=2)
     normal = np.sum(np.swapaxes(slopes, 1, 2) @ information @ slopes, axis=0)
     rate_known = np.linalg.inv(normal[:3, :3])
     if seen.streak_px is not None:
         told = np.isfinite(seen.streak_px[:, 0])
         by_rate = exposure_s * streak_factor(camera, velocity[told])[:, None, None] * jacobian[told]
-        normal[3:, 3:] += np.sum(np.swapaxes(by_rate, 1, 2) @ chords(camera, seen.take(told))[1] @ by_rate, axis=0)
+        normal[3:, 3:] += np.sum(
+            np.swapaxes(by_rate, 1, 2) @ chords(camera, seen.take(told))[1] @ by_rate, axis=0
+        )
     bound = np.linalg.inv(normal)[:3, :3]
     error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     ratio = float(np.sqrt(bound[2, 2] / rate_known[2, 2]))
@@ -185,19 +226,48 @@ def with_bound(solved: Solved, tracker: factory.Estimator, report: Report, truth
 
 
 def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
-    solved, by_peer = np.isfinite(ours[:, 0]), np.isfinite(peer[:, 0])
+    solved = np.isfinite(ours[:, 0])
+    by_peer = np.isfinite(peer[:, 0])
     both = solved & by_peer
     rows = [
-        row(f"{name}: solved", 100 * solved.mean(), "%", 100 * by_peer.mean(), None, solved.sum() >= by_peer.sum()),
+        row(
+            f"{name}: solved",
+            100 * solved.mean(),
+            "%",
+            100 * by_peer.mean(),
+            None,
+            solved.sum() >= by_peer.sum(),
+        ),
         nees_row(f"{name}: NEES", ours[solved, 0], peer[by_peer, 0]),
     ]
     if np.isfinite(ours[:, 3]).any():
-        by_bound, ratio = np.sqrt(np.nanmedian(ours[:, 3]) / CHI2_MEDIAN), np.nanmedian(ours[:, 4])
-        rows.append(row(f"{name}: error over its bound", by_bound, "", None, BAR_ERROR, by_bound <= BAR_ERROR))
-        rows.append(row(f"{name}: bound of the roll over that of a known rate", ratio, "", None, None, None))
+        by_bound = np.sqrt(np.nanmedian(ours[:, 3]) / CHI2_MEDIAN)
+        ratio = np.nanmedian(ours[:, 4])
+        rows.append(
+            row(
+                f"{name}: error over its bound",
+                by_bound,
+                "",
+                None,
+                BAR_ERROR,
+                by_bound <= BAR_ERROR,
+            )
+        )
+        rows.append(
+            row(f"{name}: bound of the roll over that of a known rate", ratio, "", None, None, None)
+        )
     for column, angle in (1, "cross"), (2, "roll"):
         value, others = (float(np.median(np.abs(errors[both, column]))) for errors in (ours, peer))
-        rows.append(row(f"{name}: {angle}", value, "arcsec median", others, BAR_ERROR, value <= BAR_ERROR * others))
+        rows.append(
+            row(
+                f"{name}: {angle}",
+                value,
+                "arcsec median",
+                others,
+                BAR_ERROR,
+                value <= BAR_ERROR * others,
+            )
+        )
     return rows
 
 
@@ -209,7 +279,9 @@ def nees_row(name: str, ours: Floats, peer: Floats | None = None) -> dict[str, A
     return row(name, value, error, others, 3 + BAR_NEES, abs(value - 3) <= BAR_NEES)
 
 
-def row(name: str, value: float, unit: str, peer: float | None, bar: float | None, met: bool | None) -> dict[str, Any]:
+def row(
+    name: str, value: float, unit: str, peer: float | None, bar: float | None, met: bool | None
+) -> dict[str, Any]:
     """A row as `python -m benchmarks` prints it; the peer is a global shutter."""
     return {
         "name": name,

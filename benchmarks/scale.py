@@ -37,12 +37,18 @@ SIZE = {"camera.width_px": "1024", "camera.height_px": "1024"}
 # 20 degrees and stars to V 7, as in benchmarks/instrument.py, with all noise of a CMOS chip: shot and read noise, dark
 # current, PRNU, DSNU, hot pixels. The CCD of shefex2 has readout smear, transfer loss and blooming besides.
 CMOS = SIZE | {
-    **{"camera.focal_length": "28.7 mm", "light.limit_mag": "7", "camera.shutter": "{kind: global}"},
-    **{"camera.detector.cti_parallel": "0", "camera.detector.cti_serial": "0", "camera.detector.blooming": "none"},
+    "camera.focal_length": "28.7 mm",
+    "light.limit_mag": "7",
+    "camera.shutter": "{kind: global}",
+    "camera.detector.cti_parallel": "0",
+    "camera.detector.cti_serial": "0",
+    "camera.detector.blooming": "none",
 }
-FRAMES, PER_SHARD = 640, 16
+FRAMES = 640
+PER_SHARD = 16
 PARTS = 64  # frames of which the parts are timed
-DASK_S, DASK_CHUNKS = 1.0, 12
+DASK_S = 1.0
+DASK_CHUNKS = 12
 
 
 def measure() -> list[dict[str, Any]]:
@@ -67,7 +73,9 @@ def figure(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
 # Labelled frames.
 
 
-def small_plan(count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS) -> plan.DatasetPlan:
+def small_plan(
+    count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS
+) -> plan.DatasetPlan:
     """Frames of 1024 x 1024 pixels."""
     return plan.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
 
@@ -76,8 +84,22 @@ def frames() -> list[dict[str, Any]]:
     """Frames written to shards in a second, by two workers and by one."""
     rates = {workers: frames_hz(workers) for workers in (2, 1)}
     return [
-        verdict("labelled 1024 x 1024 frames to shards, two workers", rates[2], "/s", "CMOS", 400.0, True),
-        verdict("frames: two workers over one", rates[2] / rates[1], "x", f"{rates[1]:.0f}/s of one", 1.9, True),
+        verdict(
+            "labelled 1024 x 1024 frames to shards, two workers",
+            rates[2],
+            "/s",
+            "CMOS",
+            400.0,
+            True,
+        ),
+        verdict(
+            "frames: two workers over one",
+            rates[2] / rates[1],
+            "x",
+            f"{rates[1]:.0f}/s of one",
+            1.9,
+            True,
+        ),
     ]
 
 
@@ -85,7 +107,12 @@ def frames_hz(workers: int) -> float:
     """Frames in a second, from the end of the second shard of each worker to that of the last one."""
     arrived: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory() as folder, closing(engines.Pool(workers)) as pool:
-        run.run(small_plan(), f"{folder}/frames", pool, lambda at: arrived.append((time.perf_counter(), at.now)))
+        run.run(
+            small_plan(),
+            f"{folder}/frames",
+            pool,
+            lambda at: arrived.append((time.perf_counter(), at.now)),
+        )
     first = next(n for n, (_, now) in enumerate(arrived) if now >= 2 * workers * PER_SHARD)
     (begin_s, before), (end_s, after) = arrived[first], arrived[-1]
     return (after - before) / (end_s - begin_s)
@@ -96,8 +123,11 @@ def parts() -> list[dict[str, Any]]:
     rows = []
     for name, keys in (("CMOS", CMOS), ("CCD", SIZE)):
         spent = parts_of(small_plan(PARTS, PARTS, keys))
-        total, most = sum(spent.values()), max(spent, key=lambda part: spent[part])
-        rows += [figure(f"CPU of a {name} frame", total, "ms", f"{most} is {spent[most] / total:.0%}")]
+        total = sum(spent.values())
+        most = max(spent, key=lambda part: spent[part])
+        rows += [
+            figure(f"CPU of a {name} frame", total, "ms", f"{most} is {spent[most] / total:.0%}")
+        ]
         rows += [figure(f"- {part}", ms, "ms", f"{ms / total:.0%}") for part, ms in spent.items()]
     return rows
 
@@ -116,7 +146,9 @@ def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
             with timed(spent, "label"):
                 label_frame(setup, seed, by)
             with timed(spent, "encode"):
-                row = shards.frame_labels(one, setup.lab.scene, {"frame": number, "shard": 0, "seed": seed})
+                row = shards.frame_labels(
+                    one, setup.lab.scene, {"frame": number, "shard": 0, "seed": seed}
+                )
                 shards.coco_annotations(one, number)
             with timed(spent, "write"):
                 shards.add_frame(tar, number, one, row | {"levels": levels})
@@ -136,7 +168,13 @@ def writing() -> dict[str, Any]:
     """The tar of a shard, beside Python's tarfile and numpy.save with the same members."""
     _, _, _, one = next(run.labelled_frames(small_plan(PER_SHARD), 0))
     kept = [(number, one) for number in range(PER_SHARD)]
-    return versus("write 16 frames as a tar", lambda: ours(kept), "tarfile", lambda: by_tarfile(kept), repeats=10)
+    return versus(
+        "write 16 frames as a tar",
+        lambda: ours(kept),
+        "tarfile",
+        lambda: by_tarfile(kept),
+        repeats=10,
+    )
 
 
 def ours(kept: list[tuple[int, LabelledFrame]]) -> None:
@@ -168,22 +206,38 @@ def centroids() -> list[dict[str, Any]]:
     two, one = (run_study(CENTROIDS, workers) for workers in (2, 1))
     return [
         verdict("centroid trials with the store, two workers", two.rate, "/s", "", 5000.0, True),
-        verdict("centroids: two workers over one", two.rate / one.rate, "x", f"{one.rate:.0f}/s of one", 1.9, True),
-        figure("centroids: beside the trial itself", one.overhead_ms, "ms", "a trial of one worker"),
+        verdict(
+            "centroids: two workers over one",
+            two.rate / one.rate,
+            "x",
+            f"{one.rate:.0f}/s of one",
+            1.9,
+            True,
+        ),
+        figure(
+            "centroids: beside the trial itself", one.overhead_ms, "ms", "a trial of one worker"
+        ),
     ]
 
 
 def closed_loop() -> list[dict[str, Any]]:
     """SimSat on its wheels under control, against the clock, and against mj_step alone with the same model."""
     lab = build_lab(loader.load("afit_simsat", {"exposure.frames": "3"}))
-    model, flown_s = lab.vehicle.model, lab.duration_s
+    model = lab.vehicle.model
+    flown_s = lab.duration_s
 
     def bare() -> None:
         data = mujoco.MjData(model)
         for _ in range(round(flown_s / model.opt.timestep)):
             mujoco.mj_step(model, data)
 
-    row = versus("closed loop on wheels", lambda: Flight(lab).simulate_motion(), "bare mj_step", bare, repeats=20)
+    row = versus(
+        "closed loop on wheels",
+        lambda: Flight(lab).simulate_motion(),
+        "bare mj_step",
+        bare,
+        repeats=20,
+    )
     speed = flown_s / (row["value"] / 1e3)
     limit = f"mj_step alone: {flown_s / (row['peer_value'] / 1e3):.0f}x"
     return [row, verdict("closed loop on wheels", speed, "x real time", limit, 100.0, True)]
@@ -191,7 +245,8 @@ def closed_loop() -> list[dict[str, Any]]:
 
 def worker_cost() -> list[dict[str, Any]]:
     """Start of a worker after the first, and its memory with as many setups as it keeps, of the worst shipped scene."""
-    started_s, held_mb = {}, {}
+    started_s = {}
+    held_mb = {}
     for name in loader.list_scenes():
         try:
             study = four_exposures(name)
@@ -202,9 +257,12 @@ def worker_cost() -> list[dict[str, Any]]:
         with engines.start_pool(1, trials.TrialJob(study.spec)) as pool:
             started_s[name] = time.perf_counter() - begin_s
             for n, point in enumerate(study.points):
-                pool.submit(engines.run_chunk, (trials.Segment(n, point.settings, n, range(1)),)).result()
+                pool.submit(
+                    engines.run_chunk, (trials.Segment(n, point.settings, n, range(1)),)
+                ).result()
             held_mb[name] = private_mb(next(iter(pool._processes)))
-    slowest, largest = max(started_s, key=started_s.__getitem__), max(held_mb, key=held_mb.__getitem__)
+    slowest = max(started_s, key=started_s.__getitem__)
+    largest = max(held_mb, key=held_mb.__getitem__)
     return [
         verdict("start of a worker after the first", started_s[slowest], "s", slowest, 1.0),
         verdict("memory of a worker with four setups", held_mb[largest], "MB", largest, 350.0),
@@ -223,7 +281,10 @@ def four_exposures(name: str) -> Plan:
         "factors": {"time": {"key": "exposure.time", "values": times}},
     }
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
-        yaml.safe_dump(tree | {"schema": 1, "title": "memory", "replicates": 1, "responses": ["identified"]}, file)
+        yaml.safe_dump(
+            tree | {"schema": 1, "title": "memory", "replicates": 1, "responses": ["identified"]},
+            file,
+        )
         file.flush()
         return study_loader.load(Path(file.name))
 

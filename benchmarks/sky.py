@@ -28,15 +28,29 @@ from skysim.sources import gaia
 
 DEEP = Path("out/catalogs/gaia_v10.0.ecsv")
 FIELDS_DEG = 2, 3, 5
-SHEFEX_DEG, SHEFEX_MM = 14.87, 25.0
-NARROW_FRAMES, BODY_FRAMES = 500, 2500
+SHEFEX_DEG = 14.87
+SHEFEX_MM = 25.0
+NARROW_FRAMES = 500
+BODY_FRAMES = 2500
 MIN_STARS = 6  # of the tracker's catalog in the field
 SEED = 26
 BODIES = {
-    "Moon": {"start_time": "2012-06-27T03:30:00", "trial.near": {"body": "moon", "off_deg": [0, 8]}},
-    "full Moon": {"start_time": "2012-07-03T18:00:00", "trial.near": {"body": "moon", "off_deg": [0, 8]}},
-    "Venus": {"start_time": "2012-04-30T00:00:00", "trial.near": {"body": "venus", "off_deg": [0, 8]}},
-    "Jupiter": {"start_time": "2012-12-03T00:00:00", "trial.near": {"body": "jupiter", "off_deg": [0, 8]}},
+    "Moon": {
+        "start_time": "2012-06-27T03:30:00",
+        "trial.near": {"body": "moon", "off_deg": [0, 8]},
+    },
+    "full Moon": {
+        "start_time": "2012-07-03T18:00:00",
+        "trial.near": {"body": "moon", "off_deg": [0, 8]},
+    },
+    "Venus": {
+        "start_time": "2012-04-30T00:00:00",
+        "trial.near": {"body": "venus", "off_deg": [0, 8]},
+    },
+    "Jupiter": {
+        "start_time": "2012-12-03T00:00:00",
+        "trial.near": {"body": "jupiter", "off_deg": [0, 8]},
+    },
 }
 
 
@@ -61,25 +75,37 @@ def bodies() -> list[dict[str, Any]]:
     lab = build_lab(load("shefex2"))
     enough = np.array([catalog_stars(lab, row) >= MIN_STARS for row in trials])
     return shares(
-        f"bodies, satellites and airglow, {len(trials)} frames", trials[enough], len(trials), wrong_of=trials, bar=97
+        f"bodies, satellites and airglow, {len(trials)} frames",
+        trials[enough],
+        len(trials),
+        wrong_of=trials,
+        bar=97,
     )
 
 
 def narrow(fov_deg: float) -> list[dict[str, Any]]:
     """Wrong attitudes and the solved share of a narrow camera that knows the sky to V 10."""
     catalog = str(DEEP.resolve())
-    focal_mm = SHEFEX_MM * math.tan(math.radians(SHEFEX_DEG / 2)) / math.tan(math.radians(fov_deg / 2))
+    focal_mm = (
+        SHEFEX_MM * math.tan(math.radians(SHEFEX_DEG / 2)) / math.tan(math.radians(fov_deg / 2))
+    )
     camera = {
         "camera.focal_length": f"{focal_mm:.4g} mm",
         "light.catalog": catalog,
         "tracker.catalog": catalog,
         "tracker.limit_mag": 10,
     }
-    trials = study_trials("shefex2", camera, {"field": {"levels": {f"{fov_deg:g} deg": {}}}}, NARROW_FRAMES)
-    return shares(f"{fov_deg:g} deg, sky and tracker to V 10", trials, len(trials), wrong_of=trials, bar=99)
+    trials = study_trials(
+        "shefex2", camera, {"field": {"levels": {f"{fov_deg:g} deg": {}}}}, NARROW_FRAMES
+    )
+    return shares(
+        f"{fov_deg:g} deg, sky and tracker to V 10", trials, len(trials), wrong_of=trials, bar=99
+    )
 
 
-def study_trials(scene: str, settings: Mapping[str, Any], factors: Mapping[str, Any], replicates: int) -> Any:
+def study_trials(
+    scene: str, settings: Mapping[str, Any], factors: Mapping[str, Any], replicates: int
+) -> Any:
     """The table of all trials of a study of rendered frames."""
     plan = {
         "schema": 1,
@@ -110,7 +136,9 @@ def shares(name: str, trials: Any, drawn: int, wrong_of: Any, bar: float) -> lis
     solved = 100 * float(np.mean(trials["status"] == "solved"))
     wrong = float(np.sum(wrong_of["wrong"]))
     return [
-        verdict(f"{name}: solved", solved, "%", f"{len(trials)} of {drawn} frames", bar, least=True),
+        verdict(
+            f"{name}: solved", solved, "%", f"{len(trials)} of {drawn} frames", bar, least=True
+        ),
         verdict(f"{name}: wrong", wrong, "frames", f"of {drawn}", 0),
     ]
 
@@ -132,4 +160,6 @@ def frame_time() -> dict[str, Any]:
             seconds[side].append(time.perf_counter() - began)
     ratio = min(seconds[0]) / min(seconds[1])
     what = f"{len(whole.camera.sources)} stars over {int(near.sum())}"
-    return verdict("frame of 3 deg, time in a deep sky over that of its stars alone", ratio, "", what, 1.1)
+    return verdict(
+        "frame of 3 deg, time in a deep sky over that of its stars alone", ratio, "", what, 1.1
+    )

@@ -34,14 +34,17 @@ KNOT_S = 0.5e-3
 Streak = tuple[float, float] | None
 
 
-def frames(lab: Lab, rate_deg_s: float, count: int, seed: int) -> Iterator[tuple[Frame, Rotation, Streak]]:
+def frames(
+    lab: Lab, rate_deg_s: float, count: int, seed: int
+) -> Iterator[tuple[Frame, Rotation, Streak]]:
     """Yield frames at random attitudes, each rotating about a random axis perpendicular to the boresight.
 
     Each comes with cam_from_icrs at mid-exposure and the streak vector at the image center.
     """
     for n in range(count):
         rng = np.random.default_rng([seed, n])
-        middle, angle = random_southern_attitude(rng), rng.uniform(0, 2 * np.pi)
+        middle = random_southern_attitude(rng)
+        angle = rng.uniform(0, 2 * np.pi)
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
         # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
@@ -67,7 +70,9 @@ def streak_of(rate_cam_rad_s: np.ndarray, lab: Lab) -> tuple[float, float]:
     return -rate_cam_rad_s[1] * pixels_per_rad_s, rate_cam_rad_s[0] * pixels_per_rad_s
 
 
-def is_solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak) -> tuple[bool, bool]:
+def is_solved(
+    tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: Streak
+) -> tuple[bool, bool]:
     """Whether a frame is solved correctly, and whether it is solved wrongly."""
     try:
         answer = tracker.solve(frame.image_dn, streak_px).attitude.cam_from_ref
@@ -79,7 +84,8 @@ def is_solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: St
 
 def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     """The paper's chain with its star selection, and the default chain with the paper's limiting magnitude (twice)."""
-    camera, scene = calibration(lab.scene.camera), lab.scene
+    camera = calibration(lab.scene.camera)
+    scene = lab.scene
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
     paper_stars = shefex.chosen(stars)
@@ -97,8 +103,12 @@ def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     default = Settings(gain_e_dn=gain, centroid_sigma_px=scene.tracker.centroid_sigma_px)
     return {
         "paper": StarTracker(camera, paper_stars, catalog.apparent(paper_stars, observer), paper),
-        "default": StarTracker(camera, stars_default, catalog.apparent(stars_default, observer), default),
-        "with gyro": StarTracker(camera, stars_default, catalog.apparent(stars_default, observer), default),
+        "default": StarTracker(
+            camera, stars_default, catalog.apparent(stars_default, observer), default
+        ),
+        "with gyro": StarTracker(
+            camera, stars_default, catalog.apparent(stars_default, observer), default
+        ),
     }
 
 
@@ -111,8 +121,13 @@ def measure(count: int, seed: int) -> Iterator[str]:
         score = {name: np.zeros(2, int) for name in trackers}
         for frame, truth, streak_px in frames(lab, rate, count, seed):
             for name, tracker in trackers.items():
-                score[name] += is_solved(tracker, frame, truth, streak_px if name == "with gyro" else None)
-        cells = [f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}" for name in trackers]
+                score[name] += is_solved(
+                    tracker, frame, truth, streak_px if name == "with gyro" else None
+                )
+        cells = [
+            f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}"
+            for name in trackers
+        ]
         pixels = np.radians(rate) * 0.05 * lab.scene.camera.focal_px
         yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(cells)
 

@@ -26,7 +26,9 @@ def measure() -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         skysim(["render", "shefex2", "--frames", "1", "--out", "."], folder)
         return [
-            verdict(f"skysim {words}", least_s(words.split(), folder), "s", "user + system time", bar)
+            verdict(
+                f"skysim {words}", least_s(words.split(), folder), "s", "user + system time", bar
+            )
             for words, bar in COMMANDS.items()
         ]
 

@@ -48,7 +48,9 @@ class TimedPool:
     """A pool that records each batch. batches : (arrival time, number of trials, seconds spent in trials) by batch."""
 
     def __init__(self, pool: Pool) -> None:
-        self.pool, self.name, self.workers = pool, pool.name, pool.workers
+        self.pool = pool
+        self.name = pool.name
+        self.workers = pool.workers
         self.batches: list[tuple[float, int, float]] = []
 
     def run(self, job: Job, chunks: Chunks) -> Iterator[list[Row]]:
@@ -77,25 +79,30 @@ def run_study(settings: dict[str, Any], workers: int) -> StudyTime:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.yaml"
         path.write_text(STUDY.format(**settings))
-        pool, begin = TimedPool(engines.Pool(workers)), time.perf_counter()
+        pool = TimedPool(engines.Pool(workers))
+        begin = time.perf_counter()
         study = loader.load(path)
         with store.writing(path.with_suffix(".sqlite")) as database:
             runner.prepare_store(study, database, False)
             progress = runner.run(study, database, pool)
         total_s = time.perf_counter() - begin
     if (progress.done, progress.failed) != (study.trials, 0):
-        raise RuntimeError(f"{progress.done} of {study.trials} trials are in, {progress.failed} of them failed")
+        raise RuntimeError(
+            f"{progress.done} of {study.trials} trials are in, {progress.failed} of them failed"
+        )
     when_s, count, worked_s = np.array(pool.batches).T
     late = np.cumsum(count) > WARM_UP * study.trials
     first = int(np.argmax(late))  # the timed window starts at its end
-    window_s, trials = when_s[-1] - when_s[first], count[first + 1 :].sum()
+    window_s = when_s[-1] - when_s[first]
+    trials = count[first + 1 :].sum()
     beside_s = workers * window_s - worked_s[first + 1 :].sum()
     return StudyTime(total_s, trials / window_s, 1e3 * beside_s / trials)
 
 
 def measure() -> list[dict[str, Any]]:
     """Results of the studies benchmark; the first pool is started cold, as for a user."""
-    points, frames = run_study(CENTROIDS, 2), run_study(FRAMES, 2)
+    points = run_study(CENTROIDS, 2)
+    frames = run_study(FRAMES, 2)
     alone = {"centroids": run_study(CENTROIDS, 1), "frames": run_study(FRAMES, 1)}
     both = {"centroids": points, "frames": frames}
     ratios = [
@@ -110,10 +117,24 @@ def measure() -> list[dict[str, Any]]:
         for name, one in alone.items()
     ]
     return [
-        verdict("10,000 centroid trials with the store", points.total_s, "s", f"then {points.rate:.0f}/s", 5.0),
-        verdict("1,000 EC655 frame trials with the store", frames.total_s, "s", f"then {frames.rate:.0f}/s", 20.0),
+        verdict(
+            "10,000 centroid trials with the store",
+            points.total_s,
+            "s",
+            f"then {points.rate:.0f}/s",
+            5.0,
+        ),
+        verdict(
+            "1,000 EC655 frame trials with the store",
+            frames.total_s,
+            "s",
+            f"then {frames.rate:.0f}/s",
+            20.0,
+        ),
         *ratios,
-        verdict("overhead a trial of a pool of two", points.overhead_ms, "ms", "centroid trials", 1.0),
+        verdict(
+            "overhead a trial of a pool of two", points.overhead_ms, "ms", "centroid trials", 1.0
+        ),
     ]
 
 

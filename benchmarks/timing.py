@@ -48,7 +48,9 @@ def versus(
     }
 
 
-def verdict(name: str, value: float, unit: str, what: str, bar: float, least: bool = False) -> dict[str, Any]:
+def verdict(
+    name: str, value: float, unit: str, what: str, bar: float, least: bool = False
+) -> dict[str, Any]:
     """One result without a peer: a value and its maximum `bar`, or its minimum if `least`."""
     return {
         "name": name,

@@ -23,8 +23,10 @@ from random import Random
 from types import FunctionType, ModuleType
 
 FOLDER = Path(__file__).parent
-CORPUS, OUT = FOLDER / "corpus", FOLDER.parent / "out" / "fuzz"
-TIME_LIMIT_S, MEMORY_LIMIT_MB = 10, 3000
+CORPUS = FOLDER / "corpus"
+OUT = FOLDER.parent / "out" / "fuzz"
+TIME_LIMIT_S = 10
+MEMORY_LIMIT_MB = 3000
 # Targets, and the shipped files that are seeds of each.
 TARGETS = {
     "scenes": ("scenes/*.yaml", "data/cameras/*.yaml"),
@@ -75,12 +77,16 @@ def shipped_files(name: str) -> list[Path]:
 
 def seeds(name: str) -> list[bytes]:
     """All seeds of a target: corpus and shipped files."""
-    return [path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped_files(name))]
+    return [
+        path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped_files(name))
+    ]
 
 
 def write_dictionary(name: str) -> Path:
     """Write libFuzzer's dictionary for a target (words of its seeds and schemas, and TOKENS) and return its path."""
-    schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(name, ())
+    schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(
+        name, ()
+    )
     texts = [
         *seeds(name),
         *((FOLDER.parent / f"data/schema/{schema}.json").read_bytes() for schema in schemas),
@@ -128,7 +134,11 @@ def fuzz_by_mutation(name: str, seconds: float, seed: int = 1) -> int:
     """Fuzz a target by random mutation only; return the number of findings."""
     from fuzz.targets import TARGETS
 
-    rng, corpus, end_s, findings, tries = Random(seed), seeds(name), time.monotonic() + seconds, 0, 0
+    rng = Random(seed)
+    corpus = seeds(name)
+    end_s = time.monotonic() + seconds
+    findings = 0
+    tries = 0
     while time.monotonic() < end_s:
         # First every seed unchanged, then mutations of random seeds.
         data = corpus[tries] if tries < len(corpus) else mutate(rng.choice(corpus), corpus, rng)
@@ -177,7 +187,10 @@ def fuzz_by_coverage(names: list[str], seconds_each: float) -> int:
         output = ["-verbosity=0", "-print_final_stats=1"]
         arguments = [name, *limits, *files, *output, str(grown_corpus), str(CORPUS / name)]
         exit_code = run_forked(partial(run_libfuzzer, TARGETS[name], arguments))
-        print(f"{name}: {f'finding, exit code {exit_code}' if exit_code else 'no finding'}", flush=True)
+        print(
+            f"{name}: {f'finding, exit code {exit_code}' if exit_code else 'no finding'}",
+            flush=True,
+        )
         findings += exit_code != 0
     return findings
 
@@ -210,11 +223,15 @@ def run_forked(task: Callable[[], None]) -> int:
 def main() -> int:
     """Fuzz the requested targets one after another; return the exit code."""
     arguments = [word for word in sys.argv[1:] if not word.startswith("-")]
-    seconds, names = float(arguments[0]) if arguments else 60.0, arguments[1:] or list(NAMES)
+    seconds = float(arguments[0]) if arguments else 60.0
+    names = arguments[1:] or list(NAMES)
     OUT.mkdir(parents=True, exist_ok=True)
     seconds_each = seconds / len(names)
     if "--plain" in sys.argv or importlib.util.find_spec("atheris") is None:
-        print("Fuzzing by random mutation; the extra `fuzz` (atheris) adds coverage guidance.", flush=True)
+        print(
+            "Fuzzing by random mutation; the extra `fuzz` (atheris) adds coverage guidance.",
+            flush=True,
+        )
         findings = sum([fuzz_by_mutation(name, seconds_each) for name in names])
     else:
         findings = fuzz_by_coverage(names, seconds_each)

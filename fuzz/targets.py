@@ -88,7 +88,9 @@ def studies(data: bytes) -> None:
 
 def overrides(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
-    rejects(lambda: loader.load("shefex2", yaml_reader.parse_overrides(text.split("\n"))), InputError)
+    rejects(
+        lambda: loader.load("shefex2", yaml_reader.parse_overrides(text.split("\n"))), InputError
+    )
 
 
 def fits(data: bytes) -> None:
@@ -134,7 +136,9 @@ def tables(data: bytes) -> None:
     rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
     for largest in (1.0, math.inf):  # a response, the spectrum of an LED
         # bypass the cache, whose key is the path
-        rejects(lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest), InputError)
+        rejects(
+            lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest), InputError
+        )
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)
     rejects(lambda: read_prices(path), InputError)
 
@@ -155,7 +159,13 @@ def stores(data: bytes) -> None:
 
     def resume() -> None:
         with store.writing(path) as trials:
-            trials.meta("digest"), trials.meta("code"), trials.counts(), trials.points(), trials.scenes()
+            (
+                trials.meta("digest"),
+                trials.meta("code"),
+                trials.counts(),
+                trials.points(),
+                trials.scenes(),
+            )
 
     for journal in path.parent.glob(f"{path.name}-*"):  # SQLite's journal of the previous file
         journal.unlink()
@@ -170,13 +180,19 @@ def answers(data: bytes) -> None:
     except (ValueError, RecursionError):  # as in core.plugins
         return
     statuses: list[str] = []
-    if rejects(lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status), ValueError):
+    if rejects(
+        lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status),
+        ValueError,
+    ):
         return
     with redirect_stdout(TextIOWrapper(BytesIO(), "utf-8")) as output:
         print_table(Table((Column("status"),), [tuple(statuses)]))
         output.seek(0)
         printed = output.read()
-    if statuses[0][:80] not in printed or not printed.removesuffix("\n").partition("\n")[2].isprintable():
+    if (
+        statuses[0][:80] not in printed
+        or not printed.removesuffix("\n").partition("\n")[2].isprintable()
+    ):
         raise AssertionError(f"not printed as it is: {statuses[0]!r}")
 
 
@@ -191,7 +207,12 @@ def profiles(data: bytes) -> None:
     """An attitude file of any format, read as a scene's maneuver is."""
     path = write_file(data, "profile.csv")
     for rotation in (None, "lab_from_body"):
-        rejects(lambda rotation=rotation: fit_spline(check_samples(read_profile(path, START, rotation))), InputError)
+        rejects(
+            lambda rotation=rotation: fit_spline(
+                check_samples(read_profile(path, START, rotation))
+            ),
+            InputError,
+        )
 
 
 def torques(data: bytes) -> None:
@@ -215,7 +236,23 @@ def quantities(data: bytes) -> None:
 TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
     for target in (
-        *(scenes, studies, overrides, fits, pictures, catalogs, maps, truths, calibrations),
-        *(tables, vehicles, stores, answers, profiles, orbits, torques, packets, quantities),
+        scenes,
+        studies,
+        overrides,
+        fits,
+        pictures,
+        catalogs,
+        maps,
+        truths,
+        calibrations,
+        tables,
+        vehicles,
+        stores,
+        answers,
+        profiles,
+        orbits,
+        torques,
+        packets,
+        quantities,
     )
 }

@@ -50,14 +50,20 @@ def imported(path: Path, files: Collection[Path]) -> set[Path]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
     stems = (ROOT / name.replace(".", "/") for name in names)
-    return {one for stem in stems for one in (stem.with_suffix(".py"), stem / "__init__.py") if one in files}
+    return {
+        one
+        for stem in stems
+        for one in (stem.with_suffix(".py"), stem / "__init__.py")
+        if one in files
+    }
 
 
 def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
     """A file and all that it imports, directly or not; every file if it is no longer there."""
     if source not in uses:
         return set(uses)
-    found, new = {source}, uses[source]
+    found = {source}
+    new = uses[source]
     while new := new - found:
         found |= new
         new = set().union(*(uses[path] for path in new))
@@ -66,7 +72,8 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
 
 COMPILED = pytest.StashKey[tuple[Path, list[Future[None]]]]()
 # Modules run as commands, one group per process. Whatever two groups need is compiled once, by the first that needs it.
-TRACKER, FRAME = "skysim.simulation.compilation", ("--frames", "1", "--out", "{folder}")
+TRACKER = "skysim.simulation.compilation"
+FRAME = ("--frames", "1", "--out", "{folder}")
 BLIND = "skysim", "solve", "{folder}/frame_0000.png"
 LAST_COMPILED = "estimator/identification/stars/__pycache__/quads.identify-*.nbi"  # which `make demo` leaves out
 GROUPS: tuple[Sequence[Sequence[str]], ...] = (
@@ -82,7 +89,8 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     Each of them would compile everything.
     """
     if config.args == config.getini("testpaths") and not any(ROOT.glob(LAST_COMPILED)):
-        folder, pool = Path(tempfile.mkdtemp()), ThreadPoolExecutor()
+        folder = Path(tempfile.mkdtemp())
+        pool = ThreadPoolExecutor()
         groups = [pool.submit(run_modules, group, folder) for group in GROUPS]
         pool.submit(lambda: (wait(groups), (folder / "done").touch()))
         config.stash[COMPILED] = folder, groups

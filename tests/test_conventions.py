@@ -29,7 +29,12 @@ OPTICS = Optics.from_camera(
             "pixel": "10 um",
             "focal_length": "10 mm",
             "f_number": 2,
-            "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+            "detector": {
+                "quantum_efficiency": 0.5,
+                "full_well_e": 40000,
+                "gain_e_dn": 10,
+                "bits": 12,
+            },
         }
     )
 )
@@ -69,10 +74,16 @@ def test_arrays_are_indexed_row_first():
     """A light 313 px left of the boresight and 237 px above it is at (x, y) = (7, 3) and brightens image[3, 7]."""
     image = np.zeros((481, 641))
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
-    one, star = np.ones(1), np.array([[-0.313, -0.237, 1.0, 0.0]])
-    id, place = np.array([7]), star / np.linalg.norm(star)
-    light = Sources(id, place, np.zeros((1, 3)), 0 * one, 1e9 * one, one, 0 * one, one, 0 * id, 0 * one)
-    seen = render(image, light, OPTICS, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
+    one = np.ones(1)
+    star = np.array([[-0.313, -0.237, 1.0, 0.0]])
+    id = np.array([7])
+    place = star / np.linalg.norm(star)
+    light = Sources(
+        id, place, np.zeros((1, 3)), 0 * one, 1e9 * one, one, 0 * one, one, 0 * id, 0 * one
+    )
+    seen = render(
+        image, light, OPTICS, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0)
+    )
     np.testing.assert_allclose(seen.xy_px, [[7.0, 3.0]], rtol=0, atol=1e-9)
     assert np.unravel_index(image.argmax(), image.shape) == (3, 7)
     assert seen.peak_xy.tolist() == [[7, 3]]
@@ -107,7 +118,9 @@ def test_three_stars_keep_their_handedness():
 
     Seen north up, Mintaka is right of Alnitak and Betelgeuse above both; a mirrored image would not do.
     """
-    mintaka, alnitak, betelgeuse = icrs(83.00, -0.30), icrs(85.19, -1.94), icrs(88.79, 7.41)
+    mintaka = icrs(83.00, -0.30)
+    alnitak = icrs(85.19, -1.94)
+    betelgeuse = icrs(88.79, 7.41)
     pixels = OPTICS.project(cam_from_icrs(85, 2, 0).apply([mintaka, alnitak, betelgeuse]))
     assert pixels[0, 0] > pixels[1, 0] > pixels[2, 0]
     assert pixels[2, 1] < pixels[0, 1] < pixels[1, 1]
@@ -116,16 +129,22 @@ def test_three_stars_keep_their_handedness():
 def test_the_tracker_reads_the_pointing_that_the_simulator_set():
     """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
-    np.testing.assert_allclose(np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
+    )
     assert (look * cam_from_icrs(279.2347, 38.7837, -25.0).inv()).magnitude() < EXACT
 
 
 def hand_made(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
     """Rows right, down, boresight by elementary turns alone: Rz(-roll) applied to (west, south, out)."""
-    turn = Rotation.from_euler("z", ra_deg, degrees=True) * Rotation.from_euler("y", -dec_deg, degrees=True)
+    turn = Rotation.from_euler("z", ra_deg, degrees=True) * Rotation.from_euler(
+        "y", -dec_deg, degrees=True
+    )
     out, east, north = turn.apply(np.eye(3))  # where x, y, z of a frame at RA 0, Dec 0 go
-    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-    up, right = c * north + s * east, s * north - c * east
+    c = np.cos(np.radians(roll_deg))
+    s = np.sin(np.radians(roll_deg))
+    up = c * north + s * east
+    right = s * north - c * east
     return np.array([right, -up, out])
 
 
@@ -141,7 +160,9 @@ def test_quaternion_orders():
     half = np.sqrt(0.5)
     quarter = Rotation.from_euler("z", 90, degrees=True)
     np.testing.assert_allclose(quarter.as_quat(), [0, 0, half, half], rtol=0, atol=EXACT)
-    np.testing.assert_allclose(quarter.as_quat(scalar_first=True), [half, 0, 0, half], rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        quarter.as_quat(scalar_first=True), [half, 0, 0, half], rtol=0, atol=EXACT
+    )
     quat_wxyz = np.array([half, 0, 0, half])
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([1.0, 0, 0]), quat_wxyz)
@@ -174,9 +195,15 @@ def test_mujocos_camera_against_ours():
     np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=EXACT)
 
 
-def flown(parts: dict[str, object], motor: int, control: float) -> tuple[multibody.VehicleModel, multibody.Simulation]:
+def flown(
+    parts: dict[str, object], motor: int, control: float
+) -> tuple[multibody.VehicleModel, multibody.Simulation]:
     """A second of SimSat, free and at rest, one of its motors at work."""
-    given = {"model": "vehicles/simsat.xml", "mount": "free", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
+    given = {
+        "model": "vehicles/simsat.xml",
+        "mount": "free",
+        "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+    }
     vehicle = multibody.build(VehicleConfig.model_validate(given | parts))
     flight = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), 1.0)
     controls = np.zeros((1000, vehicle.model.nu))
@@ -189,7 +216,9 @@ def test_a_wheel_spun_up_turns_the_body_the_other_way():
     """+0.1 N m for 1 s on wheel z (0.010125 kg m2, the vehicle without it 8.989875): both right-handed about z."""
     vehicle, flight = flown({"wheels": {}}, 5, 0.1)
     assert flight.rate_body_rad_s[2] == pytest.approx(-0.1 / 8.989875, rel=1e-9)
-    assert flight.speeds_rad_s[vehicle.wheels.dof[2]] == pytest.approx(0.1 / 0.010125 + 0.1 / 8.989875, rel=1e-9)
+    assert flight.speeds_rad_s[vehicle.wheels.dof[2]] == pytest.approx(
+        0.1 / 0.010125 + 0.1 / 8.989875, rel=1e-9
+    )
 
 
 def test_a_fan_pushes_the_vehicle_along_its_own_z():
@@ -205,7 +234,9 @@ def test_a_gimbal_turned_takes_the_torque_the_rotors_momentum_gains():
     after a turn of 0.1 rad +0.035 N m s about x, -0.049 about z. The little that the moving gimbal itself holds, a
     hundredth, is left out.
     """
-    _, flight = flown({"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]}, 3, 0.1)
+    _, flight = flown(
+        {"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]}, 3, 0.1
+    )
     momentum = flight.rate_body_rad_s * [600, 650, 900]
     turned = 0.1 * (1 - 2 * 0.01)  # the servo is two time constants late
     expected = 0.6126106 * np.array([np.sin(turned) * 0.5773503, 0, -np.sin(turned) * 0.8164966])
@@ -223,7 +254,9 @@ def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
     body_from_lab = Rotation.from_euler("x", 10, degrees=True).inv()
     lever = Lever(np.array([0, 0, 0.381]), Rotation.identity())
     pixel = project(body_from_lab, np.array([[0, 0, 1.2192]]), lever, BELIEVED)[0]
-    np.testing.assert_allclose(pixel, (320.0, 240 + 1000 * 0.2117119 / 0.8196768), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(
+        pixel, (320.0, 240 + 1000 * 0.2117119 / 0.8196768), rtol=0, atol=1e-3
+    )
 
 
 def test_no_code_comes_out_of_data():

@@ -32,7 +32,8 @@ ALL_NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
 IDEAL = [name for name in ALL_NAMES if name.endswith("_ideal")]
 NAMES = [name for name in ALL_NAMES if name not in IDEAL]
 # What a published experiment shows instead of five sources and an attitude.
-PAIR, GRID = "afit_test2", "afit_test1"
+PAIR = "afit_test2"
+GRID = "afit_test1"
 CODED = "coded_spiral"  # few LEDs, which are named after some frames
 SHOWN = {PAIR: 2, GRID: 9, CODED: 4}  # LEDs in its first frame
 # On its way from one pair to the next it sees none; Position 4 of Test 3 is beyond this field's short side.
@@ -83,10 +84,14 @@ def test_it_says_what_it_is(flown: Flown) -> None:
 
 @pytest.mark.slow
 def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(flown: Flown) -> None:
-    frame, truth = flown.shots[0].frame, flown.shots[0].truth
-    camera, detector = flown.scene.camera, flown.scene.camera.detector
+    frame = flown.shots[0].frame
+    truth = flown.shots[0].truth
+    camera = flown.scene.camera
+    detector = flown.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
-    above_noise = truth.sources.peak_e > 5 * np.hypot(detector.read_noise_e, np.sqrt(truth.sources.peak_e))
+    above_noise = truth.sources.peak_e > 5 * np.hypot(
+        detector.read_noise_e, np.sqrt(truth.sources.peak_e)
+    )
     assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[flown.scene.name]
     # And none of them blinds the chip.
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
@@ -105,17 +110,24 @@ def test_its_light_is_on_the_frame(flown: Flown) -> None:
     """
     told = flown.scene.camera.detector
     step_e = told.full_well_e / 60000
-    offset_dn = told.offset_dn * told.gain_e_dn / step_e  # the same in electrons, or noise would be cut off at 0
+    offset_dn = (
+        told.offset_dn * told.gain_e_dn / step_e
+    )  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
     flight = simulate_motion(scene_of(flown.scene.name, 1, **fine))
     frame, truth = flight.render(0)
-    scene, camera = flight.lab.scene, flight.lab.camera
-    part, detector, pixels = scene.camera.detector, camera.detector, frame.image_dn.size
+    scene = flight.lab.scene
+    camera = flight.lab.camera
+    part = scene.camera.detector
+    detector = camera.detector
+    pixels = frame.image_dn.size
     assert scene.background == ()
     pattern_e = detector.dark_e_s.sum(dtype=float) * frame.exposure_s
     pattern_e += len(frame.image_dn) * detector.column_offset_e.sum(dtype=float)
-    found_e = (frame.image_dn.sum(dtype=float) - pixels * part.offset_dn) * part.gain_e_dn - pattern_e
+    found_e = (
+        frame.image_dn.sum(dtype=float) - pixels * part.offset_dn
+    ) * part.gain_e_dn - pattern_e
     light_e = truth.sources.electrons
     camera_m = truth.lab_from_body.apply(camera.mount.camera_body_m)
     glow_e_s = black_glow(scene.light, camera.optics, truth.cam_from_lab, camera_m, camera.band)
@@ -130,7 +142,8 @@ def test_its_light_is_on_the_frame(flown: Flown) -> None:
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(flown: Flown) -> None:
-    name, image = flown.scene.name, flown.shots[0].frame.image_dn
+    name = flown.scene.name
+    image = flown.shots[0].frame.image_dn
     again = render(scene_of(name, 2), 0)[0].image_dn
     other = render(scene_of(name, 2, seed=str(flown.scene.seed + 1)), 0)[0].image_dn
     assert image.tobytes() == again.tobytes()
@@ -149,8 +162,11 @@ def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
     assert len(flown.shots) == 2
     for shot in flown.shots:
         answer = shot.report.attitude
-        if flown.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two alone are no attitude
-            found_px, seen_px = shot.report.centroids.xy_px, shot.truth.sources.xy_px
+        if (
+            flown.scene.name in SHOWN
+        ):  # seen, each where it is, to half a pixel; two alone are no attitude
+            found_px = shot.report.centroids.xy_px
+            seen_px = shot.truth.sources.xy_px
             apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)
             assert len(found_px) == len(seen_px) == SHOWN[flown.scene.name]
             assert apart_px.min(axis=1).max() < 0.5
@@ -159,7 +175,9 @@ def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
         assert answer.status == "solved"
         true_attitude = shot.truth.cam_from_lab
         error_rad = (answer.cam_from_ref * true_attitude.inv()).magnitude()
-        nees = metrics.normalized_error_squared(answer.cam_from_ref, true_attitude, answer.covariance_rad2)
+        nees = metrics.normalized_error_squared(
+            answer.cam_from_ref, true_attitude, answer.covariance_rad2
+        )
         assert not metrics.is_wrong(error_rad, nees)
 
 
@@ -167,13 +185,15 @@ def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
 @pytest.mark.parametrize("name", IDEAL)
 def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
     """It differs from its base in the tracker alone, whose map and lever are the true ones."""
-    ideal, base = loader.load(name), loader.load(name.removesuffix("_ideal"))
-    assert ideal.model_copy(update={"tracker": base.tracker, "title": base.title, "name": base.name}) == base
-    lab = build_lab(ideal)
-    leds, lever = (
-        onboard_model.assumed_dome(ideal, ideal.light, lab.camera.sources),
-        onboard_model.assumed_lever(ideal, lab.camera.mount),
+    ideal = loader.load(name)
+    base = loader.load(name.removesuffix("_ideal"))
+    assert (
+        ideal.model_copy(update={"tracker": base.tracker, "title": base.title, "name": base.name})
+        == base
     )
+    lab = build_lab(ideal)
+    leds = onboard_model.assumed_dome(ideal, ideal.light, lab.camera.sources)
+    lever = onboard_model.assumed_lever(ideal, lab.camera.mount)
     np.testing.assert_array_equal(leds.position_m, lab.camera.sources.place[:, :3])
     np.testing.assert_array_equal(lever.camera_body_m, lab.camera.mount.camera_body_m)
     assert (leds.sigma_m, lever.sigma_m) == (0, 0)
@@ -185,7 +205,10 @@ def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
     for shot in open_flight(scene_of(GRID, 4)).shots():
         answer = shot.report.attitude
         if answer.solved:
-            assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
+            assert (
+                np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude())
+                < 10 / 60
+            )
 
 
 # Else its flight would render and solve.
@@ -193,11 +216,14 @@ NO_EYES = {"simsat_bump": {"filter": "null", "motion.control.feedback": "truth"}
 # Under a dome: range of the tilt in which the tracker has enough LEDs, where it is not 0 to 25.
 TILT_DEG = {"afit_test3": (0.0, 3.0), "nps_tas2": (0.0, 4.0), "apl_dome": (0.0, 60.0)}
 BENCH_DEG = (87.0, 90.0)  # elevation of the camera below the collimated display
-SURVEYS, FRAMES = 100, 3
+SURVEYS = 100
+FRAMES = 3
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in ALL_NAMES if name.removesuffix("_ideal") not in SHOWN])
+@pytest.mark.parametrize(
+    "name", [name for name in ALL_NAMES if name.removesuffix("_ideal") not in SHOWN]
+)
 def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
     """NEES e^T P^-1 e is 3 on average where the claimed covariance P is that of the errors e.
 
@@ -205,7 +231,8 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
     or another sky on the display: these errors are the same in all frames of one laboratory.
     """
     flight = simulate_motion(loader.load(name, NO_EYES.get(name)))
-    flown, motion = flight.lab.scene, flight.trajectory()
+    flown = flight.lab.scene
+    motion = flight.trajectory()
     t_s = np.array([exposure_window(flown, index).open_s for index in range(flown.exposure.frames)])
     turned = motion.attitude_at(t_s).inv() * motion.attitude_at(t_s + 0.01)
     trial = FrameTrial(
@@ -214,12 +241,16 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
         tilt_deg=TILT_DEG.get(name.removesuffix("_ideal"), (0.0, 25.0)),
         rate_deg_s=float(np.degrees(np.median(turned.magnitude())) / 0.01),
     )
-    lab, outcomes, rng = build_lab(loader.load(name)), [], np.random.default_rng(300)
+    lab = build_lab(loader.load(name))
+    outcomes = []
+    rng = np.random.default_rng(300)
     for survey in range(SURVEYS):
         scene = with_config(lab.scene, "tracker.survey", seed=survey)
         if isinstance(scene.light, CollimatedDisplayConfig):
             dec_deg = np.degrees(np.arcsin(rng.uniform(-1, 1)))
-            scene = with_config(scene, "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg)
+            scene = with_config(
+                scene, "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg
+            )
             lab = build_lab(scene)
         if survey == 0 or not isinstance(scene.light, StarsConfig):
             tracker = build_tracker(lab.with_scene(scene).camera)
@@ -246,7 +277,8 @@ def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Flight) -> None
     if isinstance(whole.lab.scene.light, StarsConfig):
         pytest.skip("no LEDs")
     motion = whole.trajectory()
-    eyes, counts = build_tracker(whole.lab.camera), []
+    eyes = build_tracker(whole.lab.camera)
+    counts = []
     for index in range(whole.lab.scene.exposure.frames):
         body_from_lab = motion.attitude_at(exposure_window(whole.lab.scene, index).open_s).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
@@ -277,10 +309,13 @@ def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.S
 
     A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
     """
-    vehicle, rng = multibody.build(config), np.random.default_rng(7)
+    vehicle = multibody.build(config)
+    rng = np.random.default_rng(7)
     most = np.where(vehicle.model.actuator_ctrllimited, vehicle.model.actuator_ctrlrange[:, 1], 1.0)
     most[vehicle.torques] = config.torque_limit_nm
-    most[vehicle.gimbals.motor] = np.radians(config.cmgs.gimbal_rate_limit_deg_s) if config.cmgs else 0.0
+    most[vehicle.gimbals.motor] = (
+        np.radians(config.cmgs.gimbal_rate_limit_deg_s) if config.cmgs else 0.0
+    )
     flight = multibody.Simulation(vehicle, Rotation.identity(), rate_body_rad_s, 1.0)
     flight.advance(np.repeat(most * rng.uniform(-1, 1, (100, vehicle.model.nu)), 10, axis=0))
     flight.check_warnings()
@@ -298,23 +333,35 @@ def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
 
 @pytest.mark.parametrize("mount", ["free", "air_bearing"])
 @pytest.mark.parametrize("model", MODELS)
-def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(model: str, mount: str) -> None:
+def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
+    model: str, mount: str
+) -> None:
     """At 1.1 rad/s and, on the bearing, against its stop; wheels at 3000 rpm and out of balance."""
     spec = mujoco.MjSpec.from_file(str(SCENES / "vehicles" / model))
     named = [element.name for element in [*spec.joints, *spec.sites]]
     wheels = sum(name.startswith("wheel_") for name in named)
     parts = {
-        "wheel_": {"wheels": {"start_rpm": [3000] * wheels, "coulomb": "2 mN m", "static_imbalance": "1 g cm"}},
+        "wheel_": {
+            "wheels": {
+                "start_rpm": [3000] * wheels,
+                "coulomb": "2 mN m",
+                "static_imbalance": "1 g cm",
+            }
+        },
         "gimbal_": {"cmgs": {"rotor_torque_limit": "0.1 N m"}},
         "fan_": {"fans": {}},
     }
     given = {"model": f"vehicles/{model}", "mount": mount}
     for prefix, part in parts.items():
         given |= part if any(name.startswith(prefix) for name in named) else {}
-    flight = at_random(VehicleConfig.model_validate(given), TURNS.get(model, 1.0) * np.array([0.6, 0.5, 0.8]))
+    flight = at_random(
+        VehicleConfig.model_validate(given), TURNS.get(model, 1.0) * np.array([0.6, 0.5, 0.8])
+    )
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
-    assert flight.model.nu == 3 + sum(name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named)
+    assert flight.model.nu == 3 + sum(
+        name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named
+    )
     up = Rotation.from_quat(flight.states[:, 1:5], scalar_first=True).as_matrix()[:, 2, 2]
     tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1))).max()
     lowest, highest = {"free": (30.0, 180.0), "air_bearing": (29.9, 30.1)}[mount]

@@ -25,7 +25,10 @@ def off_deg(believed: Rotation | None, telemetry: Telemetry) -> np.ndarray:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("actuators", "more"),
-    [("ideal", {}), ("wheels", {"vehicle.wheels": "{torque_limit: 1 N m, speed_limit_rpm: 20000}"})],
+    [
+        ("ideal", {}),
+        ("wheels", {"vehicle.wheels": "{torque_limit: 1 N m, speed_limit_rpm: 20000}"}),
+    ],
 )
 def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_back(
     actuators: str, more: dict[str, str]
@@ -59,8 +62,13 @@ def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
 
 
 def test_a_maneuver_beyond_the_stop_is_refused_before_the_flight() -> None:
-    overrides = {"motion.maneuver": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
-    with pytest.raises(InputError, match=r"motion.maneuver: tilt of 30\.\d deg at \d+\.\d+ s; allowed: up to"):
+    overrides = {
+        "motion.maneuver": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]",
+        "exposure": QUIET % 20,
+    }
+    with pytest.raises(
+        InputError, match=r"motion.maneuver: tilt of 30\.\d deg at \d+\.\d+ s; allowed: up to"
+    ):
         open_flight(loader.load("afit_simsat", overrides))
 
 
@@ -68,8 +76,13 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    overrides = {"vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}", "exposure": QUIET % 0.3}
-    with pytest.raises(InputError, match="motion: not integrable at a step of 1 ms: MuJoCo warned before"):
+    overrides = {
+        "vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}",
+        "exposure": QUIET % 0.3,
+    }
+    with pytest.raises(
+        InputError, match="motion: not integrable at a step of 1 ms: MuJoCo warned before"
+    ):
         simulate_motion(loader.load("afit_simsat", overrides))
     assert not list(tmp_path.iterdir())
 
@@ -90,12 +103,17 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
     assert telemetry.lab_from_imu is not None
     assert telemetry.bias_rad_s is not None
     off = (telemetry.lab_from_imu * telemetry.lab_from_body.inv()).as_rotvec()[-1]
-    drift = telemetry.lab_from_body.apply(telemetry.bias_rad_s)[:-1].sum(axis=0) * telemetry.period_s
+    drift = (
+        telemetry.lab_from_body.apply(telemetry.bias_rad_s)[:-1].sum(axis=0) * telemetry.period_s
+    )
     assert np.linalg.norm(drift) > 1e-3
     np.testing.assert_allclose(off, drift, rtol=0, atol=2e-3 * np.linalg.norm(drift))
 
 
 def test_a_vehicle_of_one_tick_is_reported_too() -> None:
-    overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
+    overrides = {
+        "vehicle.imu": "{}",
+        "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}",
+    }
     telemetry = simulate_motion(loader.load("afit_simsat", overrides)).telemetry()
     assert telemetry_report.summary(telemetry)["gyro_saturated_s"] == 0

@@ -31,7 +31,9 @@ from skysim.sources import photometry
 from skysim.sources.dome.layouts import listed
 from skysim.sources.dome.shell import point_cloud
 
-AS_IT_IS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+AS_IT_IS = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def test_every_target_has_a_corpus() -> None:
@@ -43,7 +45,8 @@ def test_every_target_has_a_corpus() -> None:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("files", [4, pytest.param(3000, marks=pytest.mark.long)])
 def test_what_grew_from_the_corpus_is_read_or_refused_in_one_line(name: str, files: int) -> None:
-    rng, corpus = Random(2026), seeds(name)
+    rng = Random(2026)
+    corpus = seeds(name)
     for data in corpus:
         TARGETS[name](data)
     for _ in range(files):
@@ -60,7 +63,11 @@ def edited(data: bytes, edit: tuple[str, float, int, bytes], other: bytes) -> by
     at = round(place * len(data))
     if how == "splice":
         return data[:at] + other[round(place * len(other)) :]
-    return data[:at] + (b"" if how == "delete" else new) + data[at + (0 if how == "insert" else length) :]
+    return (
+        data[:at]
+        + (b"" if how == "delete" else new)
+        + data[at + (0 if how == "insert" else length) :]
+    )
 
 
 @some.composite
@@ -104,7 +111,9 @@ def test_any_file_is_read_or_refused_in_one_line(name: str, examples: int) -> No
     ("text", "what"),
     [
         (
-            "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9)),
+            "\n".join(
+                f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9)
+            ),
             "values",
         ),
         ("a: " + "[" * 60 + "]" * 60, "sections deep"),
@@ -124,7 +133,11 @@ def test_yaml_that_is_more_than_it_seems_is_refused(tmp_path: Path, text: str, w
 def test_yaml_keeps_aliases_and_merges(tmp_path: Path) -> None:
     text = "a: &a {b: 1, c: [2, 3]}\nd: {<<: *a, b: 4}\ne: *a\n"
     _, values = yaml_reader.parse_yaml(text)
-    assert values == {"a": {"b": 1, "c": [2, 3]}, "d": {"b": 4, "c": [2, 3]}, "e": {"b": 1, "c": [2, 3]}}
+    assert values == {
+        "a": {"b": 1, "c": [2, 3]},
+        "d": {"b": 4, "c": [2, 3]},
+        "e": {"b": 1, "c": [2, 3]},
+    }
 
 
 def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
@@ -134,7 +147,8 @@ def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "told", [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}]
+    "told",
+    [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}],
 )
 def test_a_flight_that_no_memory_holds_is_refused(told: dict[str, str]) -> None:
     with pytest.raises(InputError, match="allowed: up to 1000000, over a day"):
@@ -178,10 +192,14 @@ def test_any_table_is_read_or_refused(
 
 @pytest.mark.parametrize("side", [20_000, 60_000])
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg", ".fits"])
-def test_a_header_of_gigapixels_is_refused_by_itself(tmp_path: Path, suffix: str, side: int) -> None:
+def test_a_header_of_gigapixels_is_refused_by_itself(
+    tmp_path: Path, suffix: str, side: int
+) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_bytes(promise(suffix, side, side) + b"\0" * 999)
-    with pytest.raises(InputError, match=r"\d+x\d+ pixels by its header; allowed: up to 268435456|truncated"):
+    with pytest.raises(
+        InputError, match=r"\d+x\d+ pixels by its header; allowed: up to 268435456|truncated"
+    ):
         images.read_image(path)
 
 
@@ -192,10 +210,13 @@ def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> No
     assert list(read(data)) == [((41, 30), 1)]
 
 
-def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_sample_of_a_tiff_s_pixels_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Four doubles a pixel are sixteen times what two bytes are."""
     monkeypatch.setattr(decoding, "MAX_PIXELS", 30 * 41)
-    path, gray = tmp_path / "x.tiff", np.arange(30 * 41.0).reshape(30, 41)
+    path = tmp_path / "x.tiff"
+    gray = np.arange(30 * 41.0).reshape(30, 41)
     cv2.imwrite(str(path), gray)
     assert np.array_equal(images.read_image(path), gray)
     cv2.imwrite(str(path), np.dstack([gray] * 4))
@@ -211,12 +232,19 @@ def pillow_bytes(mode: str, kind: str, **options: Any) -> bytes:
 
 
 ENCODED = [
-    *(cv2.imencode(suffix, np.zeros((30, 41, 4), of))[1].tobytes() for suffix in (".png", ".tiff") for of in "BH"),
+    *(
+        cv2.imencode(suffix, np.zeros((30, 41, 4), of))[1].tobytes()
+        for suffix in (".png", ".tiff")
+        for of in "BH"
+    ),
     *(cv2.imencode(".tiff", np.zeros((30, 41), of))[1].tobytes() for of in "Bfd"),
     *(pillow_bytes(mode, "PNG") for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")),
     *(pillow_bytes(mode, "TIFF") for mode in ("1", "L", "RGB", "RGBA", "I;16", "F")),
     *(pillow_bytes(mode, "JPEG") for mode in ("L", "RGB", "CMYK")),
-    *(pillow_bytes("RGB", kind, **options) for kind, options in (("BMP", {}), ("TIFF", {"big_tiff": True}))),
+    *(
+        pillow_bytes("RGB", kind, **options)
+        for kind, options in (("BMP", {}), ("TIFF", {"big_tiff": True}))
+    ),
 ]
 
 
@@ -236,7 +264,9 @@ def test_a_png_of_zeros_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> 
     packed = (struct.pack(">I", len(data)) + kind + data + bytes(4) for kind, data in chunks)
     path = tmp_path / "x.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
-    with pytest.raises(InputError, match=r"16384x16384 pixels of 2147483648 bytes by its header; allowed: up to"):
+    with pytest.raises(
+        InputError, match=r"16384x16384 pixels of 2147483648 bytes by its header; allowed: up to"
+    ):
         images.read_image(path)
 
 
@@ -248,7 +278,9 @@ def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -
     def entry(tag: int, of: int, value: int) -> bytes:
         return struct.pack("<HHQQ", tag, of, 1, value)
 
-    sides = b"".join(entry(tag, of, value) for tag in (256, 257) for of, value in ((kind, side), (4, 2)))
+    sides = b"".join(
+        entry(tag, of, value) for tag in (256, 257) for of, value in ((kind, side), (4, 2))
+    )
     data = b"II" + struct.pack("<HHHQQ", 43, 8, 0, 16, 4) + sides
     assert list(encoded.tiff_size(data)) == [((side, side), 1)]
 
@@ -256,7 +288,8 @@ def test_a_tiff_s_sides_count_as_libtiff_reads_them(tmp_path: Path, kind: int) -
 @pytest.mark.parametrize("between", [b"\xff\xd0", b"\xff\x01", b"\xff\x00"])
 def test_no_mark_hides_a_jpeg_s_size(tmp_path: Path, between: bytes) -> None:
     """To libjpeg these are a mark without a length, or nothing: what they seem to skip, it reads."""
-    path, small = tmp_path / "x.jpg", cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes()
+    path = tmp_path / "x.jpg"
+    small = cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes()
     at = small.index(b"\xff\xc0")
     great = small[2 : at + 5] + struct.pack(">HH", 17_000, 17_000) + small[at + 9 :]
     skipped = 4 + struct.unpack(">H", great[:2])[0]
@@ -273,7 +306,9 @@ def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -
         path.write_bytes(gzip.compress(promise(".fits", 40_000, 50_000) + b"\0" * 2880))
     else:
         told = streams.BytesIO()
-        fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]).writeto(told)
+        fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]).writeto(
+            told
+        )
         data = told.getvalue()
         for key, of in (("ZNAXIS1", 40_000), ("ZNAXIS2", 50_000)):
             at = data.index(key.encode())

@@ -17,11 +17,24 @@ from fuzz.targets import TARGETS
 from skysim.core.paths import ROOT
 
 SEEDS = 12  # of each target: its readers are reached by any
-READER = re.compile(r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$")  # by its name, if it is public
+READER = re.compile(
+    r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$"
+)  # by its name, if it is public
 PARSERS = {  # by what it calls, whatever its name
-    *("json.loads", "np.loadtxt", "np.frombuffer", "np.load", "Table.read", "fits.open", "fits.getheader"),
-    *("cv2.imdecode", "cv2.VideoCapture", "yaml.safe_load", "yaml.compose", "sqlite3.connect"),
-    *("mujoco.MjSpec.from_file", "mujoco.MjModel.from_xml_string"),
+    "json.loads",
+    "np.loadtxt",
+    "np.frombuffer",
+    "np.load",
+    "Table.read",
+    "fits.open",
+    "fits.getheader",
+    "cv2.imdecode",
+    "cv2.VideoCapture",
+    "yaml.safe_load",
+    "yaml.compose",
+    "sqlite3.connect",
+    "mujoco.MjSpec.from_file",
+    "mujoco.MjModel.from_xml_string",
 }
 BYTES = ("read_text", "read_bytes")  # of any path
 OURS = "what skysim itself has written, for its own process or folder"
@@ -100,7 +113,9 @@ def readers() -> Iterator[str]:
         for path in sorted((ROOT / package).rglob("*.py")):
             module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
             for name, function in functions(ast.parse(path.read_text(encoding="utf-8")), ""):
-                calls = {ast.unparse(one.func) for one in ast.walk(function) if isinstance(one, ast.Call)}
+                calls = {
+                    ast.unparse(one.func) for one in ast.walk(function) if isinstance(one, ast.Call)
+                }
                 opens = calls & PARSERS or any(call.endswith(BYTES) for call in calls)
                 if opens or READER.match(function.name):
                     yield f"{module}.{name}"

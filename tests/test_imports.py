@@ -15,7 +15,11 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-FILES = {module_of(path): path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")}
+FILES = {
+    module_of(path): path
+    for package in ("skysim", "estimator")
+    for path in (ROOT / package).rglob("*.py")
+}
 
 
 def statements(node: ast.AST) -> Iterator[ast.AST]:

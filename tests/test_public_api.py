@@ -30,7 +30,9 @@ def test_every_public_name_is_there(package: object) -> None:
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_an_import_loads_no_library(package: str) -> None:
     script = f"import sys, {package}; print({{'numpy', 'scipy', 'numba', 'mujoco', 'cv2'}} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "set()"
 
 
@@ -78,7 +80,10 @@ def test_a_saved_run_is_what_the_command_writes(run, tmp_path) -> None:
 def test_only_a_report_of_several_frames_has_plots_against_time(run, tmp_path) -> None:
     one = dataclasses.replace(run, scores=run.scores[:1]).save(tmp_path / "one")
     three = run.save(tmp_path / "three")
-    headings = [re.findall("<h2>(.*?)</h2>", (folder / "report.html").read_text("utf-8")) for folder in (three, one)]
+    headings = [
+        re.findall("<h2>(.*?)</h2>", (folder / "report.html").read_text("utf-8"))
+        for folder in (three, one)
+    ]
     assert headings[0][:3] == ["The last solved frame", "Errors", "Motion"]
     assert headings[1] == ["The last solved frame", *headings[0][3:]]
 
@@ -108,7 +113,9 @@ def test_an_image_is_solved_where_the_truth_is(run, tmp_path) -> None:
 
 
 def test_overrides_of_python_are_those_of_the_command_line() -> None:
-    scene = skysim.load_scene("afit_simsat", {"exposure.time": "5 ms", "exposure.frames": 2, "seed": 7})
+    scene = skysim.load_scene(
+        "afit_simsat", {"exposure.time": "5 ms", "exposure.frames": 2, "seed": 7}
+    )
     assert (scene.exposure.time_s, scene.exposure.frames, scene.seed) == (0.005, 2, 7)
     assert "shefex2" in skysim.list_scenes()
     with pytest.raises(skysim.InputError, match=r"exposure\.frames"):
@@ -132,7 +139,9 @@ def test_a_tracker_of_one_line_solves_a_frame(run) -> None:
     height_px, width_px = run[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
     assert camera.fov_rad == pytest.approx(np.radians(14.87), rel=1e-12)
-    tracker = estimator.StarTracker.for_sky(camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05)
+    tracker = estimator.StarTracker.for_sky(
+        camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05
+    )
     found = tracker.solve(run[0].image).attitude
     assert found.ra_dec_roll_deg[:2] == pytest.approx(run[0].row.truth_deg[:2], abs=0.02)
     with pytest.raises(estimator.ImageError, match="either"):

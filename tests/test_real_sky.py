@@ -22,20 +22,26 @@ TO_SOLVE = [row for row in ROWS if row["expect"] == "solve"]
 NOT_TO_SOLVE = [row for row in ROWS if row["expect"] == "refuse"]
 ANY = [row for row in ROWS if row["expect"] == "any"]
 
-needs_photographs = pytest.mark.skipif(not ROWS, reason=f"no photographs of the real sky in {FOLDER}")
+needs_photographs = pytest.mark.skipif(
+    not ROWS, reason=f"no photographs of the real sky in {FOLDER}"
+)
 
 
 def by_file(rows, quick: int = 1):
     """A test for each photograph; of which every `quick`-th is not slow."""
     marks = [() if k % quick == 0 else pytest.mark.slow for k in range(len(rows))]
-    params = [pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)]
+    params = [
+        pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)
+    ]
     return pytest.mark.parametrize("row", params)
 
 
 def answer(row, fov_error: float) -> dict:
     """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
-    return plate_solver.solve_file(FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None)
+    return plate_solver.solve_file(
+        FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +113,9 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 def test_a_photograph_in_a_mirror_is_refused(row, blind):
     """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
-    outcome = plate_solver.solve_picture(images.Picture(np.ascontiguousarray(image[:, ::-1])), blind, None)
+    outcome = plate_solver.solve_picture(
+        images.Picture(np.ascontiguousarray(image[:, ::-1])), blind, None
+    )
     assert not outcome.report.attitude.solved
     assert len(outcome.report.centroids) >= 10
     assert plate_solver.outcome_fields(outcome, None)["hint"].startswith("perhaps mirrored: ")

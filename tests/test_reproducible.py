@@ -108,11 +108,15 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
 @pytest.mark.slow
 def test_the_first_picture_ever_says_that_it_compiles(tmp_path: Path) -> None:
     """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
-    cv2.imwrite(str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8))
+    cv2.imwrite(
+        str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8)
+    )
     ours, theirs = os.openpty()
     words = [sys.executable, "-m", "skysim", "solve", "x.png", "--fov", "20"]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=theirs, env=environment, cwd=tmp_path) as process:
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=theirs, env=environment, cwd=tmp_path
+    ) as process:
         ready, _, _ = select.select([ours], [], [], 120)
         said = os.read(ours, 1000).decode() if ready else ""
         process.terminate()
@@ -126,7 +130,9 @@ def test_bytes_do_not_depend_on_threads_or_on_what_was_compiled_before(tmp_path:
     for scene in SCENES:
         cold = made(scene, tmp_path / "cold", **cache, NUMBA_NUM_THREADS="1")
         warm = made(scene, tmp_path / "warm", **cache, NUMBA_NUM_THREADS="1")
-        two = made(scene, tmp_path / "two", **cache, NUMBA_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2")
+        two = made(
+            scene, tmp_path / "two", **cache, NUMBA_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2"
+        )
         assert len(digests(cold)) > 9
         for other in (warm, two):
             assert digests(other) == digests(cold)

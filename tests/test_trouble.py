@@ -37,7 +37,9 @@ def ready() -> None:
 
 
 def asked(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*SKYSIM, *words], capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(
+        [*SKYSIM, *words], capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 def whole_frames(folder: Path) -> int:
@@ -55,7 +57,9 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
     """A file system of two megabytes."""
     place = tmp_path / "disk"
     place.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], check=False, capture_output=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], check=False, capture_output=True
+    )
     if done.returncode:
         pytest.skip("nothing can be mounted here")
     yield place
@@ -106,7 +110,11 @@ def no_room(file_bytes: int) -> Iterator[None]:
     ],
 )
 def test_an_export_without_room_names_file_and_reason_and_leaves_nothing(
-    flown: recording.Recording, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, file: str
+    flown: recording.Recording,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    file: str,
 ) -> None:
     def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
         yield from items
@@ -126,22 +134,37 @@ def test_a_film_that_lost_frames_is_refused(
 
     class Forgetful:
         def __init__(self, *told: Any) -> None:
-            self.film, self.frames = film(*told), 0
-            self.isOpened, self.release = self.film.isOpened, self.film.release
+            self.film = film(*told)
+            self.frames = 0
+            self.isOpened = self.film.isOpened
+            self.release = self.film.release
 
         def write(self, image: Any) -> None:
             self.frames += 1
             if self.frames < 3:
                 self.film.write(image)
 
-    monkeypatch.setattr("skysim.results.files.export.cv2.VideoWriter", type("F", (Forgetful,), {"fourcc": film.fourcc}))
+    monkeypatch.setattr(
+        "skysim.results.files.export.cv2.VideoWriter",
+        type("F", (Forgetful,), {"fourcc": film.fourcc}),
+    )
     with pytest.raises(InputError, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
         export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(tmp_path: Path) -> None:
-    command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--frames", "5", *SMALL]
+    command = [
+        "stream",
+        "shefex2",
+        "--folder",
+        str(tmp_path),
+        "--speed",
+        "0",
+        "--frames",
+        "5",
+        *SMALL,
+    ]
     with no_room(100_000):
         done = CliRunner().invoke(main.app, [*command, "--json"])
     assert str(done.exception) == f"--folder: {tmp_path / 'frame_000000.png'}: File too large"
@@ -175,7 +198,9 @@ def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> Non
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM]
+)
 def test_a_run_that_is_stopped_leaves_whole_frames(tmp_path: Path, number: signal.Signals) -> None:
     command = [*SKYSIM, "run", "shefex2", "--frames", "400", "--out", str(tmp_path), *SMALL]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=ready)

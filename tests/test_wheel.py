@@ -19,13 +19,16 @@ from skysim.core.paths import ROOT
 def test_versions_are_told_for_a_report() -> None:
     told = CliRunner().invoke(main.app, ["--version"])
     assert re.match(
-        r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$", told.stdout
+        r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$",
+        told.stdout,
     )
 
 
 @pytest.mark.long
 def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
-    wheels, there, here = tmp_path / "wheels", tmp_path / "installed", tmp_path / "here"
+    wheels = tmp_path / "wheels"
+    there = tmp_path / "installed"
+    here = tmp_path / "here"
     here.mkdir()
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "wheel", "--no-deps", "-w", wheels, ROOT], check=True)
@@ -38,7 +41,12 @@ def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
 
     def python(*words: str) -> str:
         done = subprocess.run(
-            [sys.executable, *words], cwd=here, env=environment, check=True, capture_output=True, text=True
+            [sys.executable, *words],
+            cwd=here,
+            env=environment,
+            check=True,
+            capture_output=True,
+            text=True,
         )
         return done.stdout
 
@@ -47,6 +55,12 @@ def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
     assert "2 of 2 frames solved, 0 wrong" in ran
     assert (here / "out/afit_simsat/report.html").is_file()
     assert "led_count" in python("-m", "skysim", "study")
-    moon = ("light.bodies={}", "start_time=2012-06-24T21:00:00", "motion.start={ra_deg: 154.9, dec_deg: 4.8}")
-    checked = python("-m", "skysim", "check", "shefex2", *(word for one in moon for word in ("--set", one)))
+    moon = (
+        "light.bodies={}",
+        "start_time=2012-06-24T21:00:00",
+        "motion.start={ra_deg: 154.9, dec_deg: 4.8}",
+    )
+    checked = python(
+        "-m", "skysim", "check", "shefex2", *(word for one in moon for word in ("--set", one))
+    )
     assert "Moon" in checked  # by the ephemeris in data/ephemeris

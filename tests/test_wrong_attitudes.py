@@ -29,7 +29,9 @@ def body_from_lab(rng: np.random.Generator) -> Rotation:
     return (lean * Rotation.from_euler("z", yaw)).inv()
 
 
-def field(tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator) -> Centroids:
+def field(
+    tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator
+) -> Centroids:
     """The LEDs wholly in view but for a share of them, with 0.2 px of noise, and false lights anywhere."""
     pixels = project(turned, tracker.leds.position_m, tracker.lever, tracker.camera)
     pixels = pixels[tracker.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12)]
@@ -43,8 +45,22 @@ def field(tracker: DomeTracker, turned: Rotation, missing: float, false: int, rn
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "false", "least_solved"),
-    [(0.0, 0, 0.995), (0.0, 5, 0.995), (0.2, 5, 0.95), (0.5, 5, 0.3), (0.7, 10, 0.0), (1.0, 15, 0.0)],
-    ids=["clean", "5 false", "a fifth missing", "half missing", "most missing", "only false lights"],
+    [
+        (0.0, 0, 0.995),
+        (0.0, 5, 0.995),
+        (0.2, 5, 0.95),
+        (0.5, 5, 0.3),
+        (0.7, 10, 0.0),
+        (1.0, 15, 0.0),
+    ],
+    ids=[
+        "clean",
+        "5 false",
+        "a fifth missing",
+        "half missing",
+        "most missing",
+        "only false lights",
+    ],
 )
 @pytest.mark.parametrize("fields", [FIELDS // 3, pytest.param(40 * FIELDS, marks=pytest.mark.long)])
 def test_a_dome_is_never_answered_wrongly(afit, missing, false, least_solved, fields):

@@ -90,7 +90,15 @@ PICKED = (
         "motion Tycho-2; parallax that of p Eri B, HIP 7751",
     ),
     Pick(HD_BASE + 23629, "24 Tau", (66715105696289024,), (19.3, -44.3), 0, 0.03, "motion Tycho-2"),
-    Pick(HD_BASE + 37042, "theta2 Ori B", (3017360833515044480,), (2.7, 2.1), 0, -0.11, "motion Tycho-2"),
+    Pick(
+        HD_BASE + 37042,
+        "theta2 Ori B",
+        (3017360833515044480,),
+        (2.7, 2.1),
+        0,
+        -0.11,
+        "motion Tycho-2",
+    ),
     Pick(
         HD_BASE + 38392,
         "gamma Lep B",
@@ -100,9 +108,27 @@ PICKED = (
         0.94,
         "motion Tycho-2; parallax that of gamma Lep A, HIP 27072",
     ),
-    Pick(HD_BASE + 45291, "HD 45291", (5501038956472938368,), (-21.8, -10.4), 0, 1.03, "motion Tycho-2"),
-    Pick(HD_BASE + 68243, "gamma1 Vel", (5519266900766220800,), (-0.6, 9.7), 0, -0.17, "motion Tycho-2"),
-    Pick(HD_BASE + 92463, "HD 92463", (5352174805905137920,), (-21.4, 4.2), 0, 0.00, "motion Tycho-2"),
+    Pick(
+        HD_BASE + 45291,
+        "HD 45291",
+        (5501038956472938368,),
+        (-21.8, -10.4),
+        0,
+        1.03,
+        "motion Tycho-2",
+    ),
+    Pick(
+        HD_BASE + 68243,
+        "gamma1 Vel",
+        (5519266900766220800,),
+        (-0.6, 9.7),
+        0,
+        -0.17,
+        "motion Tycho-2",
+    ),
+    Pick(
+        HD_BASE + 92463, "HD 92463", (5352174805905137920,), (-21.4, 4.2), 0, 0.00, "motion Tycho-2"
+    ),
     Pick(
         HD_BASE + 93308,
         "eta Car",
@@ -112,9 +138,33 @@ PICKED = (
         0.52,
         "motion Tycho-2; variable: V 6.2 in BSC5, 4.4 in Gaia's years",
     ),
-    Pick(HD_BASE + 105383, "HD 105383", (6126469139186679808,), (-35.6, -10.2), 0, -0.05, "motion Tycho-2"),
-    Pick(HD_BASE + 108250, "HR 4729", (6053807844583576064,), (-38.0, -15.3), 0, -0.14, "motion Tycho-2"),
-    Pick(HD_BASE + 116072, "HR 5034", (5869474617129630976,), (-10.6, -11.0), 0, 0.01, "motion Tycho-2"),
+    Pick(
+        HD_BASE + 105383,
+        "HD 105383",
+        (6126469139186679808,),
+        (-35.6, -10.2),
+        0,
+        -0.05,
+        "motion Tycho-2",
+    ),
+    Pick(
+        HD_BASE + 108250,
+        "HR 4729",
+        (6053807844583576064,),
+        (-38.0, -15.3),
+        0,
+        -0.14,
+        "motion Tycho-2",
+    ),
+    Pick(
+        HD_BASE + 116072,
+        "HR 5034",
+        (5869474617129630976,),
+        (-10.6, -11.0),
+        0,
+        0.01,
+        "motion Tycho-2",
+    ),
     Pick(
         HD_BASE + 116657,
         "Mizar B",
@@ -124,10 +174,30 @@ PICKED = (
         0.13,
         "motion BSC5 (HR 5055); parallax that of Mizar A, HIP 65378",
     ),
-    Pick(HD_BASE + 124953, "CN Boo", (1233902704963092608,), (41.3, -32.2), 0, 0.25, "motion Tycho-2"),
-    Pick(HD_BASE + 126111, "HD 126111", (6093032711406699648,), (-25.6, 12.6), 0, 1.72, "motion Tycho-2"),
-    Pick(HD_BASE + 162678, "HR 6660", (4040825358109531520,), (2.1, -4.5), 0, 0.00, "motion Tycho-2"),
-    Pick(HD_BASE + 169326, "HD 169326", (6652929290975546496,), (0.3, 12.8), 0, 1.19, "motion Tycho-2"),
+    Pick(
+        HD_BASE + 124953, "CN Boo", (1233902704963092608,), (41.3, -32.2), 0, 0.25, "motion Tycho-2"
+    ),
+    Pick(
+        HD_BASE + 126111,
+        "HD 126111",
+        (6093032711406699648,),
+        (-25.6, 12.6),
+        0,
+        1.72,
+        "motion Tycho-2",
+    ),
+    Pick(
+        HD_BASE + 162678, "HR 6660", (4040825358109531520,), (2.1, -4.5), 0, 0.00, "motion Tycho-2"
+    ),
+    Pick(
+        HD_BASE + 169326,
+        "HD 169326",
+        (6652929290975546496,),
+        (0.3, 12.8),
+        0,
+        1.19,
+        "motion Tycho-2",
+    ),
 )
 
 
@@ -145,7 +215,10 @@ def main() -> None:
         if star["id"] not in known:
             _v, hp, _v_i = photometry(np.array([star]))
             where = f"{star['ra']:10.5f} {star['dec']:+10.5f}"
-            print(f"{star['id']:20d} {where}  Hp {hp:.2f}", "wanted" if hp <= LIMIT_HP else "too faint")
+            print(
+                f"{star['id']:20d} {where}  Hp {hp:.2f}",
+                "wanted" if hp <= LIMIT_HP else "too faint",
+            )
 
 
 def bright_gaia() -> np.ndarray:
@@ -158,23 +231,32 @@ def lacking(gaia: np.ndarray) -> np.ndarray:
     """Indices of the stars to V 6.6 with no Hipparcos-2 entry near, both at J2016.0."""
     rows = list(hip2_rows(99.0))
     ra, dec, pm_ra, pm_dec = (
-        np.array([r[name] for r in rows]) for name in ("ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
+        np.array([r[name] for r in rows])
+        for name in ("ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
     )
     ra, dec = moved(ra, dec, pm_ra, pm_dec, gaia_dr3.EPOCH_JYEAR - EPOCH_JYEAR)
-    apart = cKDTree(gaia_dr3.directions(ra, dec)).query(gaia_dr3.directions(gaia["ra"], gaia["dec"]))[0]
+    apart = cKDTree(gaia_dr3.directions(ra, dec)).query(
+        gaia_dr3.directions(gaia["ra"], gaia["dec"])
+    )[0]
     v_mag = np.array([photometry(gaia[n : n + 1])[0] for n in range(len(gaia))])
     return np.flatnonzero((apart > APART_ARCSEC * ARCSEC_RAD) & (v_mag < 6.6))
 
 
-def moved(ra_deg: Any, dec_deg: Any, pm_ra_mas_yr: Any, pm_dec_mas_yr: Any, years: float) -> tuple[Any, Any]:
+def moved(
+    ra_deg: Any, dec_deg: Any, pm_ra_mas_yr: Any, pm_dec_mas_yr: Any, years: float
+) -> tuple[Any, Any]:
     """Proper motion along the tangents, degrees; good to 1 mas for these spans but near the poles."""
     step = years / 3.6e6
-    return ra_deg + pm_ra_mas_yr * step / np.cos(np.radians(dec_deg)), dec_deg + pm_dec_mas_yr * step
+    return ra_deg + pm_ra_mas_yr * step / np.cos(
+        np.radians(dec_deg)
+    ), dec_deg + pm_dec_mas_yr * step
 
 
 def photometry(stars: np.ndarray) -> tuple[float, float, float]:
     """V, Hp and V-I of the stars' light together: G-V and G-I of BP-RP (Gaia DR3 documentation, ch. 5.5)."""
-    g, bp, rp = (float(-2.5 * np.log10(np.sum(10 ** (-0.4 * stars[band])))) for band in ("g", "bp", "rp"))
+    g, bp, rp = (
+        float(-2.5 * np.log10(np.sum(10 ** (-0.4 * stars[band])))) for band in ("g", "bp", "rp")
+    )
     v_mag, _b_v, v_i = gaia_dr3.johnson(g, bp - rp)
     return v_mag, v_mag - float(v_from_hp(0.0, v_i)), v_i
 

@@ -39,7 +39,9 @@ def fit(ephemeris: Ephemeris, name: str, days: int, count: int) -> np.ndarray:
     starts = np.arange(FIRST_JD, LAST_JD, days)
     times = starts[:, None] + (nodes + 1) / 2 * days
     position_km = ephemeris.position(name, times.ravel()).reshape(3, len(starts), len(nodes))
-    return np.einsum("kn,agn->kag", np.linalg.pinv(chebyshev.chebvander(nodes, count - 1)), position_km)
+    return np.einsum(
+        "kn,agn->kag", np.linalg.pinv(chebyshev.chebvander(nodes, count - 1)), position_km
+    )
 
 
 def main() -> None:
@@ -48,7 +50,11 @@ def main() -> None:
     for source, (name, days, count, unit_km) in SERIES.items():
         steps = np.rint(fit(ephemeris, source, days, count) / unit_km)
         assert np.abs(steps).max() < 2**31
-        arrays |= {name: steps.astype(np.int32), f"{name}_days": float(days), f"{name}_unit_km": unit_km}
+        arrays |= {
+            name: steps.astype(np.int32),
+            f"{name}_days": float(days),
+            f"{name}_unit_km": unit_km,
+        }
     np.savez_compressed(Path(__file__).with_name("de423.npz"), **arrays)
 
 

@@ -28,7 +28,8 @@ def page() -> str:
 def commands_markdown() -> str:
     """All commands: heading, description, usage, and a table of the parameters."""
     return "\n\n".join(
-        section(context) for context in command_contexts(typer.Context(root_command(), info_name="skysim"))
+        section(context)
+        for context in command_contexts(typer.Context(root_command(), info_name="skysim"))
     )
 
 
@@ -46,12 +47,25 @@ def command_contexts(parent: Any) -> Iterator[Any]:
 def section(context: Any) -> str:
     """Section of one command."""
     command = context.command
-    rows = [row(parameter, context) for parameter in command.get_params(context) if parameter.name != "help"]
-    name, usage = context.command_path, command.get_usage(context).removeprefix("Usage: ")
-    heading = f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
+    rows = [
+        row(parameter, context)
+        for parameter in command.get_params(context)
+        if parameter.name != "help"
+    ]
+    name = context.command_path
+    usage = command.get_usage(context).removeprefix("Usage: ")
+    heading = (
+        f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
+    )
     table = "\n".join(["| parameter | meaning |", "|---|---|", *rows]) if rows else ""
     examples = "\n".join(EXAMPLES[name.partition(" ")[2]])
-    parts = [heading, command.help or "", f"```text\n{usage}\n```", table, f"Examples:\n\n```text\n{examples}\n```"]
+    parts = [
+        heading,
+        command.help or "",
+        f"```text\n{usage}\n```",
+        table,
+        f"Examples:\n\n```text\n{examples}\n```",
+    ]
     return "\n\n".join(filter(None, parts))
 
 

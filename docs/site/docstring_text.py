@@ -38,4 +38,7 @@ def paragraph_to_markdown(paragraph: str) -> str:
 def escape(text: str) -> str:
     """Escape Markdown and HTML outside of code."""
     pieces = CODE.split(text)
-    return "".join(piece if piece[:1] == "`" else MARKS.sub(r"\\\1", piece.replace("<", "&lt;")) for piece in pieces)
+    return "".join(
+        piece if piece[:1] == "`" else MARKS.sub(r"\\\1", piece.replace("<", "&lt;"))
+        for piece in pieces
+    )

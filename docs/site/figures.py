@@ -42,9 +42,19 @@ from skysim.sources.photometry import (
     temperature_k,
 )
 
-mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11})
-LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # an opaque background for labels
-INK, LAB, BODY, CAM, LIGHT = "#333333", "#666666", "#1f6fb2", "#c0392b", "#d68910"
+mpl.rcParams.update(
+    {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
+)
+LABEL_BOX = {
+    "facecolor": "white",
+    "edgecolor": "none",
+    "pad": 1.0,
+}  # an opaque background for labels
+INK = "#333333"
+LAB = "#666666"
+BODY = "#1f6fb2"
+CAM = "#c0392b"
+LIGHT = "#d68910"
 ORION = {
     "Betelgeuse": 27989, "Rigel": 24436, "Bellatrix": 25336, "Saiph": 27366,
     "Mintaka": 25930, "Alnilam": 26311, "Alnitak": 26727,
@@ -58,7 +68,9 @@ def axes(path: Path) -> None:
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     camera_m = lab_from_body.apply(mount.camera_body_m)
     azimuth, height = np.radians([-38, 24])  # from where it is looked at
-    toward = np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)])
+    toward = np.array(
+        [np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)]
+    )
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     flat = np.column_stack([right, np.cross(toward, right)])  # (3, 2) from the lab to the paper
     frames = (
@@ -76,7 +88,13 @@ def axes(path: Path) -> None:
                 "",
                 end,
                 begin,
-                arrowprops={"arrowstyle": "-|>", "color": color, "lw": 2, "shrinkA": 0, "shrinkB": 0},
+                arrowprops={
+                    "arrowstyle": "-|>",
+                    "color": color,
+                    "lw": 2,
+                    "shrinkA": 0,
+                    "shrinkB": 0,
+                },
             )
             ax.annotate(
                 f"{name} {letter}",
@@ -119,7 +137,8 @@ def pixels(path: Path) -> None:
     optics = optics_with_detector()
     direction = np.array([[1.3e-3, -0.6e-3, 1.0]])  # 1.3 px right of the boresight, 0.6 px above it
     direction /= np.linalg.norm(direction)
-    ones, image = np.ones(1), np.zeros((16, 16))
+    ones = np.ones(1)
+    image = np.zeros((16, 16))
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
     star = Sources(
         np.array([1]),
@@ -133,7 +152,9 @@ def pixels(path: Path) -> None:
         np.zeros(1, np.int64),
         0 * ones,
     )
-    visible = render(image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0))
+    visible = render(
+        image, star, optics, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 1.0)
+    )
     (x, y), (column, row) = visible.xy_px[0], visible.peak_xy[0]
     fig, ax = plt.subplots(figsize=(6.4, 4.6))
     ax.imshow(image[:5, :7], cmap="gray_r", vmax=1.6 * image.max())
@@ -190,10 +211,16 @@ def roll(path: Path) -> None:
         cam_from_icrs = star_sources.cam_from_icrs(84.0, 0.0, roll_deg)
         xy = optics.project(cam_from_icrs.apply(directions))
         bright = (stars.v_mag < 5) & (np.abs(xy - camera.center_px) < camera.center_px).all(axis=1)
-        ax.scatter(*xy[bright].T, s=2 + 6 * (5 - stars.v_mag[bright]) ** 1.3, color=INK, linewidths=0)
-        for name, place in zip(ORION, optics.project(cam_from_icrs.apply(directions[rows])), strict=True):
+        ax.scatter(
+            *xy[bright].T, s=2 + 6 * (5 - stars.v_mag[bright]) ** 1.3, color=INK, linewidths=0
+        )
+        for name, place in zip(
+            ORION, optics.project(cam_from_icrs.apply(directions[rows])), strict=True
+        ):
             if name not in ("Alnilam", "Mintaka"):
-                side = -1 if name in ("Betelgeuse", "Alnitak") else 1  # where no arrow and no star stands
+                side = (
+                    -1 if name in ("Betelgeuse", "Alnitak") else 1
+                )  # where no arrow and no star stands
                 ax.annotate(
                     name,
                     place,
@@ -208,11 +235,18 @@ def roll(path: Path) -> None:
             end = optics.project(cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
             ax.annotate("", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8})
             ax.text(*(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center")
-        ax.annotate("", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8})
+        ax.annotate(
+            "", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8}
+        )
         ax.text(middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center")
         if roll_deg:
             angles = np.radians(np.linspace(0, roll_deg, 30))
-            north = np.arctan2(*(optics.project(cam_from_icrs.apply(unit(*np.radians([[84.0], [7.0]]))))[0] - middle))
+            north = np.arctan2(
+                *(
+                    optics.project(cam_from_icrs.apply(unit(*np.radians([[84.0], [7.0]]))))[0]
+                    - middle
+                )
+            )
             arc = middle + 95 * np.column_stack([np.sin(north + angles), np.cos(north + angles)])
             ax.plot(*arc.T, color=LIGHT, linewidth=2)
         ax.set(
@@ -228,7 +262,9 @@ def roll(path: Path) -> None:
 
 def unit(ra_rad: Floats, dec_rad: Floats) -> Floats:
     """(N, 3) unit vectors of right ascensions and declinations."""
-    return np.column_stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
+    return np.column_stack(
+        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)]
+    )
 
 
 def lever(path: Path) -> None:
@@ -264,12 +300,21 @@ def lever(path: Path) -> None:
         ax.plot(*np.transpose([camera, led])[1:], color=color, linewidth=1.6)
         angle_deg = np.degrees(np.arccos((led - camera) @ bore / np.linalg.norm(led - camera)))
         label = f"roll {roll_deg:.0f}°: the LED {angle_deg:.2f}° off the boresight"
-        ax.annotate(label, camera[1:], (at_pt, -12), textcoords="offset points", color=color, ha=side)
+        ax.annotate(
+            label, camera[1:], (at_pt, -12), textcoords="offset points", color=color, ha=side
+        )
     bearing_angle_deg = np.degrees(np.arctan2(led[1], led[2]))
     ax.plot(*np.transpose([np.zeros(3), led])[1:], color=LAB, linestyle=":", linewidth=1.2)
-    ax.text(0.05, -0.11, f"bearing's center O: from here it stands at {bearing_angle_deg:.2f}°", color=LAB)
+    ax.text(
+        0.05,
+        -0.11,
+        f"bearing's center O: from here it stands at {bearing_angle_deg:.2f}°",
+        color=LAB,
+    )
     ax.plot(0, 0, "o", color=INK)
-    ax.set(aspect="equal", xlabel="lab y (m)", ylabel="lab z (m)", ylim=(-0.2, 1.32), xlim=(-1.35, 1.7))
+    ax.set(
+        aspect="equal", xlabel="lab y (m)", ylabel="lab z (m)", ylim=(-0.2, 1.32), xlim=(-1.35, 1.7)
+    )
     save(fig, path)
 
 
@@ -285,8 +330,16 @@ def bodies(path: Path) -> None:
     )
     fig, all_axes = plt.subplots(1, 4, figsize=(10, 2.8))
     for ax, (name, time, settings, title) in zip(all_axes, views, strict=True):
-        small = {"camera.focal_length": "200 mm", "camera.width_px": "240", "camera.height_px": "240"}
-        settings |= small | {"light.bodies": "{}", "start_time": time, "motion.rate_deg_s": "[0, 0, 0]"}
+        small = {
+            "camera.focal_length": "200 mm",
+            "camera.width_px": "240",
+            "camera.height_px": "240",
+        }
+        settings |= small | {
+            "light.bodies": "{}",
+            "start_time": time,
+            "motion.rate_deg_s": "[0, 0, 0]",
+        }
         lab = build_lab(loader.load("shefex2", settings))
         beam = beam_of(lab.camera.lights, exposure_at(lab, 0.0))
         shown = next(body for body in beam.discs if body.name == name)
@@ -317,10 +370,16 @@ def color(path: Path) -> None:
             photons = black_body_v0(nm * 1e-9, temperature_k(*colors))
             moments = star_chromatic(*colors, band)
         else:
-            photons, moments = measured("white").response_at(nm * 1e-9) * nm, led_chromatic("white", band)
+            photons = measured("white").response_at(nm * 1e-9) * nm
+            moments = led_chromatic("white", band)
         electrons = photons * band.response_at(nm * 1e-9)
         spectra.plot(nm, electrons / electrons.max(), color=paint, label=name)
-        shift.plot(np.interp(moments[2], chromatic_shifts(band, nm * 1e-9)[1], nm), moments[2], "o", color=paint)
+        shift.plot(
+            np.interp(moments[2], chromatic_shifts(band, nm * 1e-9)[1], nm),
+            moments[2],
+            "o",
+            color=paint,
+        )
     spectra.set(ylabel="photo-electrons, relative")
     spectra.legend(frameon=False)
     shift.set(xlabel="wavelength [nm]", ylabel="shift at the corner [px]")
@@ -342,19 +401,29 @@ def air(path: Path) -> None:
     bent.set(title="refraction", ylabel="raised by (arcsec)")
     mass = starlight.air_mass(apparent_rad)
     for extinction_mag, color in ((0.1, BODY), (0.17, LIGHT), (0.3, CAM)):
-        dimmed.loglog(altitude_deg, extinction_mag * mass, color=color, label=f"{extinction_mag:g} mag an air mass")
+        dimmed.loglog(
+            altitude_deg,
+            extinction_mag * mass,
+            color=color,
+            label=f"{extinction_mag:g} mag an air mass",
+        )
     dimmed.set(title="extinction", ylabel="fainter by (mag)")
     for ax in (bent, dimmed):
         ax.set(xlabel="altitude (deg)", xlim=(2, 90), xticks=[2, 5, 10, 20, 45, 90])
         ax.set_xticklabels(["2", "5", "10", "20", "45", "90"])
         ax.minorticks_off()
     aperture_m = np.geomspace(2e-3, 1, 25)
-    ours = np.sqrt([scintillation.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m])
+    ours = np.sqrt(
+        [scintillation.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m]
+    )
     young = np.sqrt(scintillation.YOUNG_M_S * scintillation.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
     twinkling.loglog(100 * aperture_m, ours, color=BODY, label="simulated")
     twinkling.loglog(100 * aperture_m, young, color=LAB, linestyle="--", label="Young's law")
     twinkling.set(
-        title="scintillation, zenith, 50 ms", xlabel="aperture (cm)", ylabel="standard deviation", ylim=(0.01, 2)
+        title="scintillation, zenith, 50 ms",
+        xlabel="aperture (cm)",
+        ylabel="standard deviation",
+        ylim=(0.01, 2),
     )
     for ax in (dimmed, twinkling):
         ax.legend(frameon=False, fontsize=9)
@@ -374,8 +443,16 @@ def orbit(path: Path) -> None:
     camera = lab.camera
     assert camera.orbit is not None
     cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
-    boresight, t_s = cam_from_lab.inv().apply([0.0, 0.0, 1.0]), np.arange(0, 2 * 5677, 20.0)
-    seen = sample(camera.orbit, lab.scene.start_time, t_s, Pointing("inertial", boresight), boresight[None], 0.1)
+    boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    t_s = np.arange(0, 2 * 5677, 20.0)
+    seen = sample(
+        camera.orbit,
+        lab.scene.start_time,
+        t_s,
+        Pointing("inertial", boresight),
+        boresight[None],
+        0.1,
+    )
     limits = ExclusionConfig(sun_deg=60, earth_deg=25, moon_deg=20)
     stray = [stray_e_s(camera.lights, exposure_at(lab, t)) for t in t_s.tolist()]
     fig, (angles, light) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
@@ -383,12 +460,16 @@ def orbit(path: Path) -> None:
     usable = outside["Sun"] & outside["Earth"] & outside["Moon"]
     minutes = t_s / 60
     for ax in (angles, light):
-        ax.fill_between(minutes, 0, 1, where=usable, transform=ax.get_xaxis_transform(), color="#d5e8d4", lw=0)
+        ax.fill_between(
+            minutes, 0, 1, where=usable, transform=ax.get_xaxis_transform(), color="#d5e8d4", lw=0
+        )
     for name, color in (("sun", LIGHT), ("earth", BODY), ("moon", LAB)):
         label = "the Earth's limb" if name == "earth" else f"the {name.capitalize()}"
         angles.plot(minutes, getattr(seen, f"{name}_deg"), color=color, label=label)
         angles.axhline(getattr(limits, f"{name}_deg"), color=color, linestyle=":", linewidth=1)
-        light.semilogy(minutes, [one.get(f"the {name.capitalize()}", np.nan) for one in stray], color=color)
+        light.semilogy(
+            minutes, [one.get(f"the {name.capitalize()}", np.nan) for one in stray], color=color
+        )
     angles.set(ylabel="from the boresight (deg)", ylim=(-80, 180))
     angles.legend(frameon=False, ncols=3, loc="upper right")
     light.set(ylabel="stray light (e⁻/s a pixel)", xlabel="minutes", xlim=(0, minutes[-1]))
@@ -399,7 +480,9 @@ def reflections(path: Path) -> None:
     """A frame without noise under a dome: black, and with mirror images and ghosts of its LEDs."""
     deep = "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}"
     settings = {"light.surface": deep, "exposure.frames": "1", "camera.detector.noise": "false"}
-    settings |= {f"camera.detector.{key}": "0" for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")}
+    settings |= {
+        f"camera.detector.{key}": "0" for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")
+    }
     lens = {"camera.ghosts": "[{magnification: 0.5, share: 0.02, radius_px: 6}]"}
     wall = {"light.reflection": "{specular: 0.1}"}
     fig, both = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
@@ -409,7 +492,9 @@ def reflections(path: Path) -> None:
         light = frame.image_dn.astype(float)
         light -= np.median(light)
         # Every pixel as large as seven, on a logarithmic scale, so that LEDs and ghosts are seen.
-        ax.imshow(np.log10(np.clip(maximum_filter(light, 7), 1e-3, None)), cmap="gray_r", vmin=-3, vmax=3)
+        ax.imshow(
+            np.log10(np.clip(maximum_filter(light, 7), 1e-3, None)), cmap="gray_r", vmin=-3, vmax=3
+        )
         number = truth.sources.id
         kinds = (
             ("LED", number < MIRRORED, BODY),
@@ -417,9 +502,19 @@ def reflections(path: Path) -> None:
             ("its ghost", (number >= GHOST) & (number % GHOST < MIRRORED), CAM),
         )
         for name, chosen, color in kinds:
-            ax.plot(*truth.sources.xy_px[chosen].T, "o", ms=13, mfc="none", mew=1.3, color=color, label=name)
+            ax.plot(
+                *truth.sources.xy_px[chosen].T,
+                "o",
+                ms=13,
+                mfc="none",
+                mew=1.3,
+                color=color,
+                label=name,
+            )
         height, width = light.shape
-        ax.set(xticks=[], yticks=[], title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        ax.set(
+            xticks=[], yticks=[], title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5)
+        )
     both[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     save(fig, path)
 
@@ -436,8 +531,15 @@ def save(fig: plt.Figure, path: Path) -> None:
 
 
 FIGURES = {
-    **{"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies},
-    **{"color": color, "air": air, "orbit": orbit, "reflections": reflections},
+    "axes": axes,
+    "pixels": pixels,
+    "roll": roll,
+    "lever": lever,
+    "bodies": bodies,
+    "color": color,
+    "air": air,
+    "orbit": orbit,
+    "reflections": reflections,
 }
 
 

@@ -20,13 +20,17 @@ BLOCK = re.compile(r'<div class="math">(.*?)</div>', re.DOTALL)
 INLINE = re.compile(r"\$<code>(.*?)</code>\$", re.DOTALL)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".xml": "xml", ".json": "json", ".csv": "text"}
 
-repository_paths: dict[str, str] = {}  # path in the repository of each Markdown page, by its path in the site
+repository_paths: dict[
+    str, str
+] = {}  # path in the repository of each Markdown page, by its path in the site
 
 
 def on_files(files: Any, config: Any) -> Any:
     """Add a page for every linked file or folder outside of docs/: its Markdown, its text or its list of files."""
     repository_paths.clear()
-    repository_paths.update({file.src_uri: f"docs/{file.src_uri}" for file in files.documentation_pages()})
+    repository_paths.update(
+        {file.src_uri: f"docs/{file.src_uri}" for file in files.documentation_pages()}
+    )
     queue = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *repository_paths.values()]
     visited = set(repository_paths.values())
     while queue:
@@ -37,7 +41,11 @@ def on_files(files: Any, config: Any) -> Any:
             if (ROOT / path).suffix == ".md":
                 repository_paths[site_path(path)] = path
         if (ROOT / path).suffix == ".md":
-            queue += [linked for linked in linked_paths(path) if linked not in visited and not in_site(linked)]
+            queue += [
+                linked
+                for linked in linked_paths(path)
+                if linked not in visited and not in_site(linked)
+            ]
     return files
 
 
@@ -102,6 +110,7 @@ def page_text(path: str) -> str:
     heading = f"---\nsearch: {{exclude: true}}\ntitle: {source.name}\n---\n# `{path}`\n\n"
     if source.is_dir():
         return heading + "\n".join(
-            f"- `{name}`" for name in sorted(entry.name for entry in source.iterdir() if entry.suffix)
+            f"- `{name}`"
+            for name in sorted(entry.name for entry in source.iterdir() if entry.suffix)
         )
     return f"{heading}`````{LANGUAGES.get(source.suffix, 'text')}\n{source.read_text(encoding='utf-8')}\n`````\n"

@@ -32,9 +32,22 @@ from skysim.scene.loader import PRESETS
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CURVE_FOLDER
 
-BOUNDS = {"ge": "≥", "minimum": "≥", "gt": ">", "exclusiveMinimum": ">", "le": "≤", "maximum": "≤", "lt": "<"}
+BOUNDS = {
+    "ge": "≥",
+    "minimum": "≥",
+    "gt": ">",
+    "exclusiveMinimum": ">",
+    "le": "≤",
+    "maximum": "≤",
+    "lt": "<",
+}
 BOUNDS["exclusiveMaximum"] = "<"
-WORDS = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
+WORDS = {
+    "number": "number",
+    "integer": "whole number",
+    "string": "text",
+    "boolean": "true or false",
+}
 WORDS |= {"null": "null", "object": "a section", "array": "list"}
 
 HEAD = """# Keys of a {what}
@@ -154,16 +167,29 @@ def sections(root: type[BaseModel]) -> dict[str, Section]:
 
 def table(model: type[BaseModel], paths: Iterable[str] = (), links: Iterable[str] = ()) -> str:
     """Markdown table of a section's keys; "" for a section without keys."""
-    schema, rows = model.model_json_schema(by_alias=True), []
+    schema = model.model_json_schema(by_alias=True)
+    rows = []
     for name, field in model.model_fields.items():
         key = field.alias or name
         if key == NAME_ALIAS:
             continue
         unit = si_unit(name)
-        default = "required" if field.is_required() else f"`{yaml_line(file_value(default_in_file(field), unit))}`"
+        default = (
+            "required"
+            if field.is_required()
+            else f"`{yaml_line(file_value(default_in_file(field), unit))}`"
+        )
         described = describe(schema["properties"][key], unit, links)
-        texts = [TEXTS[path] for path in (f"{path}.{key}".lstrip(".") for path in paths or [""]) if path in TEXTS]
-        allowed = texts[0] + (" or null" if described.endswith(" or null") else "") if texts else described
+        texts = [
+            TEXTS[path]
+            for path in (f"{path}.{key}".lstrip(".") for path in paths or [""])
+            if path in TEXTS
+        ]
+        allowed = (
+            texts[0] + (" or null" if described.endswith(" or null") else "")
+            if texts
+            else described
+        )
         rows.append(f"| `{key}` | {allowed.replace('|', chr(92) + '|')} | {default} |")
     return "\n".join(["| key | allowed | default |", "|---|---|---|", *rows]) if rows else ""
 
@@ -172,7 +198,9 @@ def default_in_file(field: Any) -> Any:
     """A field's default as written in a file; of a section only what differs from its defaults."""
     value = field.get_default(call_default_factory=True)
     return (
-        value.model_dump(mode="json", by_alias=True, exclude_defaults=True) if isinstance(value, BaseModel) else value
+        value.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        if isinstance(value, BaseModel)
+        else value
     )
 
 
@@ -201,7 +229,11 @@ def describe_list(node: dict[str, Any], unit: str, links: Iterable[str]) -> str:
         return f"list of {len(node['prefixItems'])}: {items[0]}"
     if items:
         return f"list: {'; '.join(items)}"
-    return f"list of any length: {describe(node['items'], unit, links)}" if node.get("items") else "list"
+    return (
+        f"list of any length: {describe(node['items'], unit, links)}"
+        if node.get("items")
+        else "list"
+    )
 
 
 def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
@@ -214,11 +246,14 @@ def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
 
 def page(root: type[BaseModel], what: str, more: str = "") -> str:
     """The page of a kind of file: one heading per model."""
-    found, parts = sections(root), [HEAD.format(what=what, more=more)]
+    found = sections(root)
+    parts = [HEAD.format(what=what, more=more)]
     for name, (model, paths) in found.items():
         kind = model.model_fields.get("kind")
         kinds = names(typing.get_args(kind.annotation)) if kind else ""
-        where = f"Section {names(paths)}" + (f" of kind {kinds}." if kinds else ".") if paths else ""
+        where = (
+            f"Section {names(paths)}" + (f" of kind {kinds}." if kinds else ".") if paths else ""
+        )
         parts += [f"## {name}", where, to_markdown(inspect.cleandoc(model.__doc__ or ""))]
         parts.append(table(model, paths, found))
     return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
@@ -226,7 +261,8 @@ def page(root: type[BaseModel], what: str, more: str = "") -> str:
 
 def pages() -> dict[Path, str]:
     """The text of every generated page by its path."""
-    folder, presets = ROOT / "docs" / "reference", stems(PRESETS, "yaml")
+    folder = ROOT / "docs" / "reference"
+    presets = stems(PRESETS, "yaml")
     return {
         folder / "scene_keys.md": page(Scene, "scene", MORE.format(presets=presets)),
         folder / "study_keys.md": page(Study, "study"),

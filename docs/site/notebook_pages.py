@@ -13,7 +13,9 @@ from mkdocs.structure.files import File, Files
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages: notebooks/NAME.md from notebooks/NAME.ipynb."""
     for path in sorted(Path(config.docs_dir, "notebooks").glob("*.ipynb")):
-        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook_markdown(path)))
+        files.append(
+            File.generated(config, f"notebooks/{path.stem}.md", content=notebook_markdown(path))
+        )
     return files
 
 
@@ -35,6 +37,8 @@ def output_markdown(output: dict[str, Any]) -> str:
     if "text/html" in data:
         return f'<div class="output">{"".join(data["text/html"]).strip()}</div>'
     if "image/png" in data:
-        return f'<img alt="output" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+        return (
+            f'<img alt="output" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+        )
     text = "".join(output.get("text") or data.get("text/plain", ""))
     return f"```text\n{text.rstrip()}\n```" if text else ""

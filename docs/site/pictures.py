@@ -35,7 +35,9 @@ def main() -> None:
         annotated = cv2.imread(str(OUT / scene_name / "annotated.png"))
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
-        files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
+        files.write_image(
+            IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA)
+        )
     flight = simulate_motion(loader.load("simsat_slew"))
     rendered = picture(flight.lab.export_mjcf(), flight.telemetry().joints[700])
     files.write_image(IMAGES / "lab.jpg", rendered[:, :, ::-1])
@@ -46,7 +48,9 @@ def main() -> None:
         f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = annotate.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
+    sheet = annotate.contact_sheet(
+        [image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3
+    )
     files.write_image(IMAGES / "smear.png", sheet)
     screenshots()
 
@@ -85,7 +89,9 @@ def screenshots() -> None:
 def frame_placement(page):  # type: ignore[no-untyped-def]
     """Box of the frame's canvas on the page, and the frame's left and top edge and scale in it."""
     canvas = page.locator(".lab-frame canvas")
-    return canvas.bounding_box(), [float(value) for value in canvas.get_attribute("data-placement").split()]
+    return canvas.bounding_box(), [
+        float(value) for value in canvas.get_attribute("data-placement").split()
+    ]
 
 
 if __name__ == "__main__":

@@ -18,11 +18,19 @@ from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE, Store
 from skysim.experiments.study.loader import load
 from skysim.experiments.study.plan import Plan
-from skysim.experiments.study.report.study_report import POINTS, STUDY_FILE, analyze, commands, compose
+from skysim.experiments.study.report.study_report import (
+    POINTS,
+    STUDY_FILE,
+    analyze,
+    commands,
+    compose,
+)
 from skysim.results.report import Report, Section, Text
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
-BESIDE = {"dome_for_the_money": "dome_without_codes"}  # a search whose front is drawn in another one's figure
+BESIDE = {
+    "dome_for_the_money": "dome_without_codes"
+}  # a search whose front is drawn in another one's figure
 
 
 def main(folder: Path) -> None:
@@ -37,20 +45,30 @@ def main(folder: Path) -> None:
         with store.open_store(store_path) as trial_store:
             unfinished = trial_store.counts()["done"] < plan.study.trial_count(len(plan.points))
             if trial_store.meta("digest") != plan.digest or unfinished:
-                print(f"{store_path}: not finished, or of another version of the study; page not changed")
+                print(
+                    f"{store_path}: not finished, or of another version of the study; page not changed"
+                )
                 continue
             print(page(plan, trial_store, folder).save(PAGES / f"{plan.name}.md", f"{plan.name}_"))
 
 
 def page(plan: Plan, trial_store: Store, folder: Path) -> Report:
     """A study's report with a link to its file; without the many points of Sobol indices and searches."""
-    study, name = plan.study, plan.name
+    study = plan.study
+    name = plan.name
     also = {f"front of {BESIDE[name]}": front_of(BESIDE[name], folder)} if name in BESIDE else None
     command = commands(plan, trial_store, name)
     report = compose(study, trial_store, analyze(plan, trial_store, command), command, also)
-    left_out = {STUDY_FILE, *([POINTS] if study.optimize or study.design.kind == "saltelli" else [])}
-    question, *blocks = (one for one in report.blocks if not (isinstance(one, Section) and one.title in left_out))
-    varied = Text(f"What is varied: [`{plan.path.name}`](../../../scenes/studies/{plan.path.name}).")
+    left_out = {
+        STUDY_FILE,
+        *([POINTS] if study.optimize or study.design.kind == "saltelli" else []),
+    }
+    question, *blocks = (
+        one for one in report.blocks if not (isinstance(one, Section) and one.title in left_out)
+    )
+    varied = Text(
+        f"What is varied: [`{plan.path.name}`](../../../scenes/studies/{plan.path.name})."
+    )
     return replace(report, blocks=[question, varied, *blocks])
 
 

@@ -86,7 +86,9 @@ def meaning(name: str, found: dict[str, str]) -> str:
 
 
 def table(head: str, rows: Iterable[tuple[str, str]]) -> str:
-    return "\n".join([f"| {head} | meaning |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows)])
+    return "\n".join(
+        [f"| {head} | meaning |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows)]
+    )
 
 
 def page() -> str:
@@ -100,9 +102,14 @@ def page() -> str:
     columns = terms(Outcome.__doc__)
     of_meaning: dict[str, list[str]] = {}
     for name in metrics.QUANTITIES:
-        of_meaning.setdefault(QUANTITIES.get(name) or meaning(name, columns), []).append(f"`{name}`")
+        of_meaning.setdefault(QUANTITIES.get(name) or meaning(name, columns), []).append(
+            f"`{name}`"
+        )
     quantities = [(", ".join(same), escape(text)) for text, same in of_meaning.items()]
-    short = [(f"`{name}`", f"`{name}_{statistic}`") for name, statistic in metrics.DEFAULT_STATISTICS.items()]
+    short = [
+        (f"`{name}`", f"`{name}_{statistic}`")
+        for name, statistic in metrics.DEFAULT_STATISTICS.items()
+    ]
     intervals = INTERVALS | {
         name: f"two order statistics, whatever the distribution; from {metrics.values_for_quantile(share)} values on"
         for name, share in QUANTILES.items()

@@ -21,22 +21,30 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids, RateEstimate
 
-MIN_LIGHTS, ROUNDS = 3, 30
+MIN_LIGHTS = 3
+ROUNDS = 30
 MIN_MOMENT_PX2 = 8.0  # xx + yy of a disk of 4 px: those of smaller images are of pixels and noise
-MOMENT_ERROR = 0.01  # of moments, as a fraction of xx + yy: common to all lights, as no light is round
+MOMENT_ERROR = (
+    0.01  # of moments, as a fraction of xx + yy: common to all lights, as no light is round
+)
 
 
-def from_moments(camera: Camera, centroids: Centroids, exposure_s: float, sight: Sight = STARS) -> list[RateEstimate]:
+def from_moments(
+    camera: Camera, centroids: Centroids, exposure_s: float, sight: Sight = STARS
+) -> list[RateEstimate]:
     """The two rates that explain the moments of the lights; none without a rolling shutter, or if they are points."""
     if centroids.moments_px2 is None or len(centroids) < MIN_LIGHTS or not camera.row_time_s:
         return []
     if np.median(centroids.moments_px2[:, 2]) < MIN_MOMENT_PX2:
         return []
-    moments, rows = centroids.moments_px2, exposure_s / camera.row_time_s
+    moments = centroids.moments_px2
+    rows = exposure_s / camera.row_time_s
     roots = np.stack([_roots(moments, rows, side) for side in (1, -1)])
     twice_a = moments[:, 2] - np.hypot(moments[:, 0], moments[:, 1])
     sigma_px = MOMENT_ERROR * moments[:, 2] / np.abs(rows**2 / 6 * roots + 1j * twice_a)
-    motion_px = camera.focal_px * camera.row_time_s * tangent_motion(camera.rays(centroids.xy_px), sight)
+    motion_px = (
+        camera.focal_px * camera.row_time_s * tangent_motion(camera.rays(centroids.xy_px), sight)
+    )
     starts = [_roots(np.median(moments, axis=0)[None], rows, side)[0] for side in (1, -1)]
     rates = [_fit(roots, sigma_px, motion_px, start) for start in starts]
     return [rate for rate in rates if rate is not None]
@@ -44,8 +52,10 @@ def from_moments(camera: Camera, centroids: Centroids, exposure_s: float, sight:
 
 def _roots(moments_px2: Floats, rows: float, side: int) -> Any:
     """The (N,) complex roots z of N moments, on one side of the mean of both."""
-    shape, total = moments_px2[:, 0] + 1j * moments_px2[:, 1], moments_px2[:, 2]
-    a, higher = (total - np.abs(shape)) / 2, np.zeros(len(shape), complex)
+    shape = moments_px2[:, 0] + 1j * moments_px2[:, 1]
+    total = moments_px2[:, 2]
+    a = (total - np.abs(shape)) / 2
+    higher = np.zeros(len(shape), complex)
     quadratic = rows**2 / 12
     for _ in range(ROUNDS):
         z = (side * np.sqrt(quadratic * (shape - higher) - a**2) - 1j * a) / quadratic

@@ -106,7 +106,9 @@ def check_map(leds: object) -> None:
     for name in ("id", "board"):
         column = getattr(leds, name)
         if column is not None and np.shape(column) != (count,):
-            raise ImageError(f"leds: {name} has shape {np.shape(column)}; allowed: ({count},), one an LED")
+            raise ImageError(
+                f"leds: {name} has shape {np.shape(column)}; allowed: ({count},), one an LED"
+            )
     for name in ("center_m", "semi_axes_m"):
         checks.floats(f"leds: {name}", getattr(leds, name), (3,))
     checks.number("leds: sigma_m", leds.sigma_m, 0.0, 1e9, "finite, 0 or more")
@@ -115,7 +117,10 @@ def check_map(leds: object) -> None:
     if leds.common_m is not None:
         checks.floats("leds: common_m", leds.common_m, (None, count, 3))
     checks.number("leds: flux_sigma", leds.flux_sigma, 1e-3, 10.0, "0.001 to 10")
-    if leds.flux_s is not None and not (checks.floats("leds: flux_s", leds.flux_s, (count,)) > 0).all():
+    if (
+        leds.flux_s is not None
+        and not (checks.floats("leds: flux_s", leds.flux_s, (count,)) > 0).all()
+    ):
         raise ImageError("leds: flux_s is 0 or less, or not a number; allowed: above 0")
 
 

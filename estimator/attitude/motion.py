@@ -38,7 +38,11 @@ class Sight(NamedTuple):
 
     def take(self, which: NDArray[Any]) -> Sight:
         """The sight of some of the lights, by mask or index."""
-        return self._replace(radius_m=self.radius_m[which]) if isinstance(self.radius_m, np.ndarray) else self
+        return (
+            self._replace(radius_m=self.radius_m[which])
+            if isinstance(self.radius_m, np.ndarray)
+            else self
+        )
 
 
 STARS = Sight(np.zeros(3), 1.0)  # without a lever arm the distance has no effect
@@ -60,7 +64,12 @@ def tangent_motion(rays_cam: Floats, sight: Sight = STARS) -> Floats:
 
 def center_streak_px(camera: Camera, rate: RateEstimate, exposure_s: float) -> tuple[float, float]:
     """(dx, dy) of the streak of a star at the boresight over an exposure."""
-    dx, dy = camera.focal_px * exposure_s * tangent_motion(np.array([[0.0, 0.0, 1.0]]))[0] @ rate.rate_rad_s
+    dx, dy = (
+        camera.focal_px
+        * exposure_s
+        * tangent_motion(np.array([[0.0, 0.0, 1.0]]))[0]
+        @ rate.rate_rad_s
+    )
     return float(dx), float(dy)
 
 
@@ -69,7 +78,9 @@ def streak_factor(camera: Camera, velocity_tan_s: Floats) -> Floats:
     return np.asarray(1 / (1 - camera.focal_px * camera.row_time_s * velocity_tan_s[:, 1]))
 
 
-def at_middle_row(camera: Camera, centroids: Centroids, rate: RateEstimate, sight: Sight = STARS) -> Centroids:
+def at_middle_row(
+    camera: Camera, centroids: Centroids, rate: RateEstimate, sight: Sight = STARS
+) -> Centroids:
     """The centroids where they are at mid-exposure of the middle row, as in a global shutter.
 
     Each ray's place is turned by exp([w] t), t its row's delay. The position depends on the row in which it is found,
@@ -77,10 +88,13 @@ def at_middle_row(camera: Camera, centroids: Centroids, rate: RateEstimate, sigh
     """
     if not camera.row_time_s:
         return centroids
-    xy_px, delay_s = centroids.xy_px, camera.row_delays_s(centroids.xy_px)
+    xy_px = centroids.xy_px
+    delay_s = camera.row_delays_s(centroids.xy_px)
     rays = camera.rays(xy_px)
     place = places_cam(rays, sight)
-    moved_px = camera.pixels(Rotation.from_rotvec(delay_s[:, None] * rate.rate_rad_s).apply(place) - sight.lever_cam_m)
+    moved_px = camera.pixels(
+        Rotation.from_rotvec(delay_s[:, None] * rate.rate_rad_s).apply(place) - sight.lever_cam_m
+    )
     moved_px = np.where(np.isfinite(moved_px), moved_px, xy_px)
     motion = tangent_motion(rays, sight)
     gain = error_gain(camera, motion @ rate.rate_rad_s)

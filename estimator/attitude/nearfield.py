@@ -73,7 +73,9 @@ def rotation_only(
     rotates about the bearing center, but not the surface. Raises ValueError if it does not converge, or if the LEDs do
     not determine all three angles.
     """
-    body_from_lab, _, covariance_cam = _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, False)
+    body_from_lab, _, covariance_cam = _fit_rotation(
+        rays_cam, sigma_rad, position_m, lever, body_from_lab, False
+    )
     return body_from_lab, _in_body_axes(covariance_cam, lever)
 
 
@@ -89,13 +91,23 @@ def fit_focal_ratio(
 
 
 def _fit_rotation(
-    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation, with_focal: bool
+    rays_cam: Floats,
+    sigma_rad: Floats,
+    position_m: Floats,
+    lever: Lever,
+    body_from_lab: Rotation,
+    with_focal: bool,
 ) -> tuple[Rotation, float, Floats]:
     """body_from_lab, the focal ratio (1 unless it is fitted), and the covariance of both in camera axes."""
     R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()
     lever_cam_m = lever.cam_from_body.apply(lever.camera_body_m)
     ratio, step_rad, covariance_cam = _fitted_rotation(
-        rays_cam, sigma_rad, np.ascontiguousarray(position_m), lever_cam_m, R_cam_from_lab, with_focal
+        rays_cam,
+        sigma_rad,
+        np.ascontiguousarray(position_m),
+        lever_cam_m,
+        R_cam_from_lab,
+        with_focal,
     )
     if np.isnan(step_rad):
         raise ValueError(
@@ -109,7 +121,12 @@ def _fit_rotation(
 
 @jit
 def _fitted_rotation(
-    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever_cam_m: Floats, R: Floats, with_focal: bool
+    rays_cam: Floats,
+    sigma_rad: Floats,
+    position_m: Floats,
+    lever_cam_m: Floats,
+    R: Floats,
+    with_focal: bool,
 ) -> tuple[float, float, Floats]:
     """The focal ratio, the length of the last step, and the covariance of rotation and logarithm of the ratio.
 
@@ -118,9 +135,13 @@ def _fitted_rotation(
     about which any rotation fits.
     """
     unknowns = 4 if with_focal else 3
-    normal, rows = np.empty((unknowns + 1, unknowns + 1)), np.empty((unknowns + 1, 2 * len(rays_cam)))
-    weight, step, covariance = np.repeat(1 / sigma_rad**2, 2), np.empty(unknowns), np.eye(unknowns)
-    log_ratio, length = 0.0, np.nan
+    normal = np.empty((unknowns + 1, unknowns + 1))
+    rows = np.empty((unknowns + 1, 2 * len(rays_cam)))
+    weight = np.repeat(1 / sigma_rad**2, 2)
+    step = np.empty(unknowns)
+    covariance = np.eye(unknowns)
+    log_ratio = 0.0
+    length = np.nan
     for _ in range(30):
         _residual_rows(rays_cam, position_m, lever_cam_m, R, np.exp(log_ratio), rows)
         normal_equations(rows, weight, rows.shape[1], normal)
@@ -146,14 +167,22 @@ def _residual_rows(
     last = len(rows) - 1
     for n in range(len(rays_cam)):
         bx, by, bz = rotate(R, row(position_m, n))
-        qx, qy, qz = bx - lever_cam_m[0], by - lever_cam_m[1], bz - lever_cam_m[2]
-        x, y, scale = ratio * qx / qz, ratio * qy / qz, ratio / qz
+        qx = bx - lever_cam_m[0]
+        qy = by - lever_cam_m[1]
+        qz = bz - lever_cam_m[2]
+        x = ratio * qx / qz
+        y = ratio * qy / qz
+        scale = ratio / qz
         # The derivative of a tangent by w is b x d, with d its derivative by q.
-        rows[0, 2 * n], rows[0, 2 * n + 1] = -by * x / qz, -by * y / qz - bz * scale
-        rows[1, 2 * n], rows[1, 2 * n + 1] = bz * scale + bx * x / qz, bx * y / qz
-        rows[2, 2 * n], rows[2, 2 * n + 1] = -by * scale, bx * scale
+        rows[0, 2 * n] = -by * x / qz
+        rows[0, 2 * n + 1] = -by * y / qz - bz * scale
+        rows[1, 2 * n] = bz * scale + bx * x / qz
+        rows[1, 2 * n + 1] = bx * y / qz
+        rows[2, 2 * n] = -by * scale
+        rows[2, 2 * n + 1] = bx * scale
         if last == 4:
-            rows[3, 2 * n], rows[3, 2 * n + 1] = x, y
+            rows[3, 2 * n] = x
+            rows[3, 2 * n + 1] = y
         rows[last, 2 * n] = rays_cam[n, 0] / rays_cam[n, 2] - x
         rows[last, 2 * n + 1] = rays_cam[n, 1] / rays_cam[n, 2] - y
 
@@ -178,7 +207,9 @@ def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
     return R_body_from_cam @ covariance_cam @ R_body_from_cam.T
 
 
-def _wahba(point_body_m: Floats, distance_m: Floats, sigma_rad: Floats, position_m: Floats) -> Rotation:
+def _wahba(
+    point_body_m: Floats, distance_m: Floats, sigma_rad: Floats, position_m: Floats
+) -> Rotation:
     """Solve body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
 
     distance_m : (N,) distance of each point from the camera
@@ -248,7 +279,9 @@ def infinity(
     return _with_covariance(body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m)
 
 
-def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False) -> tuple[Floats, float]:
+def thesis_points(
+    rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False
+) -> tuple[Floats, float]:
     """Return AFIT's vectors to the LEDs (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
 
     R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
@@ -262,7 +295,9 @@ def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = Fal
     across_m = distance_m * (rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:])
     along2_m2 = distance_m**2 - np.sum(across_m**2, axis=1)
     if not (distance_m > 0 and np.all(along2_m2 > 0)):
-        raise ValueError(f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {distance_m:.3f} m")
+        raise ValueError(
+            f"eq. 44 has no root: a ray is 45 deg off the boresight, or R - M is {distance_m:.3f} m"
+        )
     return np.column_stack([across_m, np.sqrt(along2_m2)]), distance_m
 
 
@@ -294,7 +329,9 @@ def thesis(
     distances_m = np.full(len(rays_cam), distance_m)
     body_from_lab = _wahba(point, distances_m, sigma_rad, position_m)
     rays = rays_cam @ R_body_from_cam.T
-    return _with_covariance(body_from_lab, point, distances_m, sigma_rad, position_m, rays, by_ray_m)
+    return _with_covariance(
+        body_from_lab, point, distances_m, sigma_rad, position_m, rays, by_ray_m
+    )
 
 
 def tappe(
@@ -317,12 +354,15 @@ def tappe(
         # The distances change little with the attitude, so a few updates converge.
         distance_m = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
         point = lever.camera_body_m + distance_m[:, None] * rays
-        previous, body_from_lab = body_from_lab, _wahba(point, distance_m, sigma_rad, position_m)
+        previous = body_from_lab
+        body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
         if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
     by_ray_m = distance_m[:, None, None] * np.eye(3)
     by_rotation_m = np.cross(point, rays)
-    return _with_covariance(body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m)
+    return _with_covariance(
+        body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m
+    )
 
 
 def ray_on_surface(
@@ -346,16 +386,23 @@ def ray_on_surface(
             raise ValueError("a ray misses the believed surface")
         point = body_from_lab.apply(intersection_m)
         distance_m = np.linalg.norm(point - lever.camera_body_m, axis=1)
-        previous, body_from_lab = body_from_lab, _wahba(point, distance_m, sigma_rad, position_m)
+        previous = body_from_lab
+        body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
         if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
-    normal = previous.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)  # not normalized
+    normal = previous.apply(
+        (intersection_m - leds.center_m) / leds.semi_axes_m**2
+    )  # not normalized
     scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)
     # With n the scaled normal, p moves on the surface by distance (du - u n.du); rotating the surface by w moves p
     # along u by n.(w x p).
-    by_ray_m = distance_m[:, None, None] * (np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal))
+    by_ray_m = distance_m[:, None, None] * (
+        np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal)
+    )
     by_rotation_m = np.cross(point, scaled_normal)
-    return _with_covariance(body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m)
+    return _with_covariance(
+        body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m
+    )
 
 
 def pnp(
@@ -379,13 +426,17 @@ def pnp(
     Raises ValueError for LEDs in a line and if it does not converge.
     """
     if len(rays_cam) < 4:
-        raise ValueError(f"pnp: {len(rays_cam)} rays do not determine the camera's position; 4 are needed")
+        raise ValueError(
+            f"pnp: {len(rays_cam)} rays do not determine the camera's position; 4 are needed"
+        )
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
     # With the pattern's centroid as origin, rotation and translation are nearly uncorrelated.
     centroid_m = position_m.mean(axis=0)
     pattern_m = position_m - centroid_m
     start_shift_m = lever.cam_from_body.apply(body_from_lab.apply(centroid_m) - lever.camera_body_m)
-    cam_from_lab, shift_m = _opencv_pnp(pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m)
+    cam_from_lab, shift_m = _opencv_pnp(
+        pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m
+    )
     weight = np.repeat(1 / sigma_rad, 2)
     cam_from_lab, covariance_cam = _gauss_newton(pattern_m, measured, cam_from_lab, shift_m, weight)
     return lever.cam_from_body.inv() * cam_from_lab, _in_body_axes(covariance_cam, lever)
@@ -399,7 +450,9 @@ def _gauss_newton(
     for _ in range(100):
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
         if rank < 6:
-            raise ValueError("pnp: the LEDs do not determine the camera's position: they are collinear")
+            raise ValueError(
+                "pnp: the LEDs do not determine the camera's position: they are collinear"
+            )
         before = residual @ residual
         for _ in range(12):
             updated = Rotation.from_rotvec(step[:3]) * cam_from_lab, shift_m + step[3:]
@@ -425,7 +478,9 @@ def _six_dof_residual(
     return (measured - q[:, :2] / q[:, 2:]).ravel() * weight, jacobian * weight[:, None]
 
 
-def _opencv_pnp(pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats) -> tuple[Rotation, Floats]:
+def _opencv_pnp(
+    pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats
+) -> tuple[Rotation, Floats]:
     """Return cam_from_lab and the shift in camera axes, (3,), by OpenCV's iterative PnP from an initial guess."""
     start = cam_from_lab.as_rotvec()[:, None], np.array(shift_m)[:, None]
     try:

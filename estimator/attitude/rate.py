@@ -19,12 +19,17 @@ from estimator.core.least_squares import misfit_factor
 from estimator.core.types import Centroids, RateEstimate
 
 MIN_STREAKS = 3  # two vectors for each; three components of the rate, and a check
-MAX_RATE_RAD_S = 10.0  # standard deviation of the prior: a component that no streak tells stays within it
+MAX_RATE_RAD_S = (
+    10.0  # standard deviation of the prior: a component that no streak tells stays within it
+)
 OUTLIER_CHI2 = 16.0  # squared Mahalanobis distance of a streak that is not the light's own: of two lights, of noise
-ROUNDS, CONVERGED = 20, 1e-13
+ROUNDS = 20
+CONVERGED = 1e-13
 
 
-def from_streaks(camera: Camera, centroids: Centroids, exposure_s: float, sight: Sight = STARS) -> list[RateEstimate]:
+def from_streaks(
+    camera: Camera, centroids: Centroids, exposure_s: float, sight: Sight = STARS
+) -> list[RateEstimate]:
     """The two rates of opposite sign that explain the streaks of a frame; none with fewer than MIN_STREAKS streaks.
 
     With a rolling shutter the two differ a little in size: a streak is longer if it moves with the readout. Raises
@@ -38,10 +43,18 @@ def from_streaks(camera: Camera, centroids: Centroids, exposure_s: float, sight:
     if measured.sum() < MIN_STREAKS:
         return []
     chord, information = chords(camera, centroids.take(measured))
-    motion = exposure_s * tangent_motion(camera.rays(centroids.xy_px[measured]), sight.take(measured))
+    motion = exposure_s * tangent_motion(
+        camera.rays(centroids.xy_px[measured]), sight.take(measured)
+    )
     axis = _common(chord, information)
     rates = [
-        _fit(camera, aligned(chord, np.eye(2)[None], sign * axis[None]), information, motion, exposure_s)
+        _fit(
+            camera,
+            aligned(chord, np.eye(2)[None], sign * axis[None]),
+            information,
+            motion,
+            exposure_s,
+        )
         for sign in (1, -1)
     ]
     return [rate for rate in rates if rate is not None]
@@ -78,11 +91,16 @@ def _common(chord: Floats, information: Floats) -> Floats:
     return np.asarray(np.linalg.eigh(weighted + weighted.T)[1][:, -1])
 
 
-def _fit(camera: Camera, chord: Floats, information: Floats, motion: Floats, exposure_s: float) -> RateEstimate | None:
+def _fit(
+    camera: Camera, chord: Floats, information: Floats, motion: Floats, exposure_s: float
+) -> RateEstimate | None:
     """Weighted least squares of the rate from chords of known sign; later rounds drop outliers and choose the signs."""
-    keep, factor, rate = np.ones(len(chord), bool), np.ones(len(chord)), np.zeros(3)
+    keep = np.ones(len(chord), bool)
+    factor = np.ones(len(chord))
+    rate = np.zeros(3)
     for _ in range(ROUNDS):
-        before, by_rate = rate, motion * factor[:, None, None]
+        before = rate
+        by_rate = motion * factor[:, None, None]
         weighted = np.swapaxes(by_rate, 1, 2) @ information * keep[:, None, None]
         normal = np.sum(weighted @ by_rate, axis=0) + np.eye(3) / MAX_RATE_RAD_S**2
         rate = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, chord))
@@ -97,4 +115,6 @@ def _fit(camera: Camera, chord: Floats, information: Floats, motion: Floats, exp
         return None
     residual = (chord - predicted)[keep]
     chi2 = float(np.einsum("ni,nij,nj->", residual, information[keep], residual))
-    return RateEstimate(rate, misfit_factor(chi2, 2 * count - 3) * np.linalg.inv(normal), sign_known=False)
+    return RateEstimate(
+        rate, misfit_factor(chi2, 2 * count - 3) * np.linalg.inv(normal), sign_known=False
+    )

@@ -22,7 +22,8 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids, RateEstimate
 
-MAX_STEPS, CONVERGED_RAD = 25, 1e-12
+MAX_STEPS = 25
+CONVERGED_RAD = 1e-12
 FREE_STEPS = 15  # after which outliers stay what they are: at its limit a light may turn one with every second step
 
 
@@ -58,10 +59,12 @@ def fit(
     Raises ValueError if the lights do not determine the attitude, or if the fit does not converge.
     """
     cam_from_ref, rate = start
-    delay_s, prior_information = camera.row_delays_s(centroids.xy_px), np.linalg.inv(prior.covariance_rad2_s2)
+    delay_s = camera.row_delays_s(centroids.xy_px)
+    prior_information = np.linalg.inv(prior.covariance_rad2_s2)
     keep: list[NDArray[np.bool_]] = []
     for n in range(MAX_STEPS):
-        normal, gradient = np.zeros((6, 6)), np.zeros(6)
+        normal = np.zeros((6, 6))
+        gradient = np.zeros(6)
         turn = Rotation.from_rotvec(-delay_s[:, None] * rate)
         place = turn.apply(cam_from_ref.apply(place_ref))
         jacobian = tangent_jacobian(place, place - lever_cam_m).reshape(-1, 2, 3)
@@ -81,25 +84,40 @@ def fit(
         if not np.all(size > 0) or np.linalg.cond(normal / np.outer(size, size)) > 1e12:
             raise ValueError(f"{len(centroids)} lights do not determine attitude and rate")
         step = np.linalg.solve(normal / np.outer(size, size), gradient / size) / size
-        cam_from_ref, rate = Rotation.from_rotvec(step[:3]) * cam_from_ref, rate + step[3:]
+        cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
+        rate = rate + step[3:]
         if np.linalg.norm(step[:3]) < CONVERGED_RAD:
             break
     if not np.linalg.norm(step[:3]) < 1e-8:
-        raise ValueError(f"attitude and rate: not converged, last step {np.linalg.norm(step[:3]):.1e} rad")
+        raise ValueError(
+            f"attitude and rate: not converged, last step {np.linalg.norm(step[:3]):.1e} rad"
+        )
     return Fit(cam_from_ref, RateEstimate(rate, np.asarray(np.linalg.inv(normal)[3:, 3:], float)))
 
 
 def _place_rows(
-    camera: Camera, centroids: Centroids, ray: Floats, jacobian: Floats, turn: Rotation, rate: Floats
+    camera: Camera,
+    centroids: Centroids,
+    ray: Floats,
+    jacobian: Floats,
+    turn: Rotation,
+    rate: Floats,
 ) -> _Rows:
     """Residuals of the tangents from those of predicted rays (K, 3), each at the time of its row."""
-    delay_s, gain = camera.row_delays_s(centroids.xy_px), error_gain(camera, -jacobian @ rate)
+    delay_s = camera.row_delays_s(centroids.xy_px)
+    gain = error_gain(camera, -jacobian @ rate)
     error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
-    slopes = np.concatenate([jacobian @ turn.as_matrix(), -delay_s[:, None, None] * jacobian], axis=2)
-    return _Rows(camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], slopes, inverses(error_rad2))
+    slopes = np.concatenate(
+        [jacobian @ turn.as_matrix(), -delay_s[:, None, None] * jacobian], axis=2
+    )
+    return _Rows(
+        camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], slopes, inverses(error_rad2)
+    )
 
 
-def _streak_rows(camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float) -> _Rows:
+def _streak_rows(
+    camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float
+) -> _Rows:
     """Residuals of the streaks' chords, each with the sign nearer to the rate."""
     assert centroids.streak_px is not None
     seen = np.isfinite(centroids.streak_px[:, 0])
@@ -110,7 +128,9 @@ def _streak_rows(camera: Camera, centroids: Centroids, jacobian: Floats, rate: F
     return _Rows(residual, np.concatenate([0 * by_rate, by_rate], axis=2), information)
 
 
-def rate_covariance_rad2(camera: Camera, centroids: Centroids, jacobian: Floats, covariance_rad2_s2: Floats) -> Floats:
+def rate_covariance_rad2(
+    camera: Camera, centroids: Centroids, jacobian: Floats, covariance_rad2_s2: Floats
+) -> Floats:
     """(3, 3) covariance of an attitude by the error of the rate with which its K lights were put at the middle row.
 
     centroids : as they are found, with total errors;  jacobian : (K, 2, 3) of the tangents by a small rotation
@@ -119,5 +139,7 @@ def rate_covariance_rad2(camera: Camera, centroids: Centroids, jacobian: Floats,
     information = camera.focal_px**2 * np.linalg.inv(covariance_of(centroids))
     weighted = np.swapaxes(jacobian, 1, 2) @ information
     delay_s = camera.row_delays_s(centroids.xy_px)[:, None, None]
-    gain = np.linalg.solve(np.sum(weighted @ jacobian, axis=0), np.sum(weighted @ jacobian * delay_s, axis=0))
+    gain = np.linalg.solve(
+        np.sum(weighted @ jacobian, axis=0), np.sum(weighted @ jacobian * delay_s, axis=0)
+    )
     return np.asarray(gain @ covariance_rad2_s2 @ gain.T)

@@ -84,12 +84,19 @@ def _solve_profile(
     return rotation(R_cam_from_ref)
 
 
-def _checked_arrays(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
+def _checked_arrays(
+    vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Prepare the kernels' arguments: two (N, 3) arrays, (N,) weights in rad^-2. Raises ValueError for other shapes."""
-    cam, ref, sigma = (checks.native("directions", one, np.float64) for one in (vectors_cam, vectors_ref, sigma_rad))
+    cam, ref, sigma = (
+        checks.native("directions", one, np.float64)
+        for one in (vectors_cam, vectors_ref, sigma_rad)
+    )
     count = len(cam) if cam.ndim else 0
     if cam.shape != (count, 3) or ref.shape != (count, 3) or sigma.shape != (count,):
-        raise ValueError(f"shapes {cam.shape}, {ref.shape}, {sigma.shape}; allowed: (N, 3), (N, 3), (N,)")
+        raise ValueError(
+            f"shapes {cam.shape}, {ref.shape}, {sigma.shape}; allowed: (N, 3), (N, 3), (N,)"
+        )
     return cam, ref, kernel.weights(sigma)
 
 
@@ -112,5 +119,6 @@ def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") ->
     checks.known("solver", solver, SOLVERS)
     if solver == "triad" and len(cam) > 2:
         pair = list(kernel.best_pair(cam, weight))
-        cam, weight = cam[pair], weight[pair]
+        cam = cam[pair]
+        weight = weight[pair]
     return kernel.attitude_covariance(cam, weight)

@@ -107,13 +107,13 @@ def with_survey(
     The errors are propagated through the least-squares solution of the tangents, whose covariance is S = L L'. A solver
     with the covariance L_0 L_0' is taken to respond as that solution does after the rotation L_0 L^-1.
     """
-    solver, least_squares = (
-        np.linalg.cholesky(covariance_rad2),
-        np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad))),
-    )
+    solver = np.linalg.cholesky(covariance_rad2)
+    least_squares = np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad)))
     adapt = solver @ np.linalg.inv(least_squares)
     fitted = with_focal(view) if fits_focal else view
-    shared = (from_independent(fitted, sigma_rad, own_rad2) + from_common(fitted, sigma_rad, common_rad))[:3, :3]
+    shared = (
+        from_independent(fitted, sigma_rad, own_rad2) + from_common(fitted, sigma_rad, common_rad)
+    )[:3, :3]
     noise = from_independent(fitted, sigma_rad, noise_rad2)[:3, :3]
     return adapt @ (noise + shared) @ adapt.T, adapt @ shared @ adapt.T
 

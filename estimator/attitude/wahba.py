@@ -63,9 +63,13 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     Raises ValueError for directions that are not unit vectors or do not determine a rotation.
     """
     if len(cam) < 2:
-        raise ValueError("all vectors are parallel: fewer than two directions leave the roll unknown")
+        raise ValueError(
+            "all vectors are parallel: fewer than two directions leave the roll unknown"
+        )
     B = np.zeros((3, 3))
-    max_sine2, total, length_error = 0.0, 0.0, 0.0
+    max_sine2 = 0.0
+    total = 0.0
+    length_error = 0.0
     for n in range(len(cam)):
         total += weight[n]
         length_error = max(length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
@@ -86,7 +90,9 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     if length_error > LENGTH_TOLERANCE:
         raise ValueError("a direction is not of unit length; allowed: unit vectors")
     if max_sine2 < MIN_SINE2:
-        raise ValueError("all vectors are parallel: the roll about them is unknown; two directions are needed")
+        raise ValueError(
+            "all vectors are parallel: the roll about them is unknown; two directions are needed"
+        )
     return B
 
 
@@ -107,7 +113,9 @@ def largest_eigenvalue(B: Floats) -> float:
     is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical
     Sciences 41, 261), the same polynomial as QUEST's quartic.
     """
-    square, minors, det = 0.0, 0.0, 0.0
+    square = 0.0
+    minors = 0.0
+    det = 0.0
     for i in range(3):
         for j in range(3):
             square += B[i, j] ** 2
@@ -131,7 +139,10 @@ def largest_eigenvalue(B: Floats) -> float:
 @jit
 def _cofactor(matrix: Floats, i: int, j: int) -> float:
     # Cyclic indices give the cofactor with its sign.
-    a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+    a = (i + 1) % 3
+    b = (i + 2) % 3
+    c = (j + 1) % 3
+    d = (j + 2) % 3
     return matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]
 
 
@@ -180,11 +191,13 @@ def raw_quest(B: Floats) -> Floats:
     degrees all four components of the quaternion vanish, and their ratios are rounding noise.
     """
     x = largest_eigenvalue(B)
-    best, frame = (0.0, 0.0, 0.0, 0.0), 3
+    best = (0.0, 0.0, 0.0, 0.0)
+    frame = 3
     for axis in (3, 0, 1, 2):
         q = _quest_once(_rotated_profile(B, axis), x)
         if abs(q[3]) > abs(best[3]):
-            best, frame = q, axis
+            best = q
+            frame = axis
     return matrix_of(_undo_rotation(best, frame))
 
 
@@ -192,7 +205,8 @@ def raw_quest(B: Floats) -> Floats:
 def _quest_once(B: Floats, x: float) -> Quaternion:
     """Return QUEST's quaternion (x, y, z, w), not normalized, for the eigenvalue x (Shuster & Oh 1981)."""
     S, z, trace = _symmetric(B)
-    det, kappa = 0.0, 0.0
+    det = 0.0
+    kappa = 0.0
     for j in range(3):
         det += S[0, j] * _cofactor(S, 0, j)
         kappa += _cofactor(S, j, j)
@@ -222,11 +236,14 @@ def raw_esoq2(B: Floats) -> Floats:
     the reference frame is therefore first rotated by the 180-degree rotation that gives the smallest trace.
     """
     # A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
-    x, frame, least = largest_eigenvalue(B), 3, B[0, 0] + B[1, 1] + B[2, 2]
+    x = largest_eigenvalue(B)
+    frame = 3
+    least = B[0, 0] + B[1, 1] + B[2, 2]
     for axis in range(3):
         trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
         if trace < least:
-            frame, least = axis, trace
+            frame = axis
+            least = trace
     S, z, trace = _symmetric(_rotated_profile(B, frame))
     M = np.empty((3, 3))
     for i in range(3):
@@ -234,12 +251,17 @@ def raw_esoq2(B: Floats) -> Floats:
             M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
         M[i, i] += (x - trace) * (x + trace)
     # Row i of the cofactors of M is the cross product of the two other rows.
-    e, length2 = np.zeros(3), -1.0
+    e = np.zeros(3)
+    length2 = -1.0
     for i in range(3):
-        u, v, w = _cofactor(M, i, 0), _cofactor(M, i, 1), _cofactor(M, i, 2)
+        u = _cofactor(M, i, 0)
+        v = _cofactor(M, i, 1)
+        w = _cofactor(M, i, 2)
         if u * u + v * v + w * w > length2:
             length2 = u * u + v * v + w * w
-            e[0], e[1], e[2] = u, v, w
+            e[0] = u
+            e[1] = v
+            e[2] = w
     scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
     q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
     return matrix_of(_undo_rotation(q, frame))
@@ -279,15 +301,20 @@ def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
     The smallest eigenvalue of a pair's information matrix is (p + q - sqrt((p + q)^2 - 4 p q sin^2)) / 2, with weights
     p and q and the sine of their separation; the best pair has the largest.
     """
-    first, second, best = 0, 1, -1.0
+    first = 0
+    second = 1
+    best = -1.0
     for m in range(len(cam)):
         for n in range(m + 1, len(cam)):
-            p, q = weight[m], weight[n]
+            p = weight[m]
+            q = weight[n]
             product = p * q * _sine2(cam, m, n)
             # The same eigenvalue in a form without cancellation.
             least = 2 * product / (p + q + sqrt(max((p + q) ** 2 - 4 * product, 0.0)))
             if least > best:
-                first, second, best = m, n, least
+                first = m
+                second = n
+                best = least
     return first, second
 
 
@@ -302,11 +329,14 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     which is the optimum of Wahba's problem for two stars, and Black's (1964) TRIAD if one weight is zero.
     """
     m, n = best_pair(cam, weight)
-    b, r = cam[np.array([m, n])], ref[np.array([m, n])]
-    b3, r3 = _normal(b[0], b[1]), _normal(r[0], r[1])
+    b = cam[np.array([m, n])]
+    r = ref[np.array([m, n])]
+    b3 = _normal(b[0], b[1])
+    r3 = _normal(r[0], r[1])
     along = np.zeros((3, 3))
     for k in range(2):
-        c, s = np.cross(b[k], b3), np.cross(r[k], r3)
+        c = np.cross(b[k], b3)
+        s = np.cross(r[k], r3)
         weight_k = weight[m] if k == 0 else weight[n]
         for i in range(3):
             for j in range(3):
@@ -335,7 +365,10 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
     the precision. Wahba's problem has no other local minimum, so the iteration cannot converge to a wrong one.
     """
     R = R_cam_from_ref
-    a, gradient, normal, step = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    a = np.empty(3)
+    gradient = np.empty(3)
+    normal = np.empty((3, 3))
+    step = np.empty(3)
     for _ in range(MAX_STEPS):
         gradient.fill(0.0)
         normal.fill(0.0)
@@ -370,7 +403,8 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
 @jit
 def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
     """Return the (3, 3) covariance: the inverse of sum(w (I - b b^T)). Raises ValueError if that is singular."""
-    factor, out = np.zeros((3, 3)), np.eye(3)
+    factor = np.zeros((3, 3))
+    out = np.eye(3)
     for n in range(len(cam)):
         _add_information(factor, cam[n], weight[n])
     _factorize(factor)
@@ -395,7 +429,13 @@ def matrix_of(q: Quaternion) -> Floats:
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
     R = np.empty((3, 3))
-    R[0, 0], R[0, 1], R[0, 2] = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
-    R[1, 0], R[1, 1], R[1, 2] = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
-    R[2, 0], R[2, 1], R[2, 2] = s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)
+    R[0, 0] = 1 - s * (y * y + z * z)
+    R[0, 1] = s * (x * y - z * w)
+    R[0, 2] = s * (x * z + y * w)
+    R[1, 0] = s * (x * y + z * w)
+    R[1, 1] = 1 - s * (x * x + z * z)
+    R[1, 2] = s * (y * z - x * w)
+    R[2, 0] = s * (x * z - y * w)
+    R[2, 1] = s * (y * z + x * w)
+    R[2, 2] = 1 - s * (x * x + y * y)
     return R

@@ -32,7 +32,9 @@ from estimator.core.arrays import Floats, Ints
 DECREMENT = 1e-12
 STEPS = 100
 EXACT = 1e-6  # least standard deviation of an assumed lever in m, and of an assumed focal length as a share of it
-MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
+MEDIAN_RADIUS = np.sqrt(
+    2 * np.log(2)
+)  # median distance of a two-dimensional unit Gaussian from its mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,9 @@ class Sightings:
 
     def take(self, which: np.ndarray) -> Sightings:
         """The selected sightings, by mask or index."""
-        return Sightings(self.frame[which], self.led[which], self.xy_px[which], self.sigma_px[which])
+        return Sightings(
+            self.frame[which], self.led[which], self.xy_px[which], self.sigma_px[which]
+        )
 
 
 class Assumed(NamedTuple):
@@ -62,12 +66,15 @@ class Assumed(NamedTuple):
 
     def less(self, bundle: Bundle) -> Floats:
         """(4,) lever and focal length less those of a bundle."""
-        return np.array([*(self.camera_body_m - bundle.camera_body_m), self.focal_px - bundle.lens[0]])
+        return np.array(
+            [*(self.camera_body_m - bundle.camera_body_m), self.focal_px - bundle.lens[0]]
+        )
 
     @property
     def weight(self) -> Floats:
         """(4,) 1 / sigma^2 of each. A sigma of 0 is taken as EXACT, so that the weights are finite."""
-        lever_m, focal_px = max(self.lever_sigma_m, EXACT), max(self.focal_sigma_px, EXACT * self.focal_px)
+        lever_m = max(self.lever_sigma_m, EXACT)
+        focal_px = max(self.focal_sigma_px, EXACT * self.focal_px)
         return np.array([lever_m, lever_m, lever_m, focal_px]) ** -2.0
 
 
@@ -112,7 +119,10 @@ class Bundle:
         rotation_size = 3 * len(self.R_body_from_lab)
         lens = self.lens.copy()
         lens[: self.free_lens] += rest[rotation_size + 3 :]
-        rotated = Rotation.from_rotvec(rest[:rotation_size].reshape(-1, 3)).as_matrix() @ self.R_body_from_lab
+        rotated = (
+            Rotation.from_rotvec(rest[:rotation_size].reshape(-1, 3)).as_matrix()
+            @ self.R_body_from_lab
+        )
         return replace(
             self,
             position_m=self.position_m + led.reshape(-1, 3),
@@ -141,20 +151,25 @@ def residuals(bundle: Bundle, sightings: Sightings) -> Floats:
     in_front = q[:, 2] > 0
     tangent = q[:, :2] / np.where(in_front, q[:, 2], 1.0)[:, None]
     pixel = bundle.lens[1:3] + bundle.lens[0] * _distort(tangent, bundle.lens[3:])
-    return np.where(in_front[:, None], (sightings.xy_px - pixel) / sightings.sigma_px[:, None], np.inf)
+    return np.where(
+        in_front[:, None], (sightings.xy_px - pixel) / sightings.sigma_px[:, None], np.inf
+    )
 
 
 def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     """Residuals and analytic derivatives; every light must be in front of the camera."""
     b, q = _in_camera(bundle, sightings)
     tangent = q[:, :2] / q[:, 2:]
-    focal, coefficients = bundle.lens[0], bundle.lens[3:]
+    focal = bundle.lens[0]
+    coefficients = bundle.lens[3:]
     distorted_tangent = _distort(tangent, coefficients)
     pinhole = np.zeros((len(q), 2, 3))
     pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1 / q[:, 2]
     pinhole[:, :, 2] = -tangent / q[:, 2:]
     weight = 1 / sightings.sigma_px[:, None, None]
-    by_body = focal * weight * (_by_tangent(tangent, coefficients) @ pinhole @ bundle.R_cam_from_body)
+    by_body = (
+        focal * weight * (_by_tangent(tangent, coefficients) @ pinhole @ bundle.R_cam_from_body)
+    )
     by_lens = np.concatenate(
         [
             distorted_tangent[:, :, None],
@@ -163,7 +178,9 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
         ],
         axis=2,
     )
-    residual = (sightings.xy_px - bundle.lens[1:3] - focal * distorted_tangent) / sightings.sigma_px[:, None]
+    residual = (
+        sightings.xy_px - bundle.lens[1:3] - focal * distorted_tangent
+    ) / sightings.sigma_px[:, None]
     return Linearization(
         residual,
         by_body @ bundle.R_body_from_lab[sightings.frame],
@@ -174,7 +191,9 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
 
 def _in_camera(bundle: Bundle, sightings: Sightings) -> tuple[Floats, Floats]:
     """(M, 3) lights from the bearing center in body axes, and (M, 3) from the camera's pupil in camera axes."""
-    b = np.einsum("mij,mj->mi", bundle.R_body_from_lab[sightings.frame], bundle.position_m[sightings.led])
+    b = np.einsum(
+        "mij,mj->mi", bundle.R_body_from_lab[sightings.frame], bundle.position_m[sightings.led]
+    )
     return b, (b - bundle.camera_body_m) @ bundle.R_cam_from_body.T
 
 
@@ -184,7 +203,9 @@ def _distort(tangent: Floats, coefficients: Floats) -> Floats:
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     tangential = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return np.column_stack([x * radial + tangential, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+    return np.column_stack(
+        [x * radial + tangential, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+    )
 
 
 def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
@@ -193,7 +214,9 @@ def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
     x, y = tangent.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # derivative of the radial factor by x, divided by x
+    slope = 2 * (
+        k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    )  # derivative of the radial factor by x, divided by x
     by = np.empty((len(x), 2, 2))
     by[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     by[:, 0, 1] = by[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
@@ -234,23 +257,30 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     """The normal equations J'WJ and J'W residual, with one weight per sighting and the priors added."""
     terms = linearize(bundle, sightings)
     root = np.sqrt(weight)[:, None, None]
-    count, frames, lights = len(weight), len(bundle.R_body_from_lab), len(bundle.position_m)
+    count = len(weight)
+    frames = len(bundle.R_body_from_lab)
+    lights = len(bundle.position_m)
     by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
     by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
     residual = (terms.residual * root[:, 0]).ravel()
     # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
     blocks = np.zeros((lights, 3, 3))
-    np.add.at(blocks, sightings.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2)
+    np.add.at(
+        blocks, sightings.led, np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
+    )
     by_rest = _append_dense(by_rotation, shared)
     blocks += np.eye(3) / bundle.map_sigma_m**2
     from_map = (bundle.map_m - bundle.position_m).ravel() / bundle.map_sigma_m**2
-    rest, rhs_rest = (by_rest.T @ by_rest).toarray(), by_rest.T @ residual
+    rest = (by_rest.T @ by_rest).toarray()
+    rhs_rest = by_rest.T @ residual
     if bundle.assumed:
         known = 3 * frames + np.arange(4)  # lever and focal length
         rest[known, known] += bundle.assumed.weight
         rhs_rest[known] += bundle.assumed.weight * bundle.assumed.less(bundle)
-    return NormalEquations(blocks, csr_array(by_rest.T @ by_led), rest, by_led.T @ residual + from_map, rhs_rest)
+    return NormalEquations(
+        blocks, csr_array(by_rest.T @ by_led), rest, by_led.T @ residual + from_map, rhs_rest
+    )
 
 
 def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:
@@ -265,9 +295,13 @@ def _append_dense(left: csr_array, right: Floats) -> csr_array:
     columns = np.tile(np.arange(width), len(right)) + left.shape[1]
     per_row = np.diff(left.indptr)[0]
     data = np.hstack([left.data.reshape(len(right), per_row), right])
-    index = np.hstack([left.indices.reshape(len(right), per_row), columns.reshape(len(right), width)])
+    index = np.hstack(
+        [left.indices.reshape(len(right), per_row), columns.reshape(len(right), width)]
+    )
     start = np.arange(len(right) + 1) * (per_row + width)
-    return csr_array((data.ravel(), index.ravel(), start), shape=(len(right), left.shape[1] + width))
+    return csr_array(
+        (data.ravel(), index.ravel(), start), shape=(len(right), left.shape[1] + width)
+    )
 
 
 def gauge_freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
@@ -276,7 +310,8 @@ def gauge_freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
     Returns their (3 N, 4) parts in the positions and (R, 4) in the other unknowns. A rotation by e of the lab changes x
     by e x x, and A to A exp(-e) = exp(-A e) A. A change of scale multiplies x and r alike. A prior map fixes all four.
     """
-    lights, frames = len(bundle.position_m), len(bundle.R_body_from_lab)
+    lights = len(bundle.position_m)
+    frames = len(bundle.R_body_from_lab)
     led = np.zeros((lights, 3, 4))
     for axis, e in enumerate(np.eye(3)):
         led[:, :, axis] = np.cross(e, bundle.position_m)
@@ -346,7 +381,9 @@ def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
     return max(1.0, float(np.median(length) / MEDIAN_RADIUS))
 
 
-def adjust(bundle: Bundle, sightings: Sightings, width: float, decrement: float = DECREMENT) -> tuple[Bundle, bool]:
+def adjust(
+    bundle: Bundle, sightings: Sightings, width: float, decrement: float = DECREMENT
+) -> tuple[Bundle, bool]:
     """Minimize the loss over all unknowns by Levenberg-Marquardt; returns the bundle and whether it converged.
 
     width     : of Cauchy's loss in sigmas; inf for least squares
@@ -364,12 +401,16 @@ def adjust(bundle: Bundle, sightings: Sightings, width: float, decrement: float 
                 raise
             damping *= 10
             continue
-        slope = terms.rhs_led @ led + terms.rhs_rest @ rest  # g' times the step: the Newton decrement
+        slope = (
+            terms.rhs_led @ led + terms.rhs_rest @ rest
+        )  # g' times the step: the Newton decrement
         trial = bundle.apply_step(led, rest)
         new_cost, new_weight = trial.cost(sightings, width)
         # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
-            bundle, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
+            bundle = trial
+            cost = new_cost
+            damping = max(damping / 10, 1e-12)
             if slope < decrement:
                 return bundle, True
             terms = normal_equations(bundle, sightings, new_weight)
@@ -395,8 +436,12 @@ def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
         matrix = np.zeros((rotation_size // 3, 3, 3))
         rhs = np.zeros((rotation_size // 3, 3))
         by = terms.by_rotation
-        np.add.at(matrix, sightings.frame, weight[:, None, None] * np.einsum("mai,maj->mij", by, by))
-        np.add.at(rhs, sightings.frame, weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual))
+        np.add.at(
+            matrix, sightings.frame, weight[:, None, None] * np.einsum("mai,maj->mij", by, by)
+        )
+        np.add.at(
+            rhs, sightings.frame, weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual)
+        )
         rest[:rotation_size] = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
         bundle = bundle.apply_step(no_step, rest)
     return bundle
@@ -419,7 +464,9 @@ def covariance(terms: NormalEquations, bundle: Bundle) -> Covariances:
     return _blocks(*_inverse(terms, bundle), bundle)
 
 
-def covariance_in_gauge(terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats) -> Covariances:
+def covariance_in_gauge(
+    terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
+) -> Covariances:
     """The covariance in a given gauge, without the error of the gauge itself.
 
     fixed_led, fixed_rest : (3 N, 4), (R, 4) the matrix H of the four linear gauge constraints H'd = 0
@@ -435,14 +482,18 @@ def covariance_in_gauge(terms: NormalEquations, bundle: Bundle, fixed_led: Float
     rest_fixed = rest @ through
     led_fixed = reduced.inverse_led @ fixed_led - reduced.elimination @ rest_fixed
     transform = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H'Z)^-T
-    k_led, k_rest = led_fixed @ transform, rest_fixed @ transform
+    k_led = led_fixed @ transform
+    k_rest = rest_fixed @ transform
     outer = transform.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ transform
     rotation_size = 3 * len(bundle.R_body_from_lab)
-    rotated, shared = slice(rotation_size), slice(rotation_size, None)
+    rotated = slice(rotation_size)
+    shared = slice(rotation_size, None)
     return Covariances(
         blocks.by_led + _gauge_terms(k_led.reshape(-1, 3, 4), led_free.reshape(-1, 3, 4), outer),
         blocks.by_rotation
-        + _gauge_terms(k_rest[rotated].reshape(-1, 3, 4), rest_free[rotated].reshape(-1, 3, 4), outer),
+        + _gauge_terms(
+            k_rest[rotated].reshape(-1, 3, 4), rest_free[rotated].reshape(-1, 3, 4), outer
+        ),
         blocks.shared + _gauge_terms(k_rest[None, shared], rest_free[None, shared], outer)[0],
     )
 
@@ -450,19 +501,29 @@ def covariance_in_gauge(terms: NormalEquations, bundle: Bundle, fixed_led: Float
 def _inverse(terms: NormalEquations, bundle: Bundle) -> tuple[ReducedSystem, Floats]:
     """The reduced system, and the (R, R) inverse of the Schur complement: covariance of all but the lights."""
     reduced = eliminate_lights(terms, _free_gauge(bundle), 0.0)
-    rest = cho_solve(reduced.factor, np.eye(len(reduced.scale))) * reduced.scale * reduced.scale[:, None]
+    rest = (
+        cho_solve(reduced.factor, np.eye(len(reduced.scale)))
+        * reduced.scale
+        * reduced.scale[:, None]
+    )
     return reduced, rest
 
 
 def _blocks(reduced: ReducedSystem, rest: Floats, bundle: Bundle) -> Covariances:
     """Covariance of the lights by block inversion, A^-1 + S Q S', S = A^-1 C' the elimination matrix; of the rest Q."""
-    lights, size, frames = len(bundle.position_m), len(rest), len(bundle.R_body_from_lab)
+    lights = len(bundle.position_m)
+    size = len(rest)
+    frames = len(bundle.R_body_from_lab)
     elimination = reduced.elimination.toarray()
     by_led = np.einsum(
-        "nik,njk->nij", (elimination @ rest).reshape(lights, 3, size), elimination.reshape(lights, 3, size)
+        "nik,njk->nij",
+        (elimination @ rest).reshape(lights, 3, size),
+        elimination.reshape(lights, 3, size),
     )
     by_rotation = np.array([rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)])
-    return Covariances(by_led + reduced.inverse_led.data, by_rotation, rest[3 * frames :, 3 * frames :])
+    return Covariances(
+        by_led + reduced.inverse_led.data, by_rotation, rest[3 * frames :, 3 * frames :]
+    )
 
 
 def _gauge_terms(with_gauge: Floats, free: Floats, outer: Floats) -> Floats:

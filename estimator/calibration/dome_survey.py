@@ -48,10 +48,18 @@ CAUCHY = 2.385
 LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
-MIN_REDUNDANCY = 8  # coordinates more than unknowns, for a survey that estimates its noise from them
-CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
-CONNECTING_RAD = 2 * CROSSING_RAD  # of lights that connect frames before they are adjusted: the angle is not yet exact
-NOISE_ROUNDS, NOISE_TOLERANCE = 8, 0.01  # of the noise estimated from the residuals; the tolerance is relative
+MIN_REDUNDANCY = (
+    8  # coordinates more than unknowns, for a survey that estimates its noise from them
+)
+CROSSING_RAD = (
+    0.005  # least rms angle between the rays to one light; below, its distance is undetermined
+)
+CONNECTING_RAD = (
+    2 * CROSSING_RAD
+)  # of lights that connect frames before they are adjusted: the angle is not yet exact
+# of the noise estimated from the residuals; the tolerance is relative
+NOISE_ROUNDS = 8
+NOISE_TOLERANCE = 0.01
 
 
 class Unconnected(ValueError):
@@ -162,9 +170,13 @@ def survey(
     if loss not in LOSSES:
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
-        raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only")
+        raise ValueError(
+            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
+        )
     if assumed and (np.isinf(leds_sigma_m) or known_length or reference_frame is not None):
-        raise ValueError("survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone")
+        raise ValueError(
+            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone"
+        )
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
@@ -197,7 +209,8 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
 
     Raises ValueError if the lever or the lens is undetermined.
     """
-    covariances, scale = None, 1.0
+    covariances = None
+    scale = 1.0
     try:
         start, keep = _reject_misidentified(start, sightings, width)
         subset = connected_subset(start, sightings, keep)
@@ -206,7 +219,9 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
             scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
             # If priors fix the gauge, the fit's own is the one of least squares.
-            in_gauge = fitted if _has_prior_gauge(fitted, gauge) else gauge.transform(fitted, subset)
+            in_gauge = (
+                fitted if _has_prior_gauge(fitted, gauge) else gauge.transform(fitted, subset)
+            )
             subset = replace(subset, bundle=in_gauge, sightings=scaled)
             covariances = _covariances(subset, gauge)
             if fit_noise:
@@ -218,7 +233,9 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
     except LinAlgError:
         pass  # a singular matrix raises the same ValueError below as a nearly singular one
     if covariances is None or not _determined(subset.bundle, covariances.shared):
-        raise ValueError("survey: the frames do not determine the lever or the lens; take more tilts and yaws")
+        raise ValueError(
+            "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
+        )
     return _Fit(subset, keep, converged, covariances, misfit, scale)
 
 
@@ -280,11 +297,18 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
         count = len(frame.led)
         if frame.xy_px.shape != (count, 2) or frame.sigma_px.shape != (count,):
             shapes = f"{frame.xy_px.shape} and {frame.sigma_px.shape}"
-            raise ValueError(f"survey: frame {k} has {count} LEDs, but xy_px and sigma_px are {shapes}")
+            raise ValueError(
+                f"survey: frame {k} has {count} LEDs, but xy_px and sigma_px are {shapes}"
+            )
         if count and not (frame.led.min() >= 0 and frame.led.max() < lights):
             raise ValueError(f"survey: frame {k} has LED rows outside of 0 to {lights - 1}")
-        if not (np.isfinite(frame.xy_px).all() and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))):
-            raise ValueError(f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0")
+        if not (
+            np.isfinite(frame.xy_px).all()
+            and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))
+        ):
+            raise ValueError(
+                f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0"
+            )
     return Sightings(
         np.repeat(np.arange(len(frames)), [len(frame.led) for frame in frames]),
         np.concatenate([frame.led for frame in frames]).astype(np.int64),
@@ -293,7 +317,9 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
     )
 
 
-def _start_bundle(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int) -> Bundle:
+def _start_bundle(
+    frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int
+) -> Bundle:
     lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
     rotated = Rotation.concatenate([frame.body_from_lab for frame in frames]).as_matrix()
     R_cam_from_body = lever.cam_from_body.as_matrix()
@@ -308,7 +334,9 @@ def _start_bundle(frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camer
     )
 
 
-def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> tuple[Bundle, np.ndarray]:
+def _reject_misidentified(
+    full: Bundle, sightings: Sightings, width: float
+) -> tuple[Bundle, np.ndarray]:
     """Improve the start values and reject wrong identifications.
 
     First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
@@ -327,10 +355,12 @@ def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> t
         return full, keep
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
     subset = connected_subset(full, sightings, keep)
-    fitted, previous = subset.bundle, np.inf
+    fitted = subset.bundle
+    previous = np.inf
     while (scale := ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
         noisy = replace(subset.sightings, sigma_px=scale * subset.sightings.sigma_px)
-        fitted, previous = ba.adjust(fitted, noisy, width, decrement=0.1)[0], scale
+        fitted = ba.adjust(fitted, noisy, width, decrement=0.1)[0]
+        previous = scale
     keep[subset.index] = _inliers(fitted, subset.sightings, GATE)
     return subset.insert_into(full, fitted), keep
 
@@ -349,11 +379,13 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
     """
     in_front = np.isfinite(ba.residuals(full, sightings)).all(axis=1)
     index = np.flatnonzero(keep & in_front)
-    lights, frames = len(full.position_m), len(full.R_body_from_lab)
+    lights = len(full.position_m)
+    frames = len(full.R_body_from_lab)
     camera_m = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)
     # Removing a light can leave its frames with too few lights, and the reverse: repeat until nothing changes.
     while True:
-        led, frame = sightings.led[index], sightings.frame[index]
+        led = sightings.led[index]
+        frame = sightings.frame[index]
         incidence = csr_array((np.ones(len(index)), (frame, led)), shape=(frames, lights)) > 0
         angle_rad = ray_angles(full.position_m, camera_m, frame, led)
         good_led = (incidence.sum(axis=0) >= 2) & (angle_rad > CROSSING_RAD)
@@ -362,13 +394,18 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
         if valid.all():
             break
         index = index[valid]
-    led_rows, frame_rows = np.unique(led), np.unique(frame)
+    led_rows = np.unique(led)
+    frame_rows = np.unique(frame)
     unknowns = 3 * len(led_rows) + 3 * len(frame_rows) + 3 + full.free_lens - 4
     if 2 * len(index) < unknowns or not len(index):
-        raise ValueError(f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames")
+        raise ValueError(
+            f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames"
+        )
     _check_one_group(incidence, frame_rows)
     sightings = sightings.take(index)
-    numbered = replace(sightings, frame=np.searchsorted(frame_rows, frame), led=np.searchsorted(led_rows, led))
+    numbered = replace(
+        sightings, frame=np.searchsorted(frame_rows, frame), led=np.searchsorted(led_rows, led)
+    )
     bundle = replace(
         full,
         position_m=full.position_m[led_rows],
@@ -388,7 +425,8 @@ def ray_angles(position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: I
     ray = position_m[led] - camera_m[frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     lights = len(position_m)
-    scatter, count = np.zeros((lights, 3, 3)), np.bincount(led, minlength=lights)
+    scatter = np.zeros((lights, 3, 3))
+    count = np.bincount(led, minlength=lights)
     np.add.at(scatter, led, ray[:, :, None] * ray[:, None, :])
     largest = np.linalg.eigvalsh(scatter / np.maximum(count, 1)[:, None, None])[:, 2]
     return np.sqrt(np.where(count > 0, np.maximum(1 - largest, 0.0), 0.0))
@@ -410,7 +448,8 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
             break
         member = grown
     if not member.all():
-        first, second = frame_rows[member][0], frame_rows[~member][0]
+        first = frame_rows[member][0]
+        second = frame_rows[~member][0]
         raise Unconnected(
             f"survey: the frames are not connected; {np.sum(~member)} of {len(member)}, frame {second} first, share "
             f"fewer than two LEDs with the group of frame {first}: take frames between them",
@@ -422,15 +461,25 @@ def _determined(fitted: Bundle, shared: Floats) -> bool:
     """Whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
     sigma = np.sqrt(np.maximum(np.diag(shared), 0))
     nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
-    return bool(np.isfinite(sigma).all() and sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0])
+    return bool(
+        np.isfinite(sigma).all()
+        and sigma[:3].max() < 0.1 * nearest_m
+        and sigma[3] < 0.1 * fitted.lens[0]
+    )
 
 
-def _report(status: str, fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera) -> DomeSurvey:
-    subset, sightings = fit.subset, fit.subset.sightings
-    lights, frames = len(full.position_m), len(full.R_body_from_lab)
-    surveyed, tied = np.zeros(lights, dtype=bool), np.zeros(frames, dtype=bool)
+def _report(
+    status: str, fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera
+) -> DomeSurvey:
+    subset = fit.subset
+    sightings = fit.subset.sightings
+    lights = len(full.position_m)
+    frames = len(full.R_body_from_lab)
+    surveyed = np.zeros(lights, dtype=bool)
+    tied = np.zeros(frames, dtype=bool)
     surveyed[subset.led] = tied[subset.frame] = True
-    by_led, by_rotation = np.full((lights, 3, 3), np.nan), np.full((frames, 3, 3), np.nan)
+    by_led = np.full((lights, 3, 3), np.nan)
+    by_rotation = np.full((frames, 3, 3), np.nan)
     by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
     residual = ba.residuals(subset.bundle, sightings)
     lens = [float(value) for value in full.lens]

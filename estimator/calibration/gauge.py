@@ -32,8 +32,10 @@ class Subset:
 
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
         """The full bundle with the adjusted values of this subset inserted."""
-        position, rotated = full.position_m.copy(), full.R_body_from_lab.copy()
-        position[self.led], rotated[self.frame] = fitted.position_m, fitted.R_body_from_lab
+        position = full.position_m.copy()
+        rotated = full.R_body_from_lab.copy()
+        position[self.led] = fitted.position_m
+        rotated[self.frame] = fitted.R_body_from_lab
         return replace(fitted, position_m=position, R_body_from_lab=rotated, map_m=full.map_m)
 
 
@@ -54,7 +56,8 @@ class Gauge:
     R_body_from_lab: Floats
 
     def __post_init__(self) -> None:
-        count, frames = len(self.map_m), len(self.R_body_from_lab)
+        count = len(self.map_m)
+        frames = len(self.R_body_from_lab)
         if self.length is not None:
             i, j, meters = self.length
             if not (0 <= i < count and 0 <= j < count and i != j and 0 < meters < np.inf):
@@ -78,11 +81,15 @@ class Gauge:
 
     def transform(self, fitted: Bundle, subset: Subset) -> Bundle:
         """The bundle rotated and scaled to satisfy the gauge; its pixels do not change."""
-        position_m, start = fitted.position_m, self.map_m[subset.led]
+        position_m = fitted.position_m
+        start = self.map_m[subset.led]
         if self.frame is None:
             rotation = Rotation.align_vectors(start, position_m)[0].as_matrix()
         else:
-            rotation = self.R_body_from_lab[self.frame].T @ fitted.R_body_from_lab[self._reference_row(subset)]
+            rotation = (
+                self.R_body_from_lab[self.frame].T
+                @ fitted.R_body_from_lab[self._reference_row(subset)]
+            )
         if self.length is None:
             # The scale for which the survey's projection on the start map equals the start map's own sum of squares:
             # the linear constraint that `constraints` uses.
@@ -114,20 +121,25 @@ class Gauge:
         else:
             i, j = self._length_rows(subset)
             direction = (fitted.position_m[i] - fitted.position_m[j]) / self.length[2]
-            by_led[i, :, 3], by_led[j, :, 3] = direction, -direction
+            by_led[i, :, 3] = direction
+            by_led[j, :, 3] = -direction
         return by_led.reshape(-1, 4), by_rest
 
     def _length_rows(self, subset: Subset) -> tuple[int, int]:
         assert self.length is not None
         for row in self.length[:2]:
             if row not in subset.led:
-                raise ValueError(f"survey: known_length ends at LED row {row}, which is not surveyed")
+                raise ValueError(
+                    f"survey: known_length ends at LED row {row}, which is not surveyed"
+                )
         i, j = np.searchsorted(subset.led, self.length[:2])
         return int(i), int(j)
 
     def _reference_row(self, subset: Subset) -> int:
         if self.frame is None or self.frame not in subset.frame:
-            raise ValueError(f"survey: reference_frame {self.frame} sees fewer than two surveyed LEDs")
+            raise ValueError(
+                f"survey: reference_frame {self.frame} sees fewer than two surveyed LEDs"
+            )
         return int(np.searchsorted(subset.frame, self.frame))
 
 
@@ -139,13 +151,17 @@ def align_attitudes(ours: Rotation, theirs: Rotation) -> tuple[Rotation, Rotatio
     mean rotation. If all attitudes rotate about one axis, a rotation can be divided between the two; the minimum-norm
     step is taken.
     """
-    left, right = Rotation.identity(), (ours.inv() * theirs).mean()
+    left = Rotation.identity()
+    right = (ours.inv() * theirs).mean()
     for _ in range(50):
         predicted_left = left * ours
         residual = (theirs * (predicted_left * right).inv()).as_rotvec()
-        jacobian = np.concatenate([np.tile(np.eye(3), (len(residual), 1, 1)), predicted_left.as_matrix()], axis=2)
+        jacobian = np.concatenate(
+            [np.tile(np.eye(3), (len(residual), 1, 1)), predicted_left.as_matrix()], axis=2
+        )
         step = np.linalg.lstsq(jacobian.reshape(-1, 6), residual.ravel(), rcond=1e-9)[0]
-        left, right = Rotation.from_rotvec(step[:3]) * left, Rotation.from_rotvec(step[3:]) * right
+        left = Rotation.from_rotvec(step[:3]) * left
+        right = Rotation.from_rotvec(step[3:]) * right
         if np.linalg.norm(step) < 1e-14:
             break
     return left, right

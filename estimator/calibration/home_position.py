@@ -166,11 +166,16 @@ def calibrate(
     return HomeCatalog(id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons)
 
 
-def _brightest_first(samples: _Samples, selected: NDArray[np.bool_]) -> tuple[Ints, Floats, Floats, Ints]:
+def _brightest_first(
+    samples: _Samples, selected: NDArray[np.bool_]
+) -> tuple[Ints, Floats, Floats, Ints]:
     """Lights seen in the frames used, brightest first: rows, mean positions (N, 3), brightness, numbers of frames."""
     led = samples.led[selected]
     count = np.bincount(led)
-    total = [np.bincount(led, column) for column in (*samples.lab_m[selected].T, samples.brightness[selected])]
+    total = [
+        np.bincount(led, column)
+        for column in (*samples.lab_m[selected].T, samples.brightness[selected])
+    ]
     mean = np.column_stack(total) / np.maximum(count, 1)[:, None]
     order = np.argsort(-mean[:, 3], kind="stable")
     order = order[count[order] > 0]
@@ -185,14 +190,17 @@ def _lab_positions(
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
         _check(index, sighting)
-    body_m, lab_m = [], []
+    body_m = []
+    lab_m = []
     for sighting in sightings:
         point_cam, _ = thesis_points(camera.rays(sighting.xy_px), surface, lever, sine)
         point_body = lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
         body_m.append(point_body)
         lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
-    id_, led = np.unique(np.concatenate([sighting.led for sighting in sightings]), return_inverse=True)
+    id_, led = np.unique(
+        np.concatenate([sighting.led for sighting in sightings]), return_inverse=True
+    )
     frame = np.repeat(np.arange(len(sightings)), lights)
     stop = np.repeat([sighting.stop for sighting in sightings], lights)
     brightness = np.concatenate([sighting.brightness for sighting in sightings])
@@ -218,14 +226,18 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
     Computed from half the chord, which is accurate for small angles, unlike the arc cosine of eq. 45.
     """
     direction = unit(samples.body_m)
-    first, second = [], []
+    first = []
+    second = []
     for rows in np.split(np.arange(len(samples.led)), np.flatnonzero(np.diff(samples.frame)) + 1):
         i, j = np.triu_indices(len(rows), 1)
         first.append(rows[i])
         second.append(rows[j])
-    a, b = np.concatenate(first), np.concatenate(second)
+    a = np.concatenate(first)
+    b = np.concatenate(second)
     if not len(a):
-        raise ImageError("no frame has two lights; allowed: two or more in a frame, for their separation")
+        raise ImageError(
+            "no frame has two lights; allowed: two or more in a frame, for their separation"
+        )
     angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b], axis=1) / 2)
     low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
     _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)
@@ -235,7 +247,9 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
 def _maximum(deviation: Floats, source: str) -> float:
     finite = deviation[np.isfinite(deviation)]
     if not len(finite):
-        raise ImageError(f"each {source} has one sample; allowed: two frames or more, for a standard deviation")
+        raise ImageError(
+            f"each {source} has one sample; allowed: two frames or more, for a standard deviation"
+        )
     return float(finite.max())
 
 
@@ -258,5 +272,7 @@ def led_map(catalog: HomeCatalog, surface: LedMap) -> LedMap:
     position_m = on_surface(catalog.vectors, np.zeros(3), surface)
     outside = catalog.id[np.isnan(position_m).any(axis=1)]
     if len(outside):
-        raise ImageError(f"LED {outside[0]}: its direction from the bearing does not intersect the surface")
+        raise ImageError(
+            f"LED {outside[0]}: its direction from the bearing does not intersect the surface"
+        )
     return LedMap(catalog.id, position_m, surface.center_m, surface.semi_axes_m)

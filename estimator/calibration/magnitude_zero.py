@@ -52,4 +52,6 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
     each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
     offset = float(np.median(each))
     scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
-    return MagnitudeZero(offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each))
+    return MagnitudeZero(
+        offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each)
+    )

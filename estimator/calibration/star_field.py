@@ -37,7 +37,9 @@ from estimator.core.types import Attitude, Centroids
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
 START_ROUNDS = 30  # iterations of the robust start attitude
-MIN_STAR_FRACTION = 0.9  # self_calibrate stops at a round with fewer than this fraction of the most stars so far
+MIN_STAR_FRACTION = (
+    0.9  # self_calibrate stops at a round with fewer than this fraction of the most stars so far
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,8 @@ class LensPrior:
     def sigma(self, camera: Camera) -> Floats:
         """(8,) standard deviations of focal_px (inf: no prior), center x and y, k1, k2, p1, p2, k3."""
         r = np.tan(camera.diagonal_rad / 2)
-        k1, p = self.radial / r**2, self.tangential / (3 * r)
+        k1 = self.radial / r**2
+        p = self.tangential / (3 * r)
         center = self.center * camera.width_px
         return np.array([np.inf, center, center, k1, k1 / r**2, p, p, k1 / r**4])
 
@@ -115,7 +118,9 @@ class Calibration(NamedTuple):
 LENS_PRIOR = LensPrior()
 
 
-def calibrate(frames: Sequence[StarFrame], camera_start: Camera, prior: LensPrior = LENS_PRIOR) -> Calibration:
+def calibrate(
+    frames: Sequence[StarFrame], camera_start: Camera, prior: LensPrior = LENS_PRIOR
+) -> Calibration:
     """Fit the lens and every frame's attitude by least squares, from a focal length accurate to a few percent.
 
     Wrong identifications are tolerated: the fit first uses Cauchy's loss, its width shrinking with the median residual;
@@ -132,20 +137,27 @@ def calibrate(frames: Sequence[StarFrame], camera_start: Camera, prior: LensPrio
     problem = _start_problem(sightings, vectors, camera_start, prior, len(frames))
     keep = counts[sightings.frame] >= LEAST_STARS
     _check_enough(sightings.take(keep))
-    problem, previous = problem._replace(bundle=_fit_attitudes(problem.bundle, sightings.take(keep))), np.inf
+    problem = problem._replace(bundle=_fit_attitudes(problem.bundle, sightings.take(keep)))
+    previous = np.inf
     # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
-    while (current := CAUCHY * ba.robust_scale(problem.bundle, sightings.take(keep))) < 0.9 * previous:
+    while (
+        current := CAUCHY * ba.robust_scale(problem.bundle, sightings.take(keep))
+    ) < 0.9 * previous:
         problem, _ = _minimize(problem, sightings.take(keep), current)
         previous = current
     distance = np.linalg.norm(ba.residuals(problem.bundle, sightings), axis=1)
     keep &= distance < GATE * ba.robust_scale(problem.bundle, sightings.take(keep))
-    outliers = np.column_stack([sightings.frame, row])[~keep & (counts[sightings.frame] >= LEAST_STARS)]
+    outliers = np.column_stack([sightings.frame, row])[
+        ~keep & (counts[sightings.frame] >= LEAST_STARS)
+    ]
     tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
     keep &= tied[sightings.frame]
     _check_enough(sightings.take(keep))
     problem, converged = _minimize(problem, sightings.take(keep), np.inf)
     status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
-    return _report(status, problem, sightings.take(keep), tied, outliers, keep, frames, camera_start)
+    return _report(
+        status, problem, sightings.take(keep), tied, outliers, keep, frames, camera_start
+    )
 
 
 class Tracker(Protocol):
@@ -176,18 +188,28 @@ def self_calibrate(
     checks.of_type("self_calibrate: camera", camera, Camera)
     checks.number("self_calibrate: exposure_s", exposure_s, 1e-12, 1e12, "finite, above 0")
     if not callable(tracker):
-        raise ImageError(f"self_calibrate: tracker is {checks.excerpt(tracker)}; allowed: a function that makes one")
-    best, most, previous_stars, estimate = None, 0, np.empty((0, 3)), camera
+        raise ImageError(
+            f"self_calibrate: tracker is {checks.excerpt(tracker)}; allowed: a function that makes one"
+        )
+    best = None
+    most = 0
+    previous_stars = np.empty((0, 3))
+    estimate = camera
     for _ in range(rounds):
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
         stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in identified)])
         # Each round identifies with the calibrated camera, but calibrates from the start camera, which is the prior.
         if np.array_equal(stars, previous_stars) or len(stars) < MIN_STAR_FRACTION * most:
             break
-        best, most, previous_stars = calibrate(identified, camera), max(most, len(stars)), stars
-        estimate, focal_uncertainty = best.camera, 0.0
+        best = calibrate(identified, camera)
+        most = max(most, len(stars))
+        previous_stars = stars
+        estimate = best.camera
+        focal_uncertainty = 0.0
     if best is None:
-        raise ValueError(f"self_calibrate: no star identified in any of {len(frames)} frames; check the camera")
+        raise ValueError(
+            f"self_calibrate: no star identified in any of {len(frames)} frames; check the camera"
+        )
     return best
 
 
@@ -202,7 +224,9 @@ def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
     checks.of_type("other", other, Camera)
     rays = camera.rays(xy)
     R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
-    return float(np.sqrt(np.mean(np.sum((other.pixels(rays @ R_other_from_camera.T) - xy) ** 2, axis=1))))
+    return float(
+        np.sqrt(np.mean(np.sum((other.pixels(rays @ R_other_from_camera.T) - xy) ** 2, axis=1)))
+    )
 
 
 class _Problem(NamedTuple):
@@ -215,7 +239,9 @@ class _Problem(NamedTuple):
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
         loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width)
-        return loss + float(np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)), weight
+        return loss + float(
+            np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)
+        ), weight
 
 
 class _NormalEquations(NamedTuple):
@@ -237,7 +263,9 @@ def _collect(frames: Sequence[StarFrame]) -> Sightings:
         shapes = [one.shape for one in arrays]
         count = shapes[0][0] if shapes[0] else 0
         if shapes != [(count, 2), (count,), (count, 3)]:
-            raise ValueError(f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)")
+            raise ValueError(
+                f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)"
+            )
         checks.unit_rows(f"calibrate: frame {k}: vectors_ref", arrays[2], count)
         finite = np.isfinite(arrays[0]).all()
         if not (finite and np.all((arrays[1] > 0) & (arrays[1] < np.inf))):
@@ -263,7 +291,9 @@ def _check_enough(sightings: Sightings) -> None:
         )
 
 
-def _start_problem(sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int) -> _Problem:
+def _start_problem(
+    sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int
+) -> _Problem:
     """Start values: the start camera, and each frame's robust attitude with it."""
     lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
     rays = camera.rays(sightings.xy_px)
@@ -306,17 +336,20 @@ def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -
     terms = ba.linearize(problem.bundle, sightings)
     frames = len(problem.bundle.R_body_from_lab)
     by_rotation = terms.by_rotation
-    by_lens = terms.by_shared[:, :, 3:]  # the first three columns are the lever, which is fixed at zero
-    weighted_rotation, weighted_lens = weight[:, None, None] * by_rotation, weight[:, None, None] * by_lens
-    rotation_blocks, coupling, rhs = (
-        np.zeros((frames, 3, 3)),
-        np.zeros((frames, 3, LENS)),
-        np.zeros((frames, 3)),
-    )
+    by_lens = terms.by_shared[
+        :, :, 3:
+    ]  # the first three columns are the lever, which is fixed at zero
+    weighted_rotation = weight[:, None, None] * by_rotation
+    weighted_lens = weight[:, None, None] * by_lens
+    rotation_blocks = np.zeros((frames, 3, 3))
+    coupling = np.zeros((frames, 3, LENS))
+    rhs = np.zeros((frames, 3))
     np.add.at(rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation)
     np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
     np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
-    rotation_blocks[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(3)  # unused frame: zero step
+    rotation_blocks[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(
+        3
+    )  # unused frame: zero step
     lens = np.einsum("mai,maj->ij", weighted_lens, by_lens) + np.diag(problem.sigma**-2)
     prior_rhs = (problem.prior_lens - problem.bundle.lens) / problem.sigma**2
     return _NormalEquations(
@@ -336,7 +369,8 @@ def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Float
     blocks = terms.rotation_blocks * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
     right_sides = np.concatenate([terms.coupling, terms.rhs_rotation[:, :, None]], axis=2)
     solved = np.asarray(np.linalg.solve(blocks, right_sides), dtype=np.float64)
-    through, uncoupled = solved[:, :, :LENS], solved[:, :, LENS]
+    through = solved[:, :, :LENS]
+    uncoupled = solved[:, :, LENS]
     matrix = terms.lens - np.einsum("fij,fik->jk", terms.coupling, through)
     matrix[np.diag_indices(LENS)] += damping * terms.lens.diagonal()
     return through, uncoupled, matrix
@@ -354,7 +388,9 @@ def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_P
     no_step = np.zeros(3 * len(problem.bundle.position_m))
     for _ in range(ba.STEPS):
         through, uncoupled, matrix = _eliminate_attitudes(terms, damping)
-        lens = _solve_scaled(matrix, terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled))
+        lens = _solve_scaled(
+            matrix, terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled)
+        )
         rotation = uncoupled - through @ lens
         slope = float(np.sum(terms.rhs_rotation * rotation) + terms.rhs_lens @ lens)
         step = np.concatenate([rotation.ravel(), np.zeros(3), lens])
@@ -362,7 +398,9 @@ def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_P
         new_cost, new_weight = trial.cost(sightings, width)
         # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
-            problem, cost, damping = trial, new_cost, max(damping / 10, 1e-12)
+            problem = trial
+            cost = new_cost
+            damping = max(damping / 10, 1e-12)
             if slope < ba.DECREMENT:
                 return problem, True
             terms = _normal_equations(problem, sightings, new_weight)
@@ -377,7 +415,9 @@ def _solve_scaled(matrix: Floats, right: Floats) -> Floats:
         scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
         factor = cho_factor(matrix * scale * scale[:, None], lower=True)
     except LinAlgError:
-        raise ValueError("calibrate: the frames do not determine the lens; take more stars over the field") from None
+        raise ValueError(
+            "calibrate: the frames do not determine the lens; take more stars over the field"
+        ) from None
     return (scale * cho_solve(factor, (scale * right.T)).T).T
 
 
@@ -394,7 +434,9 @@ def _report(
     terms = _normal_equations(problem, sightings, np.ones(len(sightings.frame)))
     through, _, matrix = _eliminate_attitudes(terms, 0.0)
     covariance = _solve_scaled(matrix, np.eye(LENS))
-    attitude_covariance = np.linalg.inv(terms.rotation_blocks) + through @ covariance @ through.transpose(0, 2, 1)
+    attitude_covariance = np.linalg.inv(
+        terms.rotation_blocks
+    ) + through @ covariance @ through.transpose(0, 2, 1)
     attitude_covariance[~tied] = np.nan
     residual = ba.residuals(problem.bundle, sightings)
     R = problem.bundle.R_body_from_lab
@@ -402,13 +444,17 @@ def _report(
     k1, k2, p1, p2, k3 = rest
     report = FieldReport(
         status,
-        Rotation.concatenate([rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]),
+        Rotation.concatenate(
+            [rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]
+        ),
         attitude_covariance,
         tied,
         outliers,
         len(sightings.frame),
         float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
-        float(np.sqrt(np.sum(residual**2) / max(2 * len(sightings.frame) - 3 * tied.sum() - LENS, 1))),
+        float(
+            np.sqrt(np.sum(residual**2) / max(2 * len(sightings.frame) - 3 * tied.sum() - LENS, 1))
+        ),
         _magnitude(frames, keep),
     )
     lens = replace(camera, focal_px=focal, center_px=(x, y), distortion=(k1, k2, p1, p2, k3))
@@ -427,13 +473,20 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
     return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors[keep])
 
 
-def _identified(frames: Sequence[Centroids], tracker: Tracker, exposure_s: float) -> list[StarFrame]:
+def _identified(
+    frames: Sequence[Centroids], tracker: Tracker, exposure_s: float
+) -> list[StarFrame]:
     """The frames that the tracker solves, with their identified stars."""
     identified = []
     for centroids in frames:
         match = tracker.solve_centroids(centroids).match
         if match is not None:
             selected = centroids.take(match.observed)
-            vectors, v_mag = tracker.stars.vectors[match.star], tracker.stars.v_mag[match.star]
-            identified.append(StarFrame(selected.xy_px, selected.sigma_px, vectors, selected.flux, v_mag, exposure_s))
+            vectors = tracker.stars.vectors[match.star]
+            v_mag = tracker.stars.v_mag[match.star]
+            identified.append(
+                StarFrame(
+                    selected.xy_px, selected.sigma_px, vectors, selected.flux, v_mag, exposure_s
+                )
+            )
     return identified

@@ -30,7 +30,9 @@ FALSE_ALARMS = 1e-3  # mean number of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # that must show a light, or fail to show it
 CHI2_MEDIAN = 2.366  # of three degrees of freedom
 TINY_M2 = 1e-18  # keeps a variance of 0 from a division
-SURFACE_SIGMA_M = 0.005  # of the assumed surface, for the distance of a light seen from one side only
+SURFACE_SIGMA_M = (
+    0.005  # of the assumed surface, for the distance of a light seen from one side only
+)
 GATE = 5.0  # standard deviations of a ray that belongs to a light
 MIN_SCATTER = 0.02  # of the logarithm of an LED's light
 CHANCE = 0.02  # of a light missed although it is on, or seen although it is off, at least
@@ -55,7 +57,9 @@ class HeldFrames:
         size_px = np.array([self.camera.width_px, self.camera.height_px])
         margin = np.broadcast_to(margin_px, len(self.leds.id))[:, None]
         for row, attitude in zip(out, self.body_from_lab, strict=True):
-            xy_px = np.nan_to_num(project(attitude, self.leds.position_m, self.lever, self.camera), nan=-1e9)
+            xy_px = np.nan_to_num(
+                project(attitude, self.leds.position_m, self.lever, self.camera), nan=-1e9
+            )
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
             near = np.flatnonzero(((xy_px > -apart_px) & (xy_px < size_px + apart_px)).all(axis=1))
             if len(near) > 1:
@@ -67,7 +71,9 @@ class HeldFrames:
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
         """(M, 3) origins and unit directions in the lab of the rays to lights at pixels (M, 2) of these frames."""
         lab_from_body = self.body_from_lab[frame].inv()
-        directions = lab_from_body.apply(self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px)))
+        directions = lab_from_body.apply(
+            self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px))
+        )
         return lab_from_body.apply(np.tile(self.lever.camera_body_m, (len(frame), 1))), directions
 
 
@@ -85,8 +91,10 @@ def dark(shown: Mask, seen: Mask) -> Ints:
     shown, seen : (F, N) LEDs that each frame must show, and those identified in it
     By the share p of the other LEDs' images that are detected, chance leaves one of N LEDs so in N (1 - p)^n surveys.
     """
-    count, ever = shown.sum(axis=0), seen.any(axis=0)
-    trials, hits = shown[:, ever].sum(), (shown & seen).sum()
+    count = shown.sum(axis=0)
+    ever = seen.any(axis=0)
+    trials = shown[:, ever].sum()
+    hits = (shown & seen).sum()
     missed = (trials - hits + 1) / (trials + 2)
     surveys = len(count) * missed**count
     return np.flatnonzero(~ever & (count >= MIN_FRAMES) & (surveys < FALSE_ALARMS))
@@ -107,9 +115,12 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
     squared_m2 = np.einsum("nji,nj->ni", axes, (found_m - list_m)[rows]) ** 2
 
     def value(sigma_m: float) -> Floats:
-        return np.asarray(np.sum(squared_m2 / (np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2), axis=1))
+        return np.asarray(
+            np.sum(squared_m2 / (np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2), axis=1)
+        )
 
-    low, high = 0.0, float(np.sqrt(squared_m2.max()))
+    low = 0.0
+    high = float(np.sqrt(squared_m2.max()))
     for _ in range(60):  # bisection: the median falls with s
         middle = (low + high) / 2
         low, high = (middle, high) if np.median(value(middle)) > CHI2_MEDIAN else (low, middle)
@@ -121,7 +132,9 @@ def _limit(count: int) -> float:
     return float(2 * gammainccinv(1.5, FALSE_ALARMS / count))
 
 
-def stray_lights(held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float) -> list[StrayLight]:
+def stray_lights(
+    held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float
+) -> list[StrayLight]:
     """Lights at rest among those that are no known LED: (M,) frames and (M, 2) pixels.
 
     sigma_px : of a centroid;  reach_m : distance on the assumed surface within which lights may be the same
@@ -132,12 +145,15 @@ def stray_lights(held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, 
     if len(frame) < MIN_FRAMES:
         return []
     origins, directions = held.rays(frame, xy_px)
-    points = np.array([on_surface(u[None], o, held.leds)[0] for o, u in zip(origins, directions, strict=True)])
+    points = np.array(
+        [on_surface(u[None], o, held.leds)[0] for o, u in zip(origins, directions, strict=True)]
+    )
     points = np.nan_to_num(points, nan=1e9)
     pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     groups, label = connected_components(links, directed=False)
-    sigma_rad, out = sigma_px / held.camera.focal_px, []
+    sigma_rad = sigma_px / held.camera.focal_px
+    out = []
     for group in range(groups):
         rows = np.flatnonzero(label == group)
         place_m = _meeting_point(origins[rows], directions[rows], points[rows], sigma_rad)
@@ -149,7 +165,9 @@ def stray_lights(held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, 
     return out
 
 
-def _meeting_point(origins: Floats, directions: Floats, points: Floats, sigma_rad: float) -> Floats | None:
+def _meeting_point(
+    origins: Floats, directions: Floats, points: Floats, sigma_rad: float
+) -> Floats | None:
     """The place nearest to most of the rays; None if too few meet.
 
     Least squares of the distances from the rays, |(I - u u') (x - o)|^2, held to the surface by its own error. The rays
@@ -159,7 +177,8 @@ def _meeting_point(origins: Floats, directions: Floats, points: Floats, sigma_ra
         return None
     distance_m = np.linalg.norm(points - origins, axis=1)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    at, weak = np.median(points, axis=0), (sigma_rad * distance_m.mean() / SURFACE_SIGMA_M) ** 2
+    at = np.median(points, axis=0)
+    weak = (sigma_rad * distance_m.mean() / SURFACE_SIGMA_M) ** 2
     limit_rad = np.inf
     for _ in range(10):
         off_rad = _off_rad(at, origins, directions)
@@ -167,7 +186,9 @@ def _meeting_point(origins: Floats, directions: Floats, points: Floats, sigma_ra
         if near.sum() < MIN_FRAMES:
             return None
         matrix = across[near].sum(axis=0) + weak * np.eye(3)
-        at = np.linalg.solve(matrix, np.einsum("nij,nj->i", across[near], origins[near]) + weak * at)
+        at = np.linalg.solve(
+            matrix, np.einsum("nij,nj->i", across[near], origins[near]) + weak * at
+        )
         limit_rad = 3 * float(np.median(_off_rad(at, origins, directions)[near]))
     return at
 
@@ -179,7 +200,9 @@ def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     return np.asarray(np.linalg.norm(np.cross(toward, directions), axis=1))
 
 
-def name_strays(strays: list[StrayLight], candidates: Ints, list_m: Floats, limit_m: float) -> list[tuple[int, int]]:
+def name_strays(
+    strays: list[StrayLight], candidates: Ints, list_m: Floats, limit_m: float
+) -> list[tuple[int, int]]:
     """Pairs (LED, stray) of LEDs that are not where the list has them, by the least sum of distances up to a limit."""
     if not strays or not len(candidates):
         return []
@@ -244,7 +267,9 @@ def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
     return out, observable
 
 
-def names(table: LightTable, list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[Ints, Ints]:
+def names(
+    table: LightTable, list_m: Floats, found_m: Floats, covariance_m2: Floats
+) -> tuple[Ints, Ints]:
     """The measured LEDs (rows), and the names (rows of the list) that their places and their light have together.
 
     A light is named by its place, and where two LEDs stand closer than a few errors of the list, the list may have them
@@ -269,16 +294,20 @@ def names(table: LightTable, list_m: Floats, found_m: Floats, covariance_m2: Flo
     squares = np.einsum("ni,nij,nj->n", off_m, information[at], off_m)
     likelihood = _log_likelihood(table)
     cost = np.full((len(rows), len(list_m)), FORBIDDEN)
-    cost[np.arange(len(rows)), rows] = np.minimum(limit / 2 - likelihood[rows, rows], FORBIDDEN / 10)
+    cost[np.arange(len(rows)), rows] = np.minimum(
+        limit / 2 - likelihood[rows, rows], FORBIDDEN / 10
+    )
     inside = squares < limit
-    at, name = at[inside], name[inside]
+    at = at[inside]
+    name = name[inside]
     cost[at, name] = squares[inside] / 2 - likelihood[rows[at], name]
     return rows, np.asarray(linear_sum_assignment(cost)[1])
 
 
 def _log_likelihood(table: LightTable) -> Floats:
     """(N, N) log likelihood that the light at the place of LED i (rows) is that of LED j (columns)."""
-    seen, on = np.isfinite(table.light), table.expected > 0
+    seen = np.isfinite(table.light)
+    on = table.expected > 0
     log_light = np.log(np.where(seen, table.light, 1.0))
     log_expected = np.log(np.where(on, table.expected, 1.0))
     both = seen & on
@@ -286,7 +315,8 @@ def _log_likelihood(table: LightTable) -> Floats:
     own = np.where(both, log_light - log_expected, np.nan)
     zero = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in own])
     centered = np.where(seen, log_light - zero[:, None], 0.0)
-    indicator, level = seen.T.astype(float), np.where(on, log_expected, 0.0)
+    indicator = seen.T.astype(float)
+    level = np.where(on, log_expected, 0.0)
     counts = np.maximum(indicator @ on, 1)  # (N, N) frames in which i is seen and j on
     mean = (centered.T @ on - indicator @ level) / counts
     squares = (centered**2).T @ on - 2 * centered.T @ level + indicator @ level**2
@@ -294,7 +324,9 @@ def _log_likelihood(table: LightTable) -> Floats:
     tested = both.sum(axis=0) >= MIN_FRAMES
     between_sigma = within_sigma = MIN_SCATTER
     if tested.any():
-        between_sigma = max(SIGMA_PER_MAD * float(np.median(np.abs(np.diag(mean)[tested]))), MIN_SCATTER)
+        between_sigma = max(
+            SIGMA_PER_MAD * float(np.median(np.abs(np.diag(mean)[tested]))), MIN_SCATTER
+        )
         spread = np.sqrt(np.diag(within) / np.maximum(np.diag(counts) - 1, 1))
         within_sigma = max(float(np.median(spread[tested])), MIN_SCATTER)
     silent = table.shown & ~seen

@@ -26,7 +26,9 @@ from estimator.core.camera import Camera
 Mask = NDArray[np.bool_]
 MIN_SHARED = 8  # LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # LEDs that determine an attitude
-PLANNED_RAD = 1.7 * CONNECTING_RAD  # rms angle by which their rays cross; with less, AFIT's LEDs err by a third more
+PLANNED_RAD = (
+    1.7 * CONNECTING_RAD
+)  # rms angle by which their rays cross; with less, AFIT's LEDs err by a third more
 ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
 
 
@@ -52,15 +54,21 @@ class SurveyModel:
         check_lever(self.leds, self.lever)
         for name in ("sigma_px", "leds_sigma_m"):
             if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: finite, above 0")
+                raise ValueError(
+                    f"survey: {name} is {getattr(self, name)}; allowed: finite, above 0"
+                )
         for name in ("lever_sigma_m", "focal_sigma_px"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: 0 or more")
 
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
         """(F, N) LEDs on the chip at each of F attitudes, at least `margin_px` from its edge."""
-        rows = [project(one, self.leds.position_m, self.lever, self.camera) for one in body_from_lab]
-        return np.array([self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px) for xy_px in rows])
+        rows = [
+            project(one, self.leds.position_m, self.lever, self.camera) for one in body_from_lab
+        ]
+        return np.array(
+            [self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px) for xy_px in rows]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +91,9 @@ class SurveyAccuracy:
         return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
 
 
-def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int = 3) -> SurveyAccuracy:
+def predict(
+    model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int = 3
+) -> SurveyAccuracy:
     """The errors that a survey will leave, from the Fisher information of the LEDs seen (F, N) at F attitudes.
 
     free_lens : number of lens elements that it fits: 3, or 7 with the distortion
@@ -95,7 +105,9 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: 
     try:
         covariance = ba.covariance(terms, subset.bundle)
     except LinAlgError:
-        raise ValueError("survey: the attitudes do not determine the unknowns; take more of them") from None
+        raise ValueError(
+            "survey: the attitudes do not determine the unknowns; take more of them"
+        ) from None
     check_redundancy(subset, covariance)
     measured = np.zeros(len(bundle.position_m), dtype=bool)
     measured[subset.led] = True
@@ -105,15 +117,27 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: 
     return SurveyAccuracy(measured, led_sigma_m, shared[:3], shared[3:])
 
 
-def _bundle(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int) -> tuple[Bundle, Sightings]:
+def _bundle(
+    model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int
+) -> tuple[Bundle, Sightings]:
     """The assumed model as a bundle, with sightings exactly where it predicts them."""
-    camera, lever, position_m = model.camera, model.lever, model.leds.position_m
+    camera = model.camera
+    lever = model.lever
+    position_m = model.leds.position_m
     lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
     matrices = body_from_lab.as_matrix().reshape(-1, 3, 3), lever.cam_from_body.as_matrix()
     arm_m = np.array(lever.camera_body_m)
     assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
     bundle = Bundle(
-        position_m, matrices[0], arm_m, matrices[1], lens, free_lens, position_m, model.leds_sigma_m, assumed
+        position_m,
+        matrices[0],
+        arm_m,
+        matrices[1],
+        lens,
+        free_lens,
+        position_m,
+        model.leds_sigma_m,
+        assumed,
     )
     frame, led = np.nonzero(seen)
     sightings = Sightings(frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px))
@@ -145,7 +169,9 @@ def choose(
     best (lazy greedy: Minoux 1978).
     """
     if np.shape(shown) != (len(candidates), len(model.leds.id)):
-        raise ValueError(f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}")
+        raise ValueError(
+            f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}"
+        )
     blocks = np.tile(np.eye(3) * model.leds_sigma_m**2, (len(model.leds.id), 1, 1))
     reach = _Reach(model, candidates, shown)
     if held is not None and seen is not None:
@@ -167,7 +193,8 @@ def choose(
 
 def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) -> int | None:
     """The allowed candidate of the greatest reduction, None if none has any; updates the bounds of those evaluated."""
-    best, greatest = None, 0.0
+    best = None
+    greatest = 0.0
     for k in np.argsort(-bound, kind="stable").tolist():
         if bound[k] <= greatest:
             break
@@ -175,7 +202,8 @@ def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) ->
             continue
         bound[k] = np.einsum("kii->", _reduction(rows[k], blocks))
         if bound[k] > greatest:
-            best, greatest = k, float(bound[k])
+            best = k
+            greatest = float(bound[k])
     return best
 
 
@@ -189,12 +217,14 @@ class _Reach:
     """
 
     def __init__(self, model: SurveyModel, candidates: Rotation, shown: Mask) -> None:
-        place_m, self.arm_m = model.leds.position_m, np.array(model.lever.camera_body_m)
+        place_m = model.leds.position_m
+        self.arm_m = np.array(model.lever.camera_body_m)
         self.distance_m = np.linalg.norm(place_m, axis=1)
         self.toward = place_m / self.distance_m[:, None]
         self.count, self.along_m2 = np.zeros((2, len(place_m)))
         self.sum_m = np.zeros_like(place_m)
-        self.candidates, (self.row, self.led) = candidates, np.nonzero(shown)
+        self.candidates = candidates
+        (self.row, self.led) = np.nonzero(shown)
         self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
 
     def positions(self, body_from_lab: Rotation, row: Ints, led: Ints) -> tuple[Floats, Floats]:
@@ -224,12 +254,15 @@ class _Reach:
 
     def shared(self) -> tuple[Ints, Ints]:
         """(C,) LEDs of each candidate that have been seen before: from another direction, and from any."""
-        led, count = self.led, self.count[self.led] + 1
+        led = self.led
+        count = self.count[self.led] + 1
         mean_m = (self.sum_m[led] + self.camera_m) / count[:, None]
         mean_along_m = np.sum(mean_m * self.toward[led], axis=1)
         across_m2 = self.arm_m @ self.arm_m - np.sum(mean_m**2, axis=1)
         across_m2 -= (self.along_m2[led] + self.along_m**2) / count - mean_along_m**2
-        is_crossing = (count > 1) & (across_m2 > (PLANNED_RAD * (self.distance_m[led] - mean_along_m)) ** 2)
+        is_crossing = (count > 1) & (
+            across_m2 > (PLANNED_RAD * (self.distance_m[led] - mean_along_m)) ** 2
+        )
         return self.counted(is_crossing), self.counted(count > 1)
 
     def counted(self, sightings: Mask) -> Ints:
@@ -252,7 +285,8 @@ def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Mask) -> list[_Row
     return [
         _Row(*parts)
         for parts in zip(
-            *(np.split(one, ends) for one in (sightings.led, terms.by_led, terms.by_rotation)), strict=True
+            *(np.split(one, ends) for one in (sightings.led, terms.by_led, terms.by_rotation)),
+            strict=True,
         )
     ]
 

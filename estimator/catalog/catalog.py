@@ -85,19 +85,38 @@ class StarCatalog:
             _column(name, value, count, False)
             for name, value in (("ra_deg", ra_deg), ("dec_deg", dec_deg), ("v_mag", v_mag))
         )
-        motion = {"pm_ra_mas_yr": pm_ra_mas_yr, "pm_dec_mas_yr": pm_dec_mas_yr, "parallax_mas": parallax_mas}
-        pm_ra, pm_dec, parallax = (_column(name, value, count, True) for name, value in motion.items())
-        epoch_yr = checks.number("catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200")
+        motion = {
+            "pm_ra_mas_yr": pm_ra_mas_yr,
+            "pm_dec_mas_yr": pm_dec_mas_yr,
+            "parallax_mas": parallax_mas,
+        }
+        pm_ra, pm_dec, parallax = (
+            _column(name, value, count, True) for name, value in motion.items()
+        )
+        epoch_yr = checks.number(
+            "catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200"
+        )
         _check_places(ra, dec)
-        numbers = np.arange(1, count + 1) if id is None else checks.row_numbers("catalog: id", id, 2**63 - 1)
+        numbers = (
+            np.arange(1, count + 1)
+            if id is None
+            else checks.row_numbers("catalog: id", id, 2**63 - 1)
+        )
         if len(numbers) != count:
-            raise ImageError(f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star")
-        stars = from_columns(numbers, np.radians(ra), np.radians(dec), pm_ra, pm_dec, parallax, magnitude, epoch_yr)
+            raise ImageError(
+                f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
+            )
+        stars = from_columns(
+            numbers, np.radians(ra), np.radians(dec), pm_ra, pm_dec, parallax, magnitude, epoch_yr
+        )
         return stars.take(np.argsort(stars.v_mag, kind="stable"))
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
         """Select stars by mask or index."""
-        return replace(self, **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"})
+        return replace(
+            self,
+            **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"},
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,20 +135,35 @@ def _column(name: str, value: ArrayLike, count: int, one_for_all: bool) -> Float
         array = np.full(count, array)
     checks.floats(f"catalog: {name}", array, (count,))
     if not np.isfinite(array).all():
-        raise ImageError(f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}")
+        raise ImageError(
+            f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}"
+        )
     return array
 
 
 def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
     """Raise ImageError for places out of range, and for a whole sky in the range of radians."""
-    for name, array, low, high in (("ra_deg", ra_deg, -360.0, 360.0), ("dec_deg", dec_deg, -90.0, 90.0)):
+    for name, array, low, high in (
+        ("ra_deg", ra_deg, -360.0, 360.0),
+        ("dec_deg", dec_deg, -90.0, 90.0),
+    ):
         good = (array >= low) & (array <= high)
         if not good.all():
             value = array[checks.first_bad(good)]
-            raise ImageError(f"catalog: {name} is {value:g} in a row; allowed: {low:g} to {high:g} degrees")
-    turn, pole = 2 * np.pi + 1e-6, np.pi / 2 + 1e-6
-    if len(ra_deg) >= 20 and 5 < ra_deg.max() <= turn and np.ptp(dec_deg) > 1.2 and np.abs(dec_deg).max() <= pole:
-        raise ImageError(f"catalog: all ra_deg are below {turn:.4f} and dec_deg below {pole:.4f}; radians?")
+            raise ImageError(
+                f"catalog: {name} is {value:g} in a row; allowed: {low:g} to {high:g} degrees"
+            )
+    turn = 2 * np.pi + 1e-6
+    pole = np.pi / 2 + 1e-6
+    if (
+        len(ra_deg) >= 20
+        and 5 < ra_deg.max() <= turn
+        and np.ptp(dec_deg) > 1.2
+        and np.abs(dec_deg).max() <= pole
+    ):
+        raise ImageError(
+            f"catalog: all ra_deg are below {turn:.4f} and dec_deg below {pole:.4f}; radians?"
+        )
 
 
 def checked(stars: object) -> StarCatalog:
@@ -138,7 +172,9 @@ def checked(stars: object) -> StarCatalog:
     assert isinstance(stars, StarCatalog)
     count = len(stars)
     if count == 0:
-        raise ImageError("stars: the catalog is empty at this limiting magnitude; allowed: 3 stars or more")
+        raise ImageError(
+            "stars: the catalog is empty at this limiting magnitude; allowed: 3 stars or more"
+        )
     checks.unit_rows("stars: vectors", stars.vectors, count)
     checks.rows("stars: drift_rad_yr", stars.drift_rad_yr, count, 3)
     for name in ("parallax_rad", "v_mag"):
@@ -151,10 +187,14 @@ def utc(date: object) -> datetime.datetime:
     try:
         time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
     except ValueError:
-        raise ImageError(f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00") from None
+        raise ImageError(
+            f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00"
+        ) from None
     if not isinstance(time, datetime.datetime) or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]:
         years = "{:g} to {:g}".format(*EPOCHS_YR)
-        raise ImageError(f"date: {checks.excerpt(date)}; allowed: a UTC date or datetime of {years}")
+        raise ImageError(
+            f"date: {checks.excerpt(date)}; allowed: a UTC date or datetime of {years}"
+        )
     return time
 
 
@@ -174,7 +214,9 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     days = (time_utc - J2000) / datetime.timedelta(days=1) + TT_MINUS_UTC_S / DAY_S
     _, barycentric = erfa.epv00(J2000_JD, days)
     meters_per_second = erfa.DAU / DAY_S
-    return Observer(2000 + days / JULIAN_YEAR_DAY, barycentric["p"], barycentric["v"] * meters_per_second)
+    return Observer(
+        2000 + days / JULIAN_YEAR_DAY, barycentric["p"], barycentric["v"] * meters_per_second
+    )
 
 
 def read(path: str | Path) -> StarCatalog:
@@ -217,7 +259,9 @@ def hipparcos() -> StarCatalog:
     return read(next((path for path in places if path.is_file()), root / name))
 
 
-def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> tuple[Floats, float]:
+def columns(
+    path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
+) -> tuple[Floats, float]:
     """Read columns of a catalog file as (len(names) + len(optional), N) numbers in the file's order, and its epoch.
 
     optional: columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
@@ -231,8 +275,12 @@ def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
         column_numbers = [header.index(name) for name in (*names, *optional)]
         if not body[1:]:
             raise ValueError("it has no rows")
-        converters: dict[int | str, Callable[[str], Any]] = dict.fromkeys(column_numbers[len(names) :], _number_or_nan)
-        table = np.loadtxt(body[1:], delimiter=delimiter, usecols=column_numbers, ndmin=2, converters=converters)
+        converters: dict[int | str, Callable[[str], Any]] = dict.fromkeys(
+            column_numbers[len(names) :], _number_or_nan
+        )
+        table = np.loadtxt(
+            body[1:], delimiter=delimiter, usecols=column_numbers, ndmin=2, converters=converters
+        )
         if not np.isfinite(table[:, : len(names)]).all():
             raise ValueError("some numbers are not finite")
     except (OSError, TypeError, ValueError, IndexError) as error:
@@ -245,7 +293,11 @@ def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
 def _epoch_yr(lines: Sequence[str]) -> float:
     """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError."""
     comments = (line for line in lines if line.startswith("#"))
-    found = [match for line in comments if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))]
+    found = [
+        match
+        for line in comments
+        if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))
+    ]
     epoch_yr = float(found[0][1]) if found else np.nan
     if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
         raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))
@@ -267,7 +319,10 @@ def from_columns(
     epoch_yr: float,
 ) -> StarCatalog:
     """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec)."""
-    sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
+    sa = np.sin(ra_rad)
+    ca = np.cos(ra_rad)
+    sd = np.sin(dec_rad)
+    cd = np.cos(dec_rad)
     vectors = np.column_stack([cd * ca, cd * sa, sd])
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
     north = np.column_stack([-sd * ca, -sd * sa, cd])
@@ -312,7 +367,9 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     means, v_mag = light_centers(values, stars.v_mag, groups)
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
-    result = StarCatalog(stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr)
+    result = StarCatalog(
+        stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr
+    )
     return result.take(np.argsort(result.v_mag, kind="stable"))
 
 
@@ -330,8 +387,11 @@ def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     Each star takes the least row among itself and its neighbors until none changes; scipy.sparse.csgraph does the same,
     but takes longer to import than this to run.
     """
-    one, other = cKDTree(vectors).query_pairs(2 * np.sin(closer_than_rad / 2), output_type="ndarray").T
-    label, before = np.arange(len(vectors)), np.empty(0, int)
+    one, other = (
+        cKDTree(vectors).query_pairs(2 * np.sin(closer_than_rad / 2), output_type="ndarray").T
+    )
+    label = np.arange(len(vectors))
+    before = np.empty(0, int)
     while not np.array_equal(label, before):
         before = label.copy()
         np.minimum.at(label, one, before[other])

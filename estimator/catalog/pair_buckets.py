@@ -65,18 +65,24 @@ def build_pair_catalog(
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
     in_magnitude_range = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
     selected = (angle >= low) & (angle <= high) & in_magnitude_range[pair].all(axis=1)
-    pair, angle = pair[selected], angle[selected]
+    pair = pair[selected]
+    angle = angle[selected]
     if not len(pair):
-        raise ImageError(f"no pair of stars from {np.degrees(low):.3f} to {np.degrees(high):.3f} deg")
+        raise ImageError(
+            f"no pair of stars from {np.degrees(low):.3f} to {np.degrees(high):.3f} deg"
+        )
     if range_rad is None:
-        low, high = float(angle.min()), float(angle.max())
+        low = float(angle.min())
+        high = float(angle.max())
     # The 1e-9 keeps rounding from adding a bucket where the range is a whole number of buckets.
     buckets = max(int(np.ceil((high - low) / width_rad - 1e-9)), 1)
     bucket = bucket_of(angle, high, width_rad, buckets)
     table = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets))])
     pair = np.ascontiguousarray(pair[np.argsort(bucket, kind="stable")])
     magnitude = np.ascontiguousarray(magnitude, dtype=float)
-    return PairCatalog(vectors, magnitude, pair, table, float(high), width_rad, spatial_grid.build(vectors))
+    return PairCatalog(
+        vectors, magnitude, pair, table, float(high), width_rad, spatial_grid.build(vectors)
+    )
 
 
 @jit

@@ -70,7 +70,9 @@ def build(
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
-    magnitudes = np.full(len(vectors), np.nan) if magnitude is None else np.asarray(magnitude, float)
+    magnitudes = (
+        np.full(len(vectors), np.nan) if magnitude is None else np.asarray(magnitude, float)
+    )
     if magnitudes.shape != (len(vectors),) or (np.diff(magnitudes) < 0).any():
         raise ImageError(
             f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
@@ -80,16 +82,19 @@ def build(
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
     angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
     order = np.argsort(angle, kind="stable")
-    pair, angle = np.ascontiguousarray(pair[order]), angle[order]
+    pair = np.ascontiguousarray(pair[order])
+    angle = angle[order]
     # Each pair appears in the neighbor lists of both its stars. The lists keep pairs within a group.
     owner = np.concatenate([pair[:, 0], pair[:, 1]])
     other = np.concatenate([pair[:, 1], pair[:, 0]])
     both_angles = np.concatenate([angle, angle])
     by_owner = np.lexsort((both_angles, owner))
     first = np.searchsorted(owner[by_owner], np.arange(len(vectors) + 1))
-    neighbor, separation = other[by_owner], both_angles[by_owner]
+    neighbor = other[by_owner]
+    separation = both_angles[by_owner]
     independent = group[pair[:, 0]] != group[pair[:, 1]]
-    pair, angle = pair[independent], angle[independent]
+    pair = pair[independent]
+    angle = angle[independent]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs within {np.degrees(max_angle_rad):.2f} deg, not counting those of one patch board,"
@@ -121,7 +126,8 @@ def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
     """
     count = len(angle_rad)
     margin = max(1e-12, 1e-12 * angle_rad[-1])
-    low, high = angle_rad[0] - margin, angle_rad[-1] + margin
+    low = angle_rad[0] - margin
+    high = angle_rad[-1] + margin
     slope = (high - low) / (count + 1)
     z = slope * np.arange(count + 2) + low
     return np.searchsorted(angle_rad, z, side="right"), float(slope), float(low)

@@ -20,7 +20,9 @@ from estimator.catalog import catalog
 from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 
-SUN_B_V, SUN_V_I = 0.65, 0.72  # of a G2 star, used where the catalog has no color
+# of a G2 star, used where the catalog has no color
+SUN_B_V = 0.65
+SUN_V_I = 0.72
 BYTES_PER_ENTRY = 20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
 
 
@@ -66,7 +68,9 @@ def read_cat(
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
     hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = numbers[:7]
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = catalog.from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, file_epoch_yr)
+    stars = catalog.from_columns(
+        hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, file_epoch_yr
+    )
     epoch_yr = file_epoch_yr if epoch_yr is None else epoch_yr
     magnitude = v_mag
     if color:
@@ -83,7 +87,8 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     close stars is one group.
     """
     order = np.argsort(stars.magnitude, kind="stable")
-    vectors, magnitude = stars.vectors[order], stars.magnitude[order]
+    vectors = stars.vectors[order]
+    magnitude = stars.magnitude[order]
     groups = catalog.close_groups(vectors, closer_than_rad)
     means, merged = catalog.light_centers(vectors, magnitude, groups)
     _, first = np.unique(groups, return_index=True)  # the brightest of each group
@@ -122,7 +127,8 @@ def log(stars: OnBoard, step_mag: float = 0.5) -> str:
         "",
         "    id      ra deg     dec deg     mag  stars",
     ]
-    ra, dec = np.arctan2(stars.vectors[:, 1], stars.vectors[:, 0]), np.arcsin(stars.vectors[:, 2])
+    ra = np.arctan2(stars.vectors[:, 1], stars.vectors[:, 0])
+    dec = np.arcsin(stars.vectors[:, 2])
     columns = zip(
         stars.id,
         np.degrees(ra) % 360,

@@ -28,10 +28,14 @@ from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
 PER_CIRCLE = 10  # stars of quads in a circle as high as the field
-LONGEST, SHORTEST = 0.75, 0.15  # distance of A and B, in units of the field's height
+# distance of A and B, in units of the field's height
+LONGEST = 0.75
+SHORTEST = 0.15
 NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
 SIDE = 20  # cells along each of the four axes
-ALONG, ACROSS = 0.5, 0.87  # bounds of the coordinates along B to A and across, since C is nearer to A than B is
+# bounds of the coordinates along B to A and across, since C is nearer to A than B is
+ALONG = 0.5
+ACROSS = 0.87
 
 
 class QuadIndex(NamedTuple):
@@ -50,15 +54,20 @@ def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Build the index of the stars and pairs of `sky` for fields of the given height."""
     chosen = _locally_bright(sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors))
     neighbor, first = _neighbors(sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen)
-    total, found, code = 1, np.empty((0, 4), np.int32), np.empty((0, 4))
+    total = 1
+    found = np.empty((0, 4), np.int32)
+    code = np.empty((0, 4))
     while total > len(found):
-        found, code = np.empty((total, 4), np.int32), np.empty((total, 4))
+        found = np.empty((total, 4), np.int32)
+        code = np.empty((total, 4))
         total = _quads(sky.vectors, neighbor, first, SHORTEST * height_rad, found, code)
     return QuadIndex(*_sort_into_cells(found[:total], code[:total]))
 
 
 @jit
-def _locally_bright(pair: NDArray, first: NDArray, bin_rad: float, radius_rad: float, count: int) -> NDArray[np.bool_]:
+def _locally_bright(
+    pair: NDArray, first: NDArray, bin_rad: float, radius_rad: float, count: int
+) -> NDArray[np.bool_]:
     """(count,) stars with fewer than PER_CIRCLE brighter ones within the radius. Stars are sorted by brightness."""
     brighter = np.zeros(count, np.int64)
     for p in range(first[cell_of(radius_rad / bin_rad, len(first) - 1)]):
@@ -71,32 +80,46 @@ def _neighbors(
     pair: NDArray, first: NDArray, bin_rad: float, reach_rad: float, chosen: NDArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Of every chosen star the chosen ones within reach: those of star s are neighbor[start[s] : start[s + 1]]."""
-    end, start = first[cell_of(reach_rad / bin_rad, len(first) - 1)], np.zeros(len(chosen) + 1, np.int64)
+    end = first[cell_of(reach_rad / bin_rad, len(first) - 1)]
+    start = np.zeros(len(chosen) + 1, np.int64)
     for p in range(end):
         if chosen[pair[p, 0]] and chosen[pair[p, 1]]:
             start[pair[p, 0] + 1] += 1
             start[pair[p, 1] + 1] += 1
     for s in range(len(chosen)):
         start[s + 1] += start[s]
-    neighbor, free = np.empty(start[-1], np.int32), start.copy()
+    neighbor = np.empty(start[-1], np.int32)
+    free = start.copy()
     for p in range(end):
-        i, j = pair[p, 0], pair[p, 1]
+        i = pair[p, 0]
+        j = pair[p, 1]
         if chosen[i] and chosen[j]:
-            neighbor[free[i]], neighbor[free[j]] = j, i
+            neighbor[free[i]] = j
+            neighbor[free[j]] = i
             free[i] += 1
             free[j] += 1
     return neighbor, start
 
 
 @jit
-def _quads(xyz: Floats, neighbor: NDArray, start: NDArray, shortest_rad: float, found: NDArray, code: Floats) -> int:
+def _quads(
+    xyz: Floats,
+    neighbor: NDArray,
+    start: NDArray,
+    shortest_rad: float,
+    found: NDArray,
+    code: Floats,
+) -> int:
     """Find all quads of neighbors, and their codes; return their number. No more than the arrays hold are stored."""
-    total, frame = 0, np.empty((3, 3))
-    near, place = np.empty(NEIGHBORS, np.int64), np.empty((NEIGHBORS, 2))
+    total = 0
+    frame = np.empty((3, 3))
+    near = np.empty(NEIGHBORS, np.int64)
+    place = np.empty((NEIGHBORS, 2))
     for a in range(len(start) - 1):
         for entry in range(start[a], start[a + 1]):
             b = neighbor[entry]
-            star_a, star_b = vectors.row(xyz, a), vectors.row(xyz, b)
+            star_a = vectors.row(xyz, a)
+            star_b = vectors.row(xyz, b)
             length = vectors.chord(star_a, star_b)
             if b < a or length < shortest_rad:
                 continue
@@ -105,18 +128,29 @@ def _quads(xyz: Floats, neighbor: NDArray, start: NDArray, shortest_rad: float, 
             for other in range(start[a], min(start[a + 1], start[a] + NEIGHBORS)):
                 c = neighbor[other]
                 star_c = vectors.row(xyz, c)
-                if max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c)) < length and c != b:
+                if (
+                    max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c)) < length
+                    and c != b
+                ):
                     near[count] = c
                     place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
                     count += 1
             for k in range(count):
                 for m in range(k):
-                    if vectors.chord(vectors.row(xyz, near[k]), vectors.row(xyz, near[m])) >= length:
+                    if (
+                        vectors.chord(vectors.row(xyz, near[k]), vectors.row(xyz, near[m]))
+                        >= length
+                    ):
                         continue
                     if total < len(found):
-                        found[total, 0], found[total, 1], found[total, 2], found[total, 3] = a, b, near[k], near[m]
-                        code[total, 0], code[total, 1] = place[k, 0], place[k, 1]
-                        code[total, 2], code[total, 3] = place[m, 0], place[m, 1]
+                        found[total, 0] = a
+                        found[total, 1] = b
+                        found[total, 2] = near[k]
+                        found[total, 3] = near[m]
+                        code[total, 0] = place[k, 0]
+                        code[total, 1] = place[k, 1]
+                        code[total, 2] = place[m, 0]
+                        code[total, 3] = place[m, 1]
                         arrange(code[total], found[total])
                     total += 1
     return total
@@ -151,9 +185,12 @@ def code_cell(value: float, axis: int) -> int:
 
 
 @jit
-def _sort_into_cells(star: NDArray, code: Floats) -> tuple[NDArray[np.int32], Floats, NDArray[np.int32]]:
+def _sort_into_cells(
+    star: NDArray, code: Floats
+) -> tuple[NDArray[np.int32], Floats, NDArray[np.int32]]:
     """Counting sort of quads by the cell of their code."""
-    cell, first = np.empty(len(code), np.int64), np.zeros(SIDE**4 + 1, np.int32)
+    cell = np.empty(len(code), np.int64)
+    first = np.zeros(SIDE**4 + 1, np.int32)
     for n in range(len(code)):
         k = 0
         for axis in range(4):
@@ -162,9 +199,12 @@ def _sort_into_cells(star: NDArray, code: Floats) -> tuple[NDArray[np.int32], Fl
         first[k + 1] += 1
     for k in range(SIDE**4):
         first[k + 1] += first[k]
-    sorted_star, sorted_code, free = np.empty_like(star), np.empty_like(code), first.copy()
+    sorted_star = np.empty_like(star)
+    sorted_code = np.empty_like(code)
+    free = first.copy()
     for n in range(len(code)):
         slot = free[cell[n]]
-        sorted_star[slot], sorted_code[slot] = star[n], code[n]
+        sorted_star[slot] = star[n]
+        sorted_code[slot] = code[n]
         free[cell[n]] += 1
     return sorted_star, sorted_code, first

@@ -24,7 +24,9 @@ from estimator.core.constants import (
     ZERO_CELSIUS_K,
 )
 
-LOWEST_RAD = np.radians(85.0)  # of the apparent zenith distance; the formula fails nearer to the horizon
+LOWEST_RAD = np.radians(
+    85.0
+)  # of the apparent zenith distance; the formula fails nearer to the horizon
 RAISING_STEPS = 6
 
 
@@ -85,7 +87,13 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
     centuries = days / JULIAN_CENTURY_DAY
     sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
     hour = np.radians(sidereal_deg % 360) + longitude_rad
-    of_date = np.array([np.cos(latitude_rad) * np.cos(hour), np.cos(latitude_rad) * np.sin(hour), np.sin(latitude_rad)])
+    of_date = np.array(
+        [
+            np.cos(latitude_rad) * np.cos(hour),
+            np.cos(latitude_rad) * np.sin(hour),
+            np.sin(latitude_rad),
+        ]
+    )
     zeta, z, theta = ARCSEC_RAD * np.array(
         [
             2306.2181 * centuries + 0.30188 * centuries**2,
@@ -98,24 +106,29 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
 
 def _about_z(angle: float) -> Floats:
     """(3, 3) components in axes turned by the angle about z."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
 
 
 def _about_y(angle: float) -> Floats:
     """(3, 3) components in axes turned by the angle about y."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
 
 
-def refraction_constants(pressure_hpa: float, temperature_c: float, wavelength_m: float) -> tuple[float, float]:
+def refraction_constants(
+    pressure_hpa: float, temperature_c: float, wavelength_m: float
+) -> tuple[float, float]:
     """A and B in radians of R = A tan z + B tan^3 z, z the apparent zenith distance.
 
     A = g (1 - beta), B = -g (beta - g / 2), with the refractivity g of dry air (Edlen 1953, as in Stone 1996, PASP 108,
     1051) and beta = 0.001254 T / 273.15 K, the scale height of the air over the Earth's radius. Within 0.2" of
     ray tracing above 15 degrees of altitude.
     """
-    per_um2, t_k = (1e-6 / wavelength_m) ** 2, temperature_c + ZERO_CELSIUS_K
+    per_um2 = (1e-6 / wavelength_m) ** 2
+    t_k = temperature_c + ZERO_CELSIUS_K
     standard = 1e-6 * (64.328 + 29498.1 / (146 - per_um2) + 255.4 / (41 - per_um2))
     refractivity = standard * pressure_hpa / STANDARD_PRESSURE_HPA * STANDARD_TEMPERATURE_K / t_k
     beta = 0.001254 * t_k / ZERO_CELSIUS_K

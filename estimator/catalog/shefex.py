@@ -24,12 +24,15 @@ from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
-NORTH_MAG, SOUTH_MAG = 5.2, 5.4
+NORTH_MAG = 5.2
+SOUTH_MAG = 5.4
 BRIGHT_MAG = 4.5
 COUNT = 2023
 
 
-def asymmetric(stars: StarCatalog, north_mag: float = NORTH_MAG, south_mag: float = SOUTH_MAG) -> StarCatalog:
+def asymmetric(
+    stars: StarCatalog, north_mag: float = NORTH_MAG, south_mag: float = SOUTH_MAG
+) -> StarCatalog:
     """Select stars to one limit north of the equator and to another (fainter by default) south of it."""
     return stars.take(stars.v_mag <= np.where(stars.vectors[:, 2] >= 0, north_mag, south_mag))
 
@@ -39,7 +42,13 @@ def thin(stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])
     n_bright = int(np.searchsorted(stars.v_mag[order], bright_mag, side="right"))
-    return stars.take(order[_thin(vectors, spatial_grid.build(vectors), n_bright, 2 * np.sin(min_separation_rad / 2))])
+    return stars.take(
+        order[
+            _thin(
+                vectors, spatial_grid.build(vectors), n_bright, 2 * np.sin(min_separation_rad / 2)
+            )
+        ]
+    )
 
 
 @jit
@@ -62,12 +71,17 @@ def uniform(stars: StarCatalog, count: int, bright_mag: float = -np.inf) -> Star
     """
     n_bright = int((stars.v_mag <= bright_mag).sum())
     if not max(n_bright, 1) <= count <= len(stars):
-        raise ImageError(f"{count} of {len(stars)} stars; allowed: {max(n_bright, 1)} to {len(stars)}")
+        raise ImageError(
+            f"{count} of {len(stars)} stars; allowed: {max(n_bright, 1)} to {len(stars)}"
+        )
     # A larger distance selects fewer stars; `low` always gives at least `count`.
-    low, high = 0.0, np.pi
+    low = 0.0
+    high = np.pi
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if len(thin(stars, middle, bright_mag)) >= count else (low, middle)
+        low, high = (
+            (middle, high) if len(thin(stars, middle, bright_mag)) >= count else (low, middle)
+        )
     return thin(stars, low, bright_mag)
 
 

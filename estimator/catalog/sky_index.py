@@ -61,7 +61,9 @@ class SkyIndex(NamedTuple):
         return sum(array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray))
 
 
-def build(vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None = None) -> SkyIndex:
+def build(
+    vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None = None
+) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
     paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
@@ -73,15 +75,21 @@ def build(vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None
     sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
     # A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
     expected = len(vectors) ** 2 * np.sin(max_angle_rad / 2) ** 2 / 2
-    found, half_chord = np.empty((0, 2), np.int32), np.empty(0)
+    found = np.empty((0, 2), np.int32)
+    half_chord = np.empty(0)
     total = int(1.2 * expected) + 1000
     while total > len(found):
-        found, half_chord = np.empty((total, 2), np.int32), np.empty(total)
+        found = np.empty((total, 2), np.int32)
+        half_chord = np.empty(total)
         total = _sweep(*sorted_xyz, 2 * np.sin(max_angle_rad / 2), found, half_chord)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])  # in place: there may be millions
+    angle_rad = np.minimum(
+        half_chord[:total], 1.0, out=half_chord[:total]
+    )  # in place: there may be millions
     angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
-    pair, first, bin_rad = _sort_into_bins(by_z, found[:total], angle_rad, max_angle_rad * (1 + 1e-9))
+    pair, first, bin_rad = _sort_into_bins(
+        by_z, found[:total], angle_rad, max_angle_rad * (1 + 1e-9)
+    )
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
@@ -91,10 +99,12 @@ def build(vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, without pairs: for lookups by direction only."""
-    vectors, mag = np.ascontiguousarray(vectors, dtype=float), np.ascontiguousarray(mag, dtype=float)
+    vectors = np.ascontiguousarray(vectors, dtype=float)
+    mag = np.ascontiguousarray(mag, dtype=float)
     side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
     empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
-    faces, cells = _cells(vectors, side), spatial_grid.build(vectors)
+    faces = _cells(vectors, side)
+    cells = spatial_grid.build(vectors)
     return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *faces, side, cells)
 
 
@@ -103,13 +113,17 @@ def _magnitude_density(mag: Floats) -> Floats:
     reach = 4 * MAG_SMOOTHING
     edges = np.arange(mag[0] - reach, mag[-1] + reach + MAG_STEP, MAG_STEP)
     count = np.histogram(mag, edges)[0] / len(mag) / MAG_STEP
-    kernel = np.exp(-(np.arange(-reach, reach + MAG_STEP / 2, MAG_STEP) ** 2) / 2 / MAG_SMOOTHING**2)
+    kernel = np.exp(
+        -(np.arange(-reach, reach + MAG_STEP / 2, MAG_STEP) ** 2) / 2 / MAG_SMOOTHING**2
+    )
     smooth = np.convolve(count, kernel / kernel.sum(), mode="same")
     return np.maximum(smooth[round(reach / MAG_STEP) :], 1e-4)
 
 
 @jit
-def _sweep(x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats) -> int:
+def _sweep(
+    x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats
+) -> int:
     """Find all pairs up to a chord among stars sorted by z, and their half-chords; return their number.
 
     No more than the arrays hold are stored: a greater number asks for another sweep.
@@ -120,12 +134,15 @@ def _sweep(x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_c
             dz = z[j] - z[i]
             if dz > reach:
                 break  # the stars are sorted by z: all further ones are out of reach too
-            dx, dy = x[j] - x[i], y[j] - y[i]
+            dx = x[j] - x[i]
+            dy = y[j] - y[i]
             chord2 = dx * dx + dy * dy + dz * dz
             if chord2 > reach * reach:
                 continue
             if total < len(half_chord):
-                found[total, 0], found[total, 1], half_chord[total] = i, j, sqrt(chord2) / 2
+                found[total, 0] = i
+                found[total, 1] = j
+                half_chord[total] = sqrt(chord2) / 2
             total += 1
     return total
 
@@ -142,17 +159,20 @@ def _sort_into_bins(
         first[int(angle_rad[n] / bin_rad) + 1] += 1
     for k in range(bins):
         first[k + 1] += first[k]
-    pair, next_free = np.empty((len(found), 2), np.int32), first.copy()
+    pair = np.empty((len(found), 2), np.int32)
+    next_free = first.copy()
     for n in range(len(found)):
         k = int(angle_rad[n] / bin_rad)
-        pair[next_free[k], 0], pair[next_free[k], 1] = row[found[n, 0]], row[found[n, 1]]
+        pair[next_free[k], 0] = row[found[n, 0]]
+        pair[next_free[k], 1] = row[found[n, 1]]
         next_free[k] += 1
     return pair, first, bin_rad
 
 
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Sort the stars by cell; a star near the edge of a face is also on the neighboring face."""
-    cell, star = [], []
+    cell = []
+    star = []
     for axis in range(3):
         for sign in (1, -1):
             along = sign * vectors[:, axis]
@@ -185,16 +205,24 @@ def nearest(
     The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
-    ax, ay, az = abs(x), abs(y), abs(z)
+    ax = abs(x)
+    ay = abs(y)
+    az = abs(z)
     if ax >= ay and ax >= az:
-        face, inverse = (0 if x > 0 else 1), 1 / ax
-        u, v = y * inverse, z * inverse
+        face = 0 if x > 0 else 1
+        inverse = 1 / ax
+        u = y * inverse
+        v = z * inverse
     elif ay >= az:
-        face, inverse = (2 if y > 0 else 3), 1 / ay
-        u, v = z * inverse, x * inverse
+        face = 2 if y > 0 else 3
+        inverse = 1 / ay
+        u = z * inverse
+        v = x * inverse
     else:
-        face, inverse = (4 if z > 0 else 5), 1 / az
-        u, v = x * inverse, y * inverse
+        face = 4 if z > 0 else 5
+        inverse = 1 / az
+        u = x * inverse
+        v = y * inverse
     scale = side / (2 * FACE_HALF_WIDTH)
     # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds
     # the higher orders.
@@ -203,14 +231,18 @@ def nearest(
     right = cell_of((u + reach + FACE_HALF_WIDTH) * scale, side - 1)
     top = cell_of((v - reach + FACE_HALF_WIDTH) * scale, side)
     bottom = cell_of((v + reach + FACE_HALF_WIDTH) * scale, side - 1)
-    best, closest2 = -1, gate * gate
+    best = -1
+    closest2 = gate * gate
     for row in range(top, bottom + 1):
         # The cells of a row are contiguous in `cell_star`: one loop covers them.
         row_start = (face * side + row) * side
         for entry in range(cell_first[row_start + left], cell_first[row_start + right + 1]):
             star = cell_star[entry]
-            dx, dy, dz = vectors[star, 0] - x, vectors[star, 1] - y, vectors[star, 2] - z
+            dx = vectors[star, 0] - x
+            dy = vectors[star, 1] - y
+            dz = vectors[star, 2] - z
             distance2 = dx * dx + dy * dy + dz * dz
             if distance2 < closest2:
-                best, closest2 = star, distance2
+                best = star
+                closest2 = distance2
     return best, closest2

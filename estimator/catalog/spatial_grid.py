@@ -43,7 +43,8 @@ def build(vectors: Floats) -> Cells:
 def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
     """Sort the stars by cell (counting sort); returns the fields `first` and `row` of Cells."""
     first = np.zeros(side**3 + 1, np.int32)
-    row, cell = np.empty(len(vectors), np.int32), np.empty(len(vectors), np.int64)
+    row = np.empty(len(vectors), np.int32)
+    cell = np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
         cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)
@@ -75,9 +76,12 @@ def edge_cell(x: float, side: int) -> int:
 
 
 @jit
-def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
+def within(
+    cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray
+) -> int:
     """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
-    count, side = 0, cells.side
+    count = 0
+    side = cells.side
     for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
         for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
@@ -85,7 +89,9 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
             end = cells.first[low + edge_cell(z + chord, side) + 1]
             for entry in range(begin, end):
                 s = cells.row[entry]
-                dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
+                dx = vectors[s, 0] - x
+                dy = vectors[s, 1] - y
+                dz = vectors[s, 2] - z
                 if dx * dx + dy * dy + dz * dz <= chord * chord:
                     if count < len(out):
                         out[count] = s
@@ -96,7 +102,9 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
 @jit
 def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
     """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
-    best, least2, side = -1, chord * chord, cells.side
+    best = -1
+    least2 = chord * chord
+    side = cells.side
     for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
         for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
@@ -104,8 +112,11 @@ def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: 
             end = cells.first[low + edge_cell(z + chord, side) + 1]
             for entry in range(begin, end):
                 s = cells.row[entry]
-                dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
+                dx = vectors[s, 0] - x
+                dy = vectors[s, 1] - y
+                dz = vectors[s, 2] - z
                 distance2 = dx * dx + dy * dy + dz * dz
                 if distance2 < least2:
-                    best, least2 = s, distance2
+                    best = s
+                    least2 = distance2
     return best

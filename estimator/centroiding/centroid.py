@@ -25,7 +25,9 @@ from estimator.detection.detect import check_pixel_type, to_native
 Centroider = Callable[..., Centroids]
 
 
-def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def cog(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Center of gravity of the light above the sky, in the blob's box and a margin around it.
 
     x = sum(I x) / sum(I), with var(x) = sum((I / g + noise^2) (x - x_mean)^2) / sum(I)^2 for a gain of g
@@ -35,7 +37,9 @@ def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePrior
     return _to_centroids(_gravity_rows(image, blobs, gain_e_dn))
 
 
-def weighted(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def weighted(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Center of gravity weighted by the light itself: x = sum(I^2 x) / sum(I^2).
 
     The wings, which are mostly noise, get less weight. The variance is
@@ -48,7 +52,9 @@ def weighted(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: Frame
     return _to_centroids(rows)
 
 
-def gaussian_window(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def gaussian_window(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Center of gravity in a Gaussian window w, iterated until it is the center c of the window: sum(w I (x - c)) = 0.
 
     As SExtractor's XWIN (Bertin & Arnouts 1996), but solved by Newton's method, and with a window of twice the star's
@@ -58,11 +64,15 @@ def gaussian_window(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors
     """
     image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
-    rows = moments.gaussian_windowed(image, blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
+    rows = moments.gaussian_windowed(
+        image, blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
+    )
     return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
-def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def gaussian_fit(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Least-squares fit of a Gaussian integrated over each pixel; free are x, y, flux, sigma and the sky level.
 
     Gauss-Newton on a 7x7 window around the blob's center. The model is I = b + F gx gy with
@@ -75,7 +85,9 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: F
     return _gaussian_centroids(image, blobs, gain_e_dn, priors)
 
 
-def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def streak(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Least-squares fit of a line segment blurred by a Gaussian; its center is the star's position at mid-exposure.
 
     Center, flux and sky are free. Length, direction and width have Gaussian priors around the streak of `priors`,
@@ -96,7 +108,9 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
     if failed.any():
         rows[failed] = np.nan
         # A streak longer than half the window of a round star does not fit into it.
-        short = failed & (np.hypot(*_frame_streaks(image, blobs, priors).T) <= gaussian.HALF_WINDOW_PX)
+        short = failed & (
+            np.hypot(*_frame_streaks(image, blobs, priors).T) <= gaussian.HALF_WINDOW_PX
+        )
         if short.any():
             rows[short] = _fit_gaussians(image, blobs.take(short), gain_e_dn, priors)
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
@@ -118,7 +132,9 @@ def streak_ends(
     return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
 
-def disk(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
+def disk(
+    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+) -> Centroids:
     """Least-squares fit of a uniform disk with a blurred edge: the image of a nearby LED.
 
     Center, radius, edge width, brightness and sky are free. Only the edge carries information about the position, so a
@@ -154,11 +170,15 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
         raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
     edge = np.array([image.shape[1], image.shape[0]] * 2)
     if len(blobs) and not (blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()):
-        raise ImageError(f"blobs reach beyond the image of {image.shape[1]}x{image.shape[0]} pixels")
+        raise ImageError(
+            f"blobs reach beyond the image of {image.shape[1]}x{image.shape[0]} pixels"
+        )
     return to_native(image)
 
 
-STREAK_ROUNDS, MIN_STREAKS = 4, 3  # fits of a frame's streaks; measured ones that replace the frame's
+# fits of a frame's streaks; measured ones that replace the frame's
+STREAK_ROUNDS = 4
+MIN_STREAKS = 3
 
 CENTROIDERS: dict[str, Centroider] = {
     "default": streak,
@@ -171,7 +191,9 @@ CENTROIDERS: dict[str, Centroider] = {
 }
 
 
-def _gaussian_centroids(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Centroids:
+def _gaussian_centroids(
+    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
+) -> Centroids:
     """Centroids of `gaussian_fit` in an image that is prepared."""
     rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
     return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
@@ -199,7 +221,8 @@ def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePr
     Where no gyro tells the frame's streak, the fit is repeated with the median of the fitted ones if that is another:
     the moments of faint streaks, of which the ends are below the threshold, make them too short.
     """
-    expected_px, sky = _frame_streaks(image, blobs, priors), blobs.background
+    expected_px = _frame_streaks(image, blobs, priors)
+    sky = blobs.background
     rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
         length_px = np.hypot(*expected_px.T)
@@ -219,7 +242,8 @@ def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
     measured = np.isfinite(vectors_px[:, 0])
     if np.count_nonzero(measured) < MIN_STREAKS:
         return np.zeros(2)
-    vectors, expected = vectors_px[measured], expected_px[measured]
+    vectors = vectors_px[measured]
+    expected = expected_px[measured]
     sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
     return np.asarray(np.median(sign[:, None] * vectors - expected, axis=0))
 

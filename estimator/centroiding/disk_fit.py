@@ -19,7 +19,9 @@ from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
-MIN_RADIUS_PX = 2.0  # radius of the smallest disk that still has a flat center despite its blurred edge
+MIN_RADIUS_PX = (
+    2.0  # radius of the smallest disk that still has a flat center despite its blurred edge
+)
 MAX_ITERATIONS = 40
 # Model error at a curved edge of square pixels, measured without noise at radii of 5 and 10 px.
 MODEL_PX = 0.004
@@ -42,29 +44,40 @@ def fit_all(
     """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disk."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
-    buffer, p = np.empty(len(xy), np.int64), np.empty(6)
+    buffer = np.empty(len(xy), np.int64)
+    p = np.empty(6)
     capacity = _largest_window(boxes)
-    pixels, rows, weight = np.empty((3, capacity)), np.empty((7, capacity)), np.empty(capacity)
+    pixels = np.empty((3, capacity))
+    rows = np.empty((7, capacity))
+    weight = np.empty(capacity)
     rows[SKY] = 1.0
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
         p[RADIUS] = sqrt(area[n] / pi)
         if p[RADIUS] < MIN_RADIUS_PX:
             continue
-        x0, y0 = boxes[n, 0] - MARGIN_PX, boxes[n, 1] - MARGIN_PX
-        x1, y1 = boxes[n, 2] + MARGIN_PX, boxes[n, 3] + MARGIN_PX
+        x0 = boxes[n, 0] - MARGIN_PX
+        y0 = boxes[n, 1] - MARGIN_PX
+        x1 = boxes[n, 2] + MARGIN_PX
+        y1 = boxes[n, 3] + MARGIN_PX
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         # Initial values: the radius of a disk of the blob's area, and the mean brightness.
-        p[EDGE], p[BRIGHTNESS], p[SKY] = 1.0, flux[n] / area[n], sky
+        p[EDGE] = 1.0
+        p[BRIGHTNESS] = flux[n] / area[n]
+        p[SKY] = sky
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if image[y, x] < saturation and not belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                    pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
+                if image[y, x] < saturation and not belongs_to_neighbor(
+                    boxes, neighbor_rows, n, x, y
+                ):
+                    pixels[0, count] = x
+                    pixels[1, count] = y
+                    pixels[2, count] = image[y, x]
                     count += 1
         if count >= 12:
             _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n])
@@ -81,15 +94,26 @@ def _largest_window(boxes: Ints) -> int:
 
 
 @jit
-def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats) -> None:
+def _fit(
+    pixels: Floats,
+    noise: float,
+    gain_e_dn: float,
+    rows: Floats,
+    weight: Floats,
+    p: Floats,
+    out: Floats,
+) -> None:
     """Fit one disk by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
 
     pixels : (3, K) x, y and value of the pixels used
     An LED is not a perfect disk: where the residuals exceed the noise, the covariance is inflated.
     """
     count = pixels.shape[1]
-    start_x, start_y, start_radius = p[X], p[Y], p[RADIUS]
-    normal, step = np.empty((7, 7)), np.empty(6)
+    start_x = p[X]
+    start_y = p[Y]
+    start_radius = p[RADIUS]
+    normal = np.empty((7, 7))
+    step = np.empty(6)
     for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         least_squares.normal_equations(rows, weight, count, normal)
@@ -109,27 +133,37 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             xx, yy, _ = least_squares.position_covariance(normal, step)
             variance = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
-            out[0], out[1], out[2], out[4] = p[X], p[Y], sqrt(variance + MODEL_PX**2), p[RADIUS]
+            out[0] = p[X]
+            out[1] = p[Y]
+            out[2] = sqrt(variance + MODEL_PX**2)
+            out[4] = p[RADIUS]
             # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
             out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
             return
 
 
 @jit
-def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
+def _rows(
+    pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats
+) -> None:
     """Fill the model's derivatives by the six parameters, the residual and the weight of every pixel.
 
     The model A erfc((r - R) / (w sqrt 2)) / 2 is exact for a straight edge blurred by a Gaussian; w^2 is the optics'
     sigma^2 plus the pixel's 1/12.
     """
-    brightness, w = p[BRIGHTNESS], p[EDGE]
+    brightness = p[BRIGHTNESS]
+    w = p[EDGE]
     for k in range(pixels.shape[1]):
-        dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
+        dx = pixels[0, k] - p[X]
+        dy = pixels[1, k] - p[Y]
         r = max(hypot(dx, dy), 1e-9)
         d = r - p[RADIUS]
         profile = erfc(d / (w * sqrt(2.0))) / 2
         slope = brightness * exp(-d * d / (2 * w * w)) / (w * sqrt(2 * pi))
-        rows[X, k], rows[Y, k] = slope * dx / r, slope * dy / r
-        rows[RADIUS, k], rows[EDGE, k], rows[BRIGHTNESS, k] = slope, slope * d / w, profile
+        rows[X, k] = slope * dx / r
+        rows[Y, k] = slope * dy / r
+        rows[RADIUS, k] = slope
+        rows[EDGE, k] = slope * d / w
+        rows[BRIGHTNESS, k] = profile
         rows[6, k] = pixels[2, k] - p[SKY] - brightness * profile
         weight[k] = 1 / (noise * noise + max(brightness * profile, 0.0) / gain_e_dn + 1e-9)

@@ -18,8 +18,12 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 10  # default, and largest for a saturated star
-MIN_SIGMA_PX, MAX_SIGMA_PX = 0.2, 3.0  # limits of sigma that a 7x7 window can resolve
+# default, and largest for a saturated star
+HALF_WINDOW_PX = 3
+MAX_HALF_WINDOW_PX = 10
+# limits of sigma that a 7x7 window can resolve
+MIN_SIGMA_PX = 0.2
+MAX_SIGMA_PX = 3.0
 INITIAL_SIGMA_PX = 0.8  # initial sigma of the first star
 MAX_ITERATIONS = 40
 # Parameters: center, flux, width, sky.
@@ -45,22 +49,28 @@ def fit_all(
     height, width = image.shape
     out = np.full((len(xy), 4), np.nan)
     side = 2 * MAX_HALF_WINDOW_PX + 1
-    rows, weight, edges = np.empty((6, side * side)), np.empty(side * side), np.empty((6, side + 1))
+    rows = np.empty((6, side * side))
+    weight = np.empty(side * side)
+    edges = np.empty((6, side + 1))
     rows[SKY] = 1.0
-    p, start_sigma_px = np.empty(5), INITIAL_SIGMA_PX
+    p = np.empty(5)
+    start_sigma_px = INITIAL_SIGMA_PX
     for n in range(len(xy)):
         half = HALF_WINDOW_PX
         if peak[n] >= saturation:  # only the wings are usable: enlarge the window
             long_side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1])
             half = min(max(long_side // 2 + 2, HALF_WINDOW_PX), MAX_HALF_WINDOW_PX)
-        left, top = round(xy[n, 0]) - half, round(xy[n, 1]) - half
+        left = round(xy[n, 0]) - half
+        top = round(xy[n, 1]) - half
         side = 2 * half + 1
         if left < 0 or top < 0 or left + side > width or top + side > height:
             continue
         window = image[top : top + side, left : left + side]
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
-        p[X], p[Y] = xy[n, 0] - left, xy[n, 1] - top
-        p[WIDTH], p[SKY] = start_sigma_px, interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        p[X] = xy[n, 0] - left
+        p[Y] = xy[n, 1] - top
+        p[WIDTH] = start_sigma_px
+        p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         if _fit(window, sigma, gain_e_dn, saturation, rows, weight, edges, p, out[n]):
             start_sigma_px = p[WIDTH]
             out[n, 0] += left
@@ -86,8 +96,10 @@ def _fit(
 
     Where the model does not fit (two stars in one window) the covariance is inflated by the residuals.
     """
-    start_x, start_y = p[X], p[Y]
-    normal, step = np.empty((6, 6)), np.empty(5)
+    start_x = p[X]
+    start_y = p[Y]
+    normal = np.empty((6, 6))
+    step = np.empty(5)
     p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
     for _ in range(MAX_ITERATIONS):
         pixels = _rows(window, noise, gain_e_dn, saturation, p, rows, weight, edges)
@@ -108,7 +120,10 @@ def _fit(
                 return False
             xx, yy, _ = least_squares.position_covariance(normal, step)
             inflation = least_squares.misfit_factor(normal[5, 5], pixels - 5)
-            out[0], out[1], out[2], out[3] = p[X], p[Y], sqrt((xx + yy) / 2 * inflation), p[FLUX]
+            out[0] = p[X]
+            out[1] = p[Y]
+            out[2] = sqrt((xx + yy) / 2 * inflation)
+            out[3] = p[FLUX]
             return True
     return False
 
@@ -125,17 +140,24 @@ def _rows(
     edges: Floats,
 ) -> int:
     """Fill the model's derivatives, the residuals and the weights at every pixel; return the number of pixels used."""
-    side, flux, used = len(window), p[FLUX], window.size
+    side = len(window)
+    flux = p[FLUX]
+    used = window.size
     gx, dgx, sgx, gy, dgy, sgy = edges
     _cells(side, p[X], p[WIDTH], gx, dgx, sgx)
     _cells(side, p[Y], p[WIDTH], gy, dgy, sgy)
     for j in range(side):
         block = rows[:, j * side : (j + 1) * side]
-        block_weight, pixel_row = weight[j * side : (j + 1) * side], window[j]
-        flux_y, slope_y, widening_y = flux * gy[j], flux * dgy[j], flux * sgy[j]
+        block_weight = weight[j * side : (j + 1) * side]
+        pixel_row = window[j]
+        flux_y = flux * gy[j]
+        slope_y = flux * dgy[j]
+        widening_y = flux * sgy[j]
         for i in range(side):
             model = flux_y * gx[i]
-            block[X, i], block[Y, i], block[FLUX, i] = flux_y * dgx[i], slope_y * gx[i], gy[j] * gx[i]
+            block[X, i] = flux_y * dgx[i]
+            block[Y, i] = slope_y * gx[i]
+            block[FLUX, i] = gy[j] * gx[i]
             block[WIDTH, i] = flux_y * sgx[i] + widening_y * gx[i]
             block[5, i] = pixel_row[i] - p[SKY] - model
             # The 1e-9 keeps the weights finite in the sky of a noise-free image.
@@ -148,18 +170,24 @@ def _rows(
 
 
 @jit
-def _cells(count: int, center: float, sigma: float, fraction: Floats, slope: Floats, widening: Floats) -> None:
+def _cells(
+    count: int, center: float, sigma: float, fraction: Floats, slope: Floats, widening: Floats
+) -> None:
     """Integrate a 1-D Gaussian over each pixel; also its derivatives with respect to the center and to sigma.
 
     Adjacent pixels share an edge, so erf and exp are computed once per edge.
     """
     scale = 1 / sigma
     low = (-0.5 - center) * scale
-    low_sum, low_bell = erf(low * sqrt(0.5)) / 2, exp(-low * low / 2) / sqrt(2 * pi)
+    low_sum = erf(low * sqrt(0.5)) / 2
+    low_bell = exp(-low * low / 2) / sqrt(2 * pi)
     for k in range(count):
         high = low + scale
-        high_sum, high_bell = erf(high * sqrt(0.5)) / 2, exp(-high * high / 2) / sqrt(2 * pi)
+        high_sum = erf(high * sqrt(0.5)) / 2
+        high_bell = exp(-high * high / 2) / sqrt(2 * pi)
         fraction[k] = high_sum - low_sum
         slope[k] = (low_bell - high_bell) * scale
         widening[k] = (low * low_bell - high * high_bell) * scale
-        low, low_sum, low_bell = high, high_sum, high_bell
+        low = high
+        low_sum = high_sum
+        low_bell = high_bell

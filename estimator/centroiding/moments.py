@@ -20,31 +20,41 @@ from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 MARGIN_PX = 4
-MIN_WINDOW_PX, MAX_WINDOW_PX = 0.6, 4.0  # limits of the window's sigma
+# limits of the window's sigma
+MIN_WINDOW_PX = 0.6
+MAX_WINDOW_PX = 4.0
 # The window's variance over the star's: the error is an eighth above the minimum, see `gaussian_windowed`.
 WINDOW_VARIANCE_RATIO = 2.0
-SIZING_ITERATIONS, MAX_ITERATIONS = 4, 60  # iterations that adapt the window's width, and iterations at most
+# iterations that adapt the window's width, and iterations at most
+SIZING_ITERATIONS = 4
+MAX_ITERATIONS = 60
 
 
 @jit
-def center_of_gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
+def center_of_gravity(
+    image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
+) -> Floats:
     """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
-        x0, y0 = max(boxes[n, 0] - MARGIN_PX, 0), max(boxes[n, 1] - MARGIN_PX, 0)
-        x1, y1 = min(boxes[n, 2] + MARGIN_PX, width - 1), min(boxes[n, 3] + MARGIN_PX, height - 1)
+        x0 = max(boxes[n, 0] - MARGIN_PX, 0)
+        y0 = max(boxes[n, 1] - MARGIN_PX, 0)
+        x1 = min(boxes[n, 2] + MARGIN_PX, width - 1)
+        y1 = min(boxes[n, 3] + MARGIN_PX, height - 1)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         flux = sx = sy = s_light = light_xx = light_x = light_y = 0.0
         pixels = px = py = pxx = 0.0
-        origin_x, origin_y = (x0 + x1) / 2, (y0 + y1) / 2
+        origin_x = (x0 + x1) / 2
+        origin_y = (y0 + y1) / 2
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                     continue
                 light = image[y, x] - interpolate(level, height, width, y, x)
-                u, v = x - origin_x, y - origin_y
+                u = x - origin_x
+                v = y - origin_y
                 flux += light
                 sx += light * u
                 sy += light * v
@@ -59,28 +69,38 @@ def center_of_gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats,
                 py += v
                 pxx += u * u + v * v
         if flux == 0:  # the center of gravity is undefined
-            out[n, :3], out[n, 3] = np.nan, 0.0
+            out[n, :3] = np.nan
+            out[n, 3] = 0.0
             continue
-        cx, cy = sx / flux, sy / flux
+        cx = sx / flux
+        cy = sy / flux
         # Sums of (x - cx)^2 + (y - cy)^2 over the pixels, and weighted by their light.
         by_light = light_xx - 2 * (cx * light_x + cy * light_y) + (cx * cx + cy * cy) * s_light
         by_pixel = pxx - 2 * (cx * px + cy * py) + (cx * cx + cy * cy) * pixels
-        sigma2 = (interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE) ** 2
+        sigma2 = (
+            interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE
+        ) ** 2
         moment_variance = (by_light / gain_e_dn + sigma2 * by_pixel) / 2
-        out[n, 0], out[n, 1], out[n, 3] = cx + origin_x, cy + origin_y, flux
+        out[n, 0] = cx + origin_x
+        out[n, 1] = cy + origin_y
+        out[n, 3] = flux
         out[n, 2] = sqrt(max(moment_variance, 0.0)) / abs(flux)
     return out
 
 
 @jit
-def squared_light(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float) -> Floats:
+def squared_light(
+    image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
+) -> Floats:
     """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux."""
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
-        x0, y0 = max(boxes[n, 0] - 1, 0), max(boxes[n, 1] - 1, 0)
-        x1, y1 = min(boxes[n, 2] + 1, width - 1), min(boxes[n, 3] + 1, height - 1)
+        x0 = max(boxes[n, 0] - 1, 0)
+        y0 = max(boxes[n, 1] - 1, 0)
+        x1 = min(boxes[n, 2] + 1, width - 1)
+        y1 = min(boxes[n, 3] + 1, height - 1)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         cx = cy = flux = weight = moment_variance = second_moment = 0.0
         sigma2 = 0.0
@@ -104,12 +124,16 @@ def squared_light(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gai
             if sweep == 0:
                 if weight == 0:
                     break
-                cx, cy = cx / weight, cy / weight
+                cx = cx / weight
+                cy = cy / weight
                 sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         if weight == 0:
-            out[n, :3], out[n, 3] = np.nan, 0.0
+            out[n, :3] = np.nan
+            out[n, 3] = 0.0
             continue
-        out[n, 0], out[n, 1], out[n, 3] = cx, cy, flux
+        out[n, 0] = cx
+        out[n, 1] = cy
+        out[n, 3] = flux
         out[n, 2] = sqrt(moment_variance / weight**2 + sampling_variance(second_moment / weight))
     return out
 
@@ -137,8 +161,10 @@ def gaussian_windowed(
         sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         for iteration in range(MAX_ITERATIONS):
             reach = 4 * sqrt(s2)
-            x0, y0 = max(round(cx - reach), 0), max(round(cy - reach), 0)
-            x1, y1 = min(round(cx + reach), width - 1), min(round(cy + reach), height - 1)
+            x0 = max(round(cx - reach), 0)
+            y0 = max(round(cy - reach), 0)
+            x1 = min(round(cx + reach), width - 1)
+            y1 = min(round(cy + reach), height - 1)
             neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
             total = mx = my = second_moment = moment_variance = flux = 0.0
             for y in range(y0, y1 + 1):
@@ -146,7 +172,8 @@ def gaussian_windowed(
                     if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
                         continue
                     light = image[y, x] - interpolate(level, height, width, y, x)
-                    u, v = x - cx, y - cy
+                    u = x - cx
+                    v = y - cy
                     w = exp(-(u * u + v * v) / (2 * s2))
                     total += w * light
                     mx += w * light * u
@@ -159,19 +186,25 @@ def gaussian_windowed(
             slope = total - second_moment / s2
             if not (total > 0 and slope > 0):
                 break
-            dx, dy = mx / slope, my / slope
+            dx = mx / slope
+            dy = my / slope
             scale = min(1.0, 0.7 / max(abs(dx), abs(dy), 1e-300))
-            cx, cy = cx + scale * dx, cy + scale * dy
+            cx = cx + scale * dx
+            cy = cy + scale * dy
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
             if iteration < SIZING_ITERATIONS:
                 # A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
                 apparent = second_moment / total
-                variance = 1 / (1 / apparent - 1 / s2) if 0 < apparent < 0.95 * s2 else MAX_WINDOW_PX**2
+                variance = (
+                    1 / (1 / apparent - 1 / s2) if 0 < apparent < 0.95 * s2 else MAX_WINDOW_PX**2
+                )
                 s2 = min(max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2)
             elif max(abs(dx), abs(dy)) < 1e-10:
                 sampling_error2 = sampling_variance(second_moment / total) * (total / slope) ** 2
-                out[n, 0], out[n, 1], out[n, 3] = cx, cy, flux
+                out[n, 0] = cx
+                out[n, 1] = cy
+                out[n, 3] = flux
                 out[n, 2] = sqrt(moment_variance / slope**2 + sampling_error2)
                 break
     return out

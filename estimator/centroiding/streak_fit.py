@@ -23,18 +23,25 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-MARGIN_PX, MAX_HALF_WINDOW_PX = 4, 96  # margin of the window about the streak, and its largest half-width
+# margin of the window about the streak, and its largest half-width
+MARGIN_PX = 4
+MAX_HALF_WINDOW_PX = 96
 REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
 # Priors (1 sigma): difference of a star's streak from the frame's, as slow rotation about the boresight and distortion
 # make streaks vary over the field; and of its width from that of the star before.
-LENGTH_FRACTION, LENGTH_PX, ANGLE_RAD, WIDTH_FRACTION = 0.15, 0.5, 0.15, 0.15
+LENGTH_FRACTION = 0.15
+LENGTH_PX = 0.5
+ANGLE_RAD = 0.15
+WIDTH_FRACTION = 0.15
 FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13
-MAX_OWN_ERROR = 0.3  # largest relative error of a length without priors: the fit is linear for smaller ones
+MAX_OWN_ERROR = (
+    0.3  # largest relative error of a length without priors: the fit is linear for smaller ones
+)
 
 
 @jit
@@ -55,37 +62,52 @@ def fit_all(
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
-    buffer, p = np.empty(len(xy), np.int64), np.empty(7)
+    buffer = np.empty(len(xy), np.int64)
+    p = np.empty(7)
     # The window covers the streak, with a margin, about the blob's center.
     capacity = 0
     for n in range(len(xy)):
         half_x, half_y = _half_window(streaks[n])
         capacity = max(capacity, (2 * half_x + 1) * (2 * half_y + 1))
-    pixels, rows, weight = np.empty((3, capacity)), np.empty((8, capacity)), np.empty(capacity)
+    pixels = np.empty((3, capacity))
+    rows = np.empty((8, capacity))
+    weight = np.empty(capacity)
     rows[SKY] = 1.0
     width_px = 0.9
     for n in range(len(xy)):
-        length, angle = hypot(streaks[n, 0], streaks[n, 1]), np.arctan2(streaks[n, 1], streaks[n, 0])
+        length = hypot(streaks[n, 0], streaks[n, 1])
+        angle = np.arctan2(streaks[n, 1], streaks[n, 0])
         half_x, half_y = _half_window(streaks[n])
         if length < MIN_STREAK_PX or half_x < 0:
             continue
-        x0, y0 = round(xy[n, 0]) - half_x, round(xy[n, 1]) - half_y
-        x1, y1 = x0 + 2 * half_x, y0 + 2 * half_y
+        x0 = round(xy[n, 0]) - half_x
+        y0 = round(xy[n, 1]) - half_y
+        x1 = x0 + 2 * half_x
+        y1 = y0 + 2 * half_y
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
-        p[X], p[Y], p[FLUX] = xy[n, 0], xy[n, 1], 0.0
-        p[LENGTH], p[ANGLE], p[WIDTH], p[SKY] = length, angle, width_px, sky
+        p[X] = xy[n, 0]
+        p[Y] = xy[n, 1]
+        p[FLUX] = 0.0
+        p[LENGTH] = length
+        p[ANGLE] = angle
+        p[WIDTH] = width_px
+        p[SKY] = sky
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
+                if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(
+                    boxes, neighbor_rows, n, x, y
+                ):
                     continue
                 p[FLUX] += image[y, x] - sky
                 if image[y, x] < saturation:
-                    pixels[0, count], pixels[1, count], pixels[2, count] = x, y, image[y, x]
+                    pixels[0, count] = x
+                    pixels[1, count] = y
+                    pixels[2, count] = image[y, x]
                     count += 1
         if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
             width_px = p[WIDTH]  # the optics are the same for the next star
@@ -95,7 +117,8 @@ def fit_all(
 @jit
 def _half_window(streak: Floats) -> tuple[int, int]:
     """Half the window's width and height about a streak; -1 if it is too long."""
-    half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
+    half_x = int(abs(streak[0]) / 2) + MARGIN_PX
+    half_y = int(abs(streak[1]) / 2) + MARGIN_PX
     return (half_x, half_y) if max(half_x, half_y) <= MAX_HALF_WINDOW_PX else (-1, -1)
 
 
@@ -108,14 +131,23 @@ def length_sigma_px(length_px: float) -> float:
 @jit
 def _distance_to_line(p: Floats, x: float, y: float) -> float:
     """Distance of a pixel from the line segment."""
-    along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
+    along_x = cos(p[ANGLE])
+    along_y = sin(p[ANGLE])
     u = (x - p[X]) * along_x + (y - p[Y]) * along_y
     v = (y - p[Y]) * along_x - (x - p[X]) * along_y
     return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
 
 
 @jit
-def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: Floats, p: Floats, out: Floats) -> bool:
+def _fit(
+    pixels: Floats,
+    noise: float,
+    gain_e_dn: float,
+    rows: Floats,
+    weight: Floats,
+    p: Floats,
+    out: Floats,
+) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
     pixels : (3, K) x, y and value of the pixels used
@@ -123,10 +155,14 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
     does not fit (two crossing streaks) the covariance is inflated by the residuals.
     """
     count = pixels.shape[1]
-    start_x, start_y = p[X], p[Y]
-    start_length, start_angle, start_width = p[LENGTH], p[ANGLE], p[WIDTH]
+    start_x = p[X]
+    start_y = p[Y]
+    start_length = p[LENGTH]
+    start_angle = p[ANGLE]
+    start_width = p[WIDTH]
     length_sigma = length_sigma_px(start_length)
-    normal, step = np.empty((8, 8)), np.empty(7)
+    normal = np.empty((8, 8))
+    step = np.empty(7)
     for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         least_squares.normal_equations(rows, weight, count, normal)
@@ -148,15 +184,20 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
         if p[FLUX] <= 0 or not MIN_STREAK_PX < p[LENGTH] < 2 * start_length + 4:
             return False
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
-            out[0], out[1], out[2] = p[X], p[Y], p[FLUX]
-            out[3], out[4] = p[LENGTH] * cos(p[ANGLE]), p[LENGTH] * sin(p[ANGLE])
+            out[0] = p[X]
+            out[1] = p[Y]
+            out[2] = p[FLUX]
+            out[3] = p[LENGTH] * cos(p[ANGLE])
+            out[4] = p[LENGTH] * sin(p[ANGLE])
             out[5], out[6], out[7] = least_squares.position_covariance(normal, step)
             # Degrees of freedom: seven parameters, three priors.
             misfit = least_squares.misfit_factor(normal[7, 7], count - 4)
             out[5:8] *= misfit
             # A scalar variance along the streak becomes a covariance in x and y.
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
-            _own_vector(normal, p, start_length, start_angle, misfit, 8 * end_variance_px2, step, out[8:])
+            _own_vector(
+                normal, p, start_length, start_angle, misfit, 8 * end_variance_px2, step, out[8:]
+            )
             end_variance = end_variance_px2 / p[LENGTH] ** 2
             out[5] += end_variance * out[3] ** 2
             out[6] += end_variance * out[4] ** 2
@@ -187,22 +228,33 @@ def _own_vector(
         column[:] = 0.0
         column[LENGTH + i] = 1.0
         least_squares.cholesky_solve(factor, column)
-        cov[i, 0], cov[i, 1] = column[LENGTH], column[ANGLE]
-    prior_l, prior_a = 1 / length_sigma_px(prior_length) ** 2, 1 / ANGLE_RAD**2
+        cov[i, 0] = column[LENGTH]
+        cov[i, 1] = column[ANGLE]
+    prior_l = 1 / length_sigma_px(prior_length) ** 2
+    prior_a = 1 / ANGLE_RAD**2
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-    ll, aa, la = cov[1, 1] / det - prior_l, cov[0, 0] / det - prior_a, -cov[0, 1] / det
+    ll = cov[1, 1] / det - prior_l
+    aa = cov[0, 0] / det - prior_a
+    la = -cov[0, 1] / det
     det = ll * aa - la**2
     if not (ll > 0 and aa > 0 and det > 0):
         return
     ll, aa, la = aa / det, ll / det, -la / det
-    pull_l, pull_a = prior_l * (p[LENGTH] - prior_length), prior_a * (p[ANGLE] - prior_angle)
-    length, angle = p[LENGTH] + ll * pull_l + la * pull_a, p[ANGLE] + la * pull_l + aa * pull_a
-    ll, aa, la = misfit * ll + ends_px2, misfit * aa, misfit * la
+    pull_l = prior_l * (p[LENGTH] - prior_length)
+    pull_a = prior_a * (p[ANGLE] - prior_angle)
+    length = p[LENGTH] + ll * pull_l + la * pull_a
+    angle = p[ANGLE] + la * pull_l + aa * pull_a
+    ll = misfit * ll + ends_px2
+    aa = misfit * aa
+    la = misfit * la
     if not (ll < (MAX_OWN_ERROR * length) ** 2 and aa < MAX_OWN_ERROR**2 and length > 0):
         return
-    c, s = cos(angle), sin(angle)
-    across, both = length**2 * aa, length * la
-    out[0], out[1] = length * c, length * s
+    c = cos(angle)
+    s = sin(angle)
+    across = length**2 * aa
+    both = length * la
+    out[0] = length * c
+    out[1] = length * s
     out[2] = ll * c * c + across * s * s - 2 * both * c * s
     out[3] = ll * s * s + across * c * c + 2 * both * c * s
     out[4] = (ll - across) * c * s + both * (c * c - s * s)
@@ -223,23 +275,32 @@ def _end_variance_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
 
 
 @jit
-def _rows(pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats) -> None:
+def _rows(
+    pixels: Floats, noise: float, gain_e_dn: float, p: Floats, rows: Floats, weight: Floats
+) -> None:
     """Fill the model's derivatives by the seven parameters, the residual and the weight of every pixel.
 
     The model is F / L * [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 * exp(-v^2 / 2 w^2) /
     (w sqrt(2 pi)) at u along and v across the streak. The pixel's width is part of w: w^2 = sigma^2 + 1/12.
     """
-    along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
-    flux, length, w = p[FLUX], p[LENGTH], p[WIDTH]
+    along_x = cos(p[ANGLE])
+    along_y = sin(p[ANGLE])
+    flux = p[FLUX]
+    length = p[LENGTH]
+    w = p[WIDTH]
     for k in range(pixels.shape[1]):
-        dx, dy = pixels[0, k] - p[X], pixels[1, k] - p[Y]
-        u, v = dx * along_x + dy * along_y, dy * along_x - dx * along_y
-        head, tail = (u + length / 2) / w, (u - length / 2) / w
+        dx = pixels[0, k] - p[X]
+        dy = pixels[1, k] - p[Y]
+        u = dx * along_x + dy * along_y
+        v = dy * along_x - dx * along_y
+        head = (u + length / 2) / w
+        tail = (u - length / 2) / w
         head_sum, head_bell = _gaussian_integral(head)
         tail_sum, tail_bell = _gaussian_integral(tail)
         across = exp(-v * v / (2 * w * w)) / (w * sqrt(2 * pi) * length)
         unit = (head_sum - tail_sum) * across
-        by_u, by_v = (head_bell - tail_bell) / w * across, -v / (w * w) * unit
+        by_u = (head_bell - tail_bell) / w * across
+        by_v = -v / (w * w) * unit
         rows[X, k] = -flux * (along_x * by_u - along_y * by_v)
         rows[Y, k] = -flux * (along_y * by_u + along_x * by_v)
         rows[FLUX, k] = unit

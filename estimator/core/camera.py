@@ -20,8 +20,14 @@ Distortion = tuple[float, float, float, float, float]
 
 # Horizontal fields of view that `Camera.from_fov` takes: a number of degrees is beyond WIDEST_RAD as radians, and a
 # number of radians is below NARROWEST_DEG as degrees.
-WIDEST_RAD, NARROWEST_DEG = 2.7, 1.6
-COLORS = (1, 2, 3, 4)  # channels of a color image, with transparency, or of one that is gray already
+WIDEST_RAD = 2.7
+NARROWEST_DEG = 1.6
+COLORS = (
+    1,
+    2,
+    3,
+    4,
+)  # channels of a color image, with transparency, or of one that is gray already
 
 
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
@@ -53,25 +59,42 @@ class Camera:
         if self._is_plain():
             return
         for name in ("width_px", "height_px"):
-            size = checks.number(f"camera: {name}", getattr(self, name), 1, 1e6, "whole, 1 to 1e6", True)
+            size = checks.number(
+                f"camera: {name}", getattr(self, name), 1, 1e6, "whole, 1 to 1e6", True
+            )
             object.__setattr__(self, name, size)
-        focal = checks.number("camera: focal_px", self.focal_px, 1e-9, 1e12, "finite, above 0: focal length over pixel")
+        focal = checks.number(
+            "camera: focal_px",
+            self.focal_px,
+            1e-9,
+            1e12,
+            "finite, above 0: focal length over pixel",
+        )
         object.__setattr__(self, "focal_px", focal)
-        sigma = checks.number("camera: focal_sigma", self.focal_sigma, 0.0, 0.5, "0 to 0.5, relative")
+        sigma = checks.number(
+            "camera: focal_sigma", self.focal_sigma, 0.0, 0.5, "0 to 0.5, relative"
+        )
         object.__setattr__(self, "focal_sigma", sigma)
-        row_time = checks.number("camera: row_time_s", self.row_time_s, -1.0, 1.0, "-1 to 1: seconds from row to row")
+        row_time = checks.number(
+            "camera: row_time_s", self.row_time_s, -1.0, 1.0, "-1 to 1: seconds from row to row"
+        )
         object.__setattr__(self, "row_time_s", row_time)
         # Plain floats: compiled code would be compiled again for a tuple of integers.
         for name, count in (("center_px", 2), ("distortion", 5)):
             array = checks.floats(f"camera: {name}", getattr(self, name), (count,))
             if not np.isfinite(array).all():
-                raise ImageError(f"camera: {name} is {array.tolist()}; allowed: {count} finite numbers")
+                raise ImageError(
+                    f"camera: {name} is {array.tolist()}; allowed: {count} finite numbers"
+                )
             object.__setattr__(self, name, tuple(array.tolist()))
 
     def _is_plain(self) -> bool:
         """Whether all numbers are possible ones of the declared types; a lens fit makes a hundred cameras."""
-        size, lens = (self.width_px, self.height_px), (self.center_px, self.distortion)
-        if not (type(lens[0]) is type(lens[1]) is tuple and len(lens[0]) == 2 and len(lens[1]) == 5):
+        size = (self.width_px, self.height_px)
+        lens = (self.center_px, self.distortion)
+        if not (
+            type(lens[0]) is type(lens[1]) is tuple and len(lens[0]) == 2 and len(lens[1]) == 5
+        ):
             return False
         numbers = (self.focal_px, self.focal_sigma, self.row_time_s, *lens[0], *lens[1])
         return (
@@ -85,7 +108,12 @@ class Camera:
 
     @classmethod
     def from_fov(
-        cls, width_px: int, height_px: int, fov_rad: float | None = None, *, fov_deg: float | None = None
+        cls,
+        width_px: int,
+        height_px: int,
+        fov_rad: float | None = None,
+        *,
+        fov_deg: float | None = None,
     ) -> Camera:
         """An undistorted camera from its horizontal field of view, in radians or in degrees.
 
@@ -98,7 +126,9 @@ class Camera:
         if fov_deg is None:
             fov_rad = checks.number("from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS)
             if not 0 < fov_rad <= WIDEST_RAD:
-                raise ImageError(f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}")
+                raise ImageError(
+                    f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}"
+                )
         else:
             fov_deg = checks.number("from_fov: fov_deg", fov_deg, -math.inf, math.inf, _FIELDS)
             if not NARROWEST_DEG <= fov_deg <= math.degrees(WIDEST_RAD):
@@ -134,7 +164,12 @@ class Camera:
 
     def tangents(self, xy_px: Floats) -> Floats:
         """Convert (N, 2) pixels to (N, 2) tangents (x / z, y / z) in camera axes, without distortion."""
-        return undistorted(checks.floats("xy_px", xy_px, (None, 2)), self.focal_px, *self.center_px, self.distortion)
+        return undistorted(
+            checks.floats("xy_px", xy_px, (None, 2)),
+            self.focal_px,
+            *self.center_px,
+            self.distortion,
+        )
 
     def pixels(self, vectors_cam: Floats) -> Floats:
         """Project (N, 3) vectors in camera axes to (N, 2) pixels.
@@ -150,7 +185,8 @@ class Camera:
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
         x, y = checks.floats("xy_px", xy_px, (None, 2)).T
-        low, right = margin_px - 0.5, self.width_px - 0.5 - margin_px
+        low = margin_px - 0.5
+        right = self.width_px - 0.5 - margin_px
         bottom = self.height_px - 0.5 - margin_px
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
 
@@ -169,7 +205,9 @@ class Camera:
             return np.inf
         # Solve for 1 / r^2: the leading coefficient is then 1, so no tiny coefficient is divided by.
         roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
-        largest_root = float(max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0))
+        largest_root = float(
+            max(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)], default=0.0)
+        )
         return 1 / largest_root if largest_root else np.inf
 
 
@@ -209,24 +247,34 @@ def undistorted(
     for n in range(len(out)):
         measured_x = (xy_px[n, 0] - center_x_px) / focal_px
         measured_y = (xy_px[n, 1] - center_y_px) / focal_px
-        x, y = measured_x, measured_y
+        x = measured_x
+        y = measured_y
         for _ in range(0 if no_distortion else 50):
             distorted_x, distorted_y = _distort(x, y, distortion)
-            x, y = x + measured_x - distorted_x, y + measured_y - distorted_y
+            x = x + measured_x - distorted_x
+            y = y + measured_y - distorted_y
             if max(abs(measured_x - distorted_x), abs(measured_y - distorted_y)) < 1e-15:
                 break
-        out[n, 0], out[n, 1] = x, y
+        out[n, 0] = x
+        out[n, 1] = y
     return out
 
 
 def check_frame(image: object, camera: Camera) -> None:
     """Raise ImageError unless the image is a monochrome array of the camera's width and height."""
     if not isinstance(image, np.ndarray):
-        reason = " (cv2.imread answers None for a file that it cannot read)" if image is None else ""
-        raise ImageError(f"the image is a {type(image).__name__}{reason}; allowed: a numpy array, (height, width)")
+        reason = (
+            " (cv2.imread answers None for a file that it cannot read)" if image is None else ""
+        )
+        raise ImageError(
+            f"the image is a {type(image).__name__}{reason}; allowed: a numpy array, (height, width)"
+        )
     if isinstance(image, np.ma.MaskedArray) and np.ma.is_masked(image):
-        raise ImageError("the image has masked pixels; allowed: image.filled(...), and the mask as Settings.bad_px")
-    shape, wanted = image.shape, (camera.height_px, camera.width_px)
+        raise ImageError(
+            "the image has masked pixels; allowed: image.filled(...), and the mask as Settings.bad_px"
+        )
+    shape = image.shape
+    wanted = (camera.height_px, camera.width_px)
     if shape == wanted:
         return
     if len(shape) == 3 and (shape[2] in COLORS or shape[0] in COLORS):
@@ -236,4 +284,6 @@ def check_frame(image: object, camera: Camera) -> None:
         )
     size = f"{shape[1]}x{shape[0]} pixels" if len(shape) == 2 else f"of shape {shape}"
     turned = "; transposed?" if shape == wanted[::-1] else ""
-    raise ImageError(f"the image is {size}{turned}; this camera's are {camera.width_px}x{camera.height_px}")
+    raise ImageError(
+        f"the image is {size}{turned}; this camera's are {camera.width_px}x{camera.height_px}"
+    )

@@ -30,7 +30,9 @@ def known(what: str, name: object, allowed: Iterable[str]) -> None:
         raise ImageError(f"{what}: {name!r} is unknown{guess}; allowed: {', '.join(names)}")
 
 
-def number(what: str, value: object, low: float, high: float, allowed: str, integer: bool = False) -> Any:
+def number(
+    what: str, value: object, low: float, high: float, allowed: str, integer: bool = False
+) -> Any:
     """A number as a plain float (or int) within [low, high]. Raises ImageError for anything else, NaN included."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
@@ -45,7 +47,9 @@ def of_type(what: str, value: object, *kinds: type) -> None:
     """Raise ImageError unless a value is of one of the types."""
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
-        raise ImageError(f"{what} is {excerpt(value)} of type {type(value).__name__}; allowed: {names}")
+        raise ImageError(
+            f"{what} is {excerpt(value)} of type {type(value).__name__}; allowed: {names}"
+        )
 
 
 def each_of_type(what: str, values: object, kind: type) -> None:
@@ -126,10 +130,14 @@ def row_numbers(what: str, value: object, below: int) -> NDArray[np.int64]:
     """(K,) whole numbers from 0 to below - 1, as int64. Raises ImageError otherwise."""
     array = np.asarray(value)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise ImageError(f"{what} has shape {array.shape} of {array.dtype}; allowed: (K,) whole numbers")
+        raise ImageError(
+            f"{what} has shape {array.shape} of {array.dtype}; allowed: (K,) whole numbers"
+        )
     good = (array >= 0) & (array < below)
     if not good.all():
-        raise ImageError(f"{what}: {array[first_bad(good)]} is no row of {below}; allowed: 0 to {below - 1}")
+        raise ImageError(
+            f"{what}: {array[first_bad(good)]} is no row of {below}; allowed: 0 to {below - 1}"
+        )
     return array.astype(np.int64, copy=False)
 
 
@@ -137,7 +145,9 @@ def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
     """Columns of rows that belong together, each as (name, rows, number of rows there are): see `row_numbers`."""
     arrays = [row_numbers(*column) for column in columns]
     if len({len(array) for array in arrays}) > 1:
-        lengths = ", ".join(f"{len(array)} of {name}" for (name, *_), array in zip(columns, arrays, strict=True))
+        lengths = ", ".join(
+            f"{len(array)} of {name}" for (name, *_), array in zip(columns, arrays, strict=True)
+        )
         raise ImageError(f"{lengths}; allowed: equal numbers of both")
     return arrays
 

@@ -8,4 +8,6 @@ class ImageError(ValueError):
 
     def __init__(self, message: object) -> None:
         line = " ".join(str(message).split())  # it may quote a file, and a file may hold anything
-        super().__init__("".join(character if character.isprintable() else "?" for character in line))
+        super().__init__(
+            "".join(character if character.isprintable() else "?" for character in line)
+        )

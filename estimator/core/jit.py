@@ -13,4 +13,6 @@ import numba
 # The GIL is released, so that threads of one process can search at once.
 # No wrapper for C callbacks is compiled, since no compiled function is passed as a value.
 # Division by zero gives inf or nan, as in NumPy; sums keep the order of the source unless a function sets fastmath.
-jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True, nogil=True)
+jit = partial(
+    numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True, nogil=True
+)

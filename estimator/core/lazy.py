@@ -16,7 +16,9 @@ def attach(
 
     def get(name: str) -> Any:
         if name not in module_of:
-            raise AttributeError(f"module {package} has no attribute {name}; public: {', '.join(sorted(module_of))}")
+            raise AttributeError(
+                f"module {package} has no attribute {name}; public: {', '.join(sorted(module_of))}"
+            )
         value = getattr(importlib.import_module(f"{package}.{module_of[name]}"), name)
         setattr(sys.modules[package], name, value)
         return value

@@ -17,14 +17,21 @@ from estimator.core.jit import jit
 
 # A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),
 # or below a thousandth of a pixel: convergence is quadratic where the model fits, so the next step is negligible.
-CONVERGED_CHI2, CONVERGED_PX = 1e-4, 1e-3
+CONVERGED_CHI2 = 1e-4
+CONVERGED_PX = 1e-3
 
 # Robust fit: step of the slopes' differences in units of the parameters' scale; limits of the damping and of the steps;
 # relative fall of the loss at which it has converged; diagonal for a parameter without effect.
-SLOPE_STEP, MIN_DAMPING, MAX_DAMPING, MAX_STEPS, CONVERGED_FALL, TINY = 1e-4, 1e-9, 1e6, 40, 1e-10, 1e-12
+SLOPE_STEP = 1e-4
+MIN_DAMPING = 1e-9
+MAX_DAMPING = 1e6
+MAX_STEPS = 40
+CONVERGED_FALL = 1e-10
+TINY = 1e-12
 
 # Prior of the factor of claimed variances: probability that it is 1, else from 1 to this, evenly in its logarithm.
-PRIOR_RIGHT, MAX_VARIANCE_FACTOR = 0.5, 100.0
+PRIOR_RIGHT = 0.5
+MAX_VARIANCE_FACTOR = 100.0
 FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
 
 
@@ -47,7 +54,8 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
 @jit
 def add_prior(normal: Floats, n: int, offset: float, sigma: float) -> None:
     """Add a Gaussian prior on parameter n: mean at `offset` from the current value, standard deviation sigma."""
-    last, weight = len(normal) - 1, 1 / sigma**2
+    last = len(normal) - 1
+    weight = 1 / sigma**2
     normal[n, n] += weight
     normal[last, n] += weight * offset
     normal[last, last] += weight * offset**2
@@ -116,7 +124,8 @@ def position_covariance(factor: Floats, column: Floats) -> tuple[float, float, f
     column[:] = 0.0
     column[0] = 1.0
     cholesky_solve(factor, column)
-    xx, xy = column[0], column[1]
+    xx = column[0]
+    xy = column[1]
     column[:] = 0.0
     column[1] = 1.0
     cholesky_solve(factor, column)
@@ -155,7 +164,10 @@ def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
 
 
 def fit_soft_l1(
-    residual: Callable[[Floats], Floats], start: Floats, scale: Floats, converged_fall: float = CONVERGED_FALL
+    residual: Callable[[Floats], Floats],
+    start: Floats,
+    scale: Floats,
+    converged_fall: float = CONVERGED_FALL,
 ) -> Floats:
     """Return the parameters that minimize sum(2 (sqrt(1 + r^2) - 1)), the soft L1 loss of residuals (N,).
 
@@ -165,12 +177,16 @@ def fit_soft_l1(
     scale : (P,) change of each parameter that changes the residuals by about as much as any other's
     converged_fall : the fit ends at a step that lowers the loss by no more than this fraction
     """
-    point, r = np.asarray(start, dtype=float), residual(start)
+    point = np.asarray(start, dtype=float)
+    r = residual(start)
     damping = 1e-4
     for _ in range(MAX_STEPS):
-        slopes = np.column_stack([(residual(point + step) - r) / SLOPE_STEP for step in np.diag(SLOPE_STEP * scale)])
+        slopes = np.column_stack(
+            [(residual(point + step) - r) / SLOPE_STEP for step in np.diag(SLOPE_STEP * scale)]
+        )
         weight = 1 / np.sqrt(1 + r**2)
-        normal, gradient = (weight[:, None] * slopes).T @ slopes, slopes.T @ (weight * r)
+        normal = (weight[:, None] * slopes).T @ slopes
+        gradient = slopes.T @ (weight * r)
         while damping < MAX_DAMPING:
             change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + TINY), -gradient)
             tried = residual(point + scale * change)
@@ -179,7 +195,9 @@ def fit_soft_l1(
             damping *= 10
         else:
             return point
-        point, fall, r = point + scale * change, soft_l1(r) - soft_l1(tried), tried
+        point = point + scale * change
+        fall = soft_l1(r) - soft_l1(tried)
+        r = tried
         damping = max(damping / 10, MIN_DAMPING)
         if fall <= converged_fall * soft_l1(r):
             return point

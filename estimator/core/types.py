@@ -34,7 +34,9 @@ class FramePriors:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
-        least = checks.number("saturation", self.saturation, -np.inf, np.inf, "a number; inf if unknown")
+        least = checks.number(
+            "saturation", self.saturation, -np.inf, np.inf, "a number; inf if unknown"
+        )
         object.__setattr__(self, "saturation", least)
         turn_rad = checks.number("turn_rad", self.turn_rad, -1e300, 1e300, "a finite number")
         object.__setattr__(self, "turn_rad", turn_rad)
@@ -122,7 +124,12 @@ class Blobs:
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
-OPTIONAL_SHAPES = {"covariance_px2": (2, 2), "streak_px": (2,), "streak_covariance_px2": (2, 2), "moments_px2": (3,)}
+OPTIONAL_SHAPES = {
+    "covariance_px2": (2, 2),
+    "streak_px": (2,),
+    "streak_covariance_px2": (2, 2),
+    "moments_px2": (3,),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,16 +160,22 @@ class Centroids:
         xy_px = checks.floats("centroids: xy_px", self.xy_px, (None, 2))
         object.__setattr__(self, "xy_px", xy_px)
         for name in ("sigma_px", "flux"):
-            object.__setattr__(self, name, checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)))
+            object.__setattr__(
+                self, name, checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),))
+            )
         for name, shape in OPTIONAL_SHAPES.items():
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, checks.floats(f"centroids: {name}", value, (len(xy_px), *shape)))
+                object.__setattr__(
+                    self, name, checks.floats(f"centroids: {name}", value, (len(xy_px), *shape))
+                )
 
     def check_values(self) -> None:
         """Raise ImageError unless positions are finite, sigmas in their range and fluxes above 0; in a microsecond."""
         spread = self.covariance_px2
-        row, fault = _first_fault(self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread)
+        row, fault = _first_fault(
+            self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread
+        )
         if fault:
             name, allowed = FAULTS[fault]
             value = np.asarray(getattr(self, name)[row]).tolist()
@@ -177,7 +190,12 @@ class Centroids:
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """Select centroids by mask or index."""
-        optional = (self.covariance_px2, self.streak_px, self.streak_covariance_px2, self.moments_px2)
+        optional = (
+            self.covariance_px2,
+            self.streak_px,
+            self.streak_covariance_px2,
+            self.moments_px2,
+        )
         taken = (None if array is None else array[which] for array in optional)
         return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
 
@@ -193,7 +211,9 @@ FAULTS = {  # by the number that `_first_fault` returns
 
 
 @jit
-def _first_fault(xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floats) -> tuple[int, int]:
+def _first_fault(
+    xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floats
+) -> tuple[int, int]:
     """Row and number of the first fault of centroids, as in FAULTS; (0, 0) without one."""
     for n in range(len(xy_px)):
         if not (abs(xy_px[n, 0]) < np.inf and abs(xy_px[n, 1]) < np.inf):
@@ -203,8 +223,16 @@ def _first_fault(xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floa
         if not 0 < flux[n] < np.inf:
             return n, 3
     for n in range(len(spread_px2)):
-        xx, xy, yx, yy = spread_px2[n, 0, 0], spread_px2[n, 0, 1], spread_px2[n, 1, 0], spread_px2[n, 1, 1]
-        if not (0 < xx < np.inf and 0 < yy < np.inf and xx * yy > xy * xy and abs(xy - yx) <= 1e-6 * abs(xy)):
+        xx = spread_px2[n, 0, 0]
+        xy = spread_px2[n, 0, 1]
+        yx = spread_px2[n, 1, 0]
+        yy = spread_px2[n, 1, 1]
+        if not (
+            0 < xx < np.inf
+            and 0 < yy < np.inf
+            and xx * yy > xy * xy
+            and abs(xy - yx) <= 1e-6 * abs(xy)
+        ):
             return n, 4
     return 0, 0
 

@@ -36,7 +36,9 @@ def rotate(matrix: Floats, u: Vector) -> Vector:
 @jit
 def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     """Write right-handed axes to the columns of out (3, 3): bisector of two unit vectors, their normal, third axis."""
-    out[0, 0], out[1, 0], out[2, 0] = u[0] + v[0], u[1] + v[1], u[2] + v[2]
+    out[0, 0] = u[0] + v[0]
+    out[1, 0] = u[1] + v[1]
+    out[2, 0] = u[2] + v[2]
     out[0, 1] = u[1] * v[2] - u[2] * v[1]
     out[1, 1] = u[2] * v[0] - u[0] * v[2]
     out[2, 1] = u[0] * v[1] - u[1] * v[0]
@@ -65,8 +67,12 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     remaining loss of orthogonality.
     """
     for c in range(3):
-        x, y, z = matrix[0, c], matrix[1, c], matrix[2, c]
-        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        x = matrix[0, c]
+        y = matrix[1, c]
+        z = matrix[2, c]
+        cx = w[1] * z - w[2] * y
+        cy = w[2] * x - w[0] * z
+        cz = w[0] * y - w[1] * x
         matrix[0, c] = x + cx + (w[1] * cz - w[2] * cy) / 2
         matrix[1, c] = y + cy + (w[2] * cx - w[0] * cz) / 2
         matrix[2, c] = z + cz + (w[0] * cy - w[1] * cx) / 2
@@ -74,14 +80,17 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
     for c in range(3):
         matrix[0, c] *= inverse
-    projection = matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
+    projection = (
+        matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
+    )
     for c in range(3):
         matrix[1, c] -= projection * matrix[0, c]
     inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
     for c in range(3):
         matrix[1, c] *= inverse
     for c in range(3):
-        n, m = (c + 1) % 3, (c + 2) % 3
+        n = (c + 1) % 3
+        m = (c + 2) % 3
         matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
 
 
@@ -97,9 +106,14 @@ def quaternion_xyzw(R: Floats) -> Floats:
     i = i if R[i, i] >= R[2, 2] else 2
     if trace >= R[i, i]:
         q[3] = 1 + trace
-        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        q[0] = R[2, 1] - R[1, 2]
+        q[1] = R[0, 2] - R[2, 0]
+        q[2] = R[1, 0] - R[0, 1]
     else:
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         q[i] = 1 + 2 * R[i, i] - trace
-        q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], R[k, j] - R[j, k]
+        q[j] = R[j, i] + R[i, j]
+        q[k] = R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
     return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)

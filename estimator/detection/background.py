@@ -25,7 +25,9 @@ INITIAL_SAMPLES = 33  # samples of the robust initial estimate; odd, as `_median
 CLIP_SIGMA = 3.0
 CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
 FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of floats
-FILTERED_NOISE = 0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
+FILTERED_NOISE = (
+    0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
+)
 
 
 def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
@@ -61,8 +63,10 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
 def filtered(image: NDArray, y: int, x: int) -> float:
     """The 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; the edge rows and columns are repeated."""
     height, width = image.shape
-    up, down = max(y - 1, 0), min(y + 1, height - 1)
-    left, right = max(x - 1, 0), min(x + 1, width - 1)
+    up = max(y - 1, 0)
+    down = min(y + 1, height - 1)
+    left = max(x - 1, 0)
+    right = min(x + 1, width - 1)
     total = 4.0 * image[y, x]
     total += 2.0 * (float(image[up, x]) + image[down, x] + image[y, left] + image[y, right])
     total += float(image[up, left]) + image[up, right] + image[down, left] + image[down, right]
@@ -77,8 +81,12 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
     either end), and the horizontal pass reads them.
     """
     height, width = image.shape
-    above, row, below = image[max(y - 1, 0)], image[y], image[min(y + 1, height - 1)]
-    left, middle, right = sums[:width], sums[1 : width + 1], sums[2:]
+    above = image[max(y - 1, 0)]
+    row = image[y]
+    below = image[min(y + 1, height - 1)]
+    left = sums[:width]
+    middle = sums[1 : width + 1]
+    right = sums[2:]
     for x in range(width):
         middle[x] = above[x] + 2 * row[x] + below[x]
     sums[0], sums[width + 1] = sums[1], sums[width]
@@ -90,37 +98,51 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
 def interpolate(grid: Floats, height: int, width: int, y: float, x: float) -> float:
     """Interpolate a tile grid bilinearly at a pixel; constant beyond the outermost tile centers."""
     rows, columns = grid.shape
-    v, u = (y + 0.5) * rows / height - 0.5, (x + 0.5) * columns / width - 0.5
+    v = (y + 0.5) * rows / height - 0.5
+    u = (x + 0.5) * columns / width - 0.5
     # Not max(): it would pass on a NaN position, whose cast is an index outside the grid.
-    v, u = min(v if v > 0 else 0.0, rows - 1.0), min(u if u > 0 else 0.0, columns - 1.0)
-    row, column = min(int(v), max(rows - 2, 0)), min(int(u), max(columns - 2, 0))
-    below, beside = min(row + 1, rows - 1), min(column + 1, columns - 1)
-    fv, fu = v - row, u - column
+    v = min(v if v > 0 else 0.0, rows - 1.0)
+    u = min(u if u > 0 else 0.0, columns - 1.0)
+    row = min(int(v), max(rows - 2, 0))
+    column = min(int(u), max(columns - 2, 0))
+    below = min(row + 1, rows - 1)
+    beside = min(column + 1, columns - 1)
+    fv = v - row
+    fu = u - column
     top = grid[row, column] * (1 - fu) + grid[row, beside] * fu
     bottom = grid[below, column] * (1 - fu) + grid[below, beside] * fu
     return top * (1 - fv) + bottom * fv
 
 
 @jit
-def _tiles(image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray) -> tuple[Floats, Floats]:
+def _tiles(
+    image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray
+) -> tuple[Floats, Floats]:
     """Compute level and noise of every tile from SAMPLE_ROWS of its rows.
 
     smooth, samples : buffers; their dtypes select the types of the computation
     """
     height, width = image.shape
-    rows, columns = max(height // tile_px, 1), max(width // tile_px, 1)
-    level, noise = np.empty((rows, columns)), np.empty((rows, columns))
+    rows = max(height // tile_px, 1)
+    columns = max(width // tile_px, 1)
+    level = np.empty((rows, columns))
+    noise = np.empty((rows, columns))
     longest = width // columns + 1
     values = np.empty((columns, SAMPLE_ROWS * longest), samples.dtype)
     sums = np.empty(width + 2, smooth.dtype)
     for row in range(rows):
-        y0, y1 = row * height // rows, (row + 1) * height // rows
+        y0 = row * height // rows
+        y1 = (row + 1) * height // rows
         for k in range(SAMPLE_ROWS):
             filtered_row(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth)
             for column in range(columns):
-                x0, x1 = column * width // columns, (column + 1) * width // columns
-                source, sampled = smooth[x0:x1], values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)]
-                for x in range(len(source)):  # a slice's assignment would take longer to compile than all the rest
+                x0 = column * width // columns
+                x1 = (column + 1) * width // columns
+                source = smooth[x0:x1]
+                sampled = values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)]
+                for x in range(
+                    len(source)
+                ):  # a slice's assignment would take longer to compile than all the rest
                     sampled[x] = source[x]
         for column in range(columns):
             size = (column + 1) * width // columns - column * width // columns
@@ -128,7 +150,8 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray) -> t
             middle, spread = _robust_estimate(tile_values, samples)
             for _ in range(2):
                 middle, spread = _clip(tile_values, middle, spread)
-            level[row, column], noise[row, column] = middle / 16, spread / 16
+            level[row, column] = middle / 16
+            noise[row, column] = spread / 16
     return level, noise
 
 
@@ -141,9 +164,13 @@ def median(values: Floats) -> float:
 @jit
 def _median_in_place(values: NDArray) -> float:
     """Median of (N,) values by Hoare's selection (C. A. R. Hoare, Comm. ACM 4, 321 (1961)), which reorders them."""
-    half, low, high = len(values) // 2, 0, len(values) - 1
+    half = len(values) // 2
+    low = 0
+    high = len(values) - 1
     while low < high:
-        pivot, i, j = values[half], low, high
+        pivot = values[half]
+        i = low
+        j = high
         while i <= j:
             while values[i] < pivot:
                 i += 1
@@ -151,8 +178,10 @@ def _median_in_place(values: NDArray) -> float:
                 j -= 1
             if i <= j:
                 values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        low, high = (i if j < half else low), (j if half < i else high)
+                i = i + 1
+                j = j - 1
+        low = i if j < half else low
+        high = j if half < i else high
     if len(values) % 2:
         return values[half]
     below = -np.inf
@@ -181,7 +210,8 @@ def _median_by_counting(values: NDArray) -> float:
     """
     half = len(values) // 2
     for value in values:
-        below, up_to = np.int32(0), np.int32(0)
+        below = np.int32(0)
+        up_to = np.int32(0)
         for k in range(len(values)):
             below += np.int32(values[k] < value)
             up_to += np.int32(values[k] <= value)
@@ -194,7 +224,9 @@ def _median_by_counting(values: NDArray) -> float:
 def _clip(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     """Mean and standard deviation of the values within 3 sigma; the latter is corrected for the truncated tails."""
     real = values.dtype.type
-    center, reach, one = real(middle), real(CLIP_SIGMA * spread), real(1)
+    center = real(middle)
+    reach = real(CLIP_SIGMA * spread)
+    one = real(1)
     count = total = squares = real(0)
     # Rejected values are added with weight 0 instead of skipped: without a branch the loop vectorizes.
     for i in range(len(values)):
@@ -206,4 +238,6 @@ def _clip(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     if count < 1:
         return middle, spread
     mean = float(total) / count
-    return float(center) + mean, np.sqrt(max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE)
+    return float(center) + mean, np.sqrt(
+        max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE
+    )

@@ -15,7 +15,9 @@ from estimator.core.jit import jit
 
 MIN_HEIGHT_PX = 7  # of letters; smaller ones are not read
 MIN_LETTERS = 5
-SAME_HEIGHT, SAME_PEAK = 0.2, 0.15  # greatest difference of their tops and base lines over the height; of brightness
+# greatest difference of their tops and base lines over the height; of brightness
+SAME_HEIGHT = 0.2
+SAME_PEAK = 0.15
 GAP = 1.5  # greatest gap of neighbors over the height: a space between words
 UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
 MARGIN = 0.5  # of the height: around a line of text
@@ -24,7 +26,8 @@ MARGIN = 0.5  # of the height: around a line of text
 @jit
 def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
     """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks."""
-    out, letter = np.zeros(len(boxes), np.bool_), np.zeros(len(boxes), np.bool_)
+    out = np.zeros(len(boxes), np.bool_)
+    letter = np.zeros(len(boxes), np.bool_)
     line = np.empty(4, np.int64)
     for n in range(len(boxes)):
         height = boxes[n, 3] - boxes[n, 1] + 1
@@ -39,22 +42,30 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
             continue
         margin = MARGIN * height
         for k in range(len(boxes)):
-            x, y = (boxes[k, 0] + boxes[k, 2]) / 2, (boxes[k, 1] + boxes[k, 3]) / 2
-            beside = line[0] - margin < x < line[2] + margin and line[1] - margin < y < line[3] + margin
+            x = (boxes[k, 0] + boxes[k, 2]) / 2
+            y = (boxes[k, 1] + boxes[k, 3]) / 2
+            beside = (
+                line[0] - margin < x < line[2] + margin and line[1] - margin < y < line[3] + margin
+            )
             out[k] |= letter[k] or (beside and boxes[k, 3] - boxes[k, 1] < 2 * height)
     return out
 
 
 @jit
-def _grow(boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints) -> tuple[int, int, int]:
+def _grow(
+    boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints
+) -> tuple[int, int, int]:
     """Extend a line from its first letter, in place; return the number of letters and their extreme widths.
 
     letter : (N,) whether a blob is a letter of it;  line : (4,) its box
     """
-    top, base = boxes[first, 1], boxes[first, 3]
-    height, count = base - top + 1, 1
+    top = boxes[first, 1]
+    base = boxes[first, 3]
+    height = base - top + 1
+    count = 1
     narrow = wide = boxes[first, 2] - boxes[first, 0] + 1
-    near_px, found = max(SAME_HEIGHT * height, 1.5), True
+    near_px = max(SAME_HEIGHT * height, 1.5)
+    found = True
     while found:
         found = False
         for m in range(len(boxes)):
@@ -64,10 +75,12 @@ def _grow(boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints) ->
                 continue
             if abs(peak[m] - peak[first]) > SAME_PEAK * abs(peak[first]):
                 continue
-            letter[m], found = True, True
+            letter[m] = True
+            found = True
             count += 1
             line[0], line[1] = min(line[0], boxes[m, 0]), min(line[1], boxes[m, 1])
             line[2], line[3] = max(line[2], boxes[m, 2]), max(line[3], boxes[m, 3])
             width = boxes[m, 2] - boxes[m, 0] + 1
-            narrow, wide = min(narrow, width), max(wide, width)
+            narrow = min(narrow, width)
+            wide = max(wide, width)
     return count, narrow, wide

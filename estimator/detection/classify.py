@@ -25,22 +25,31 @@ from estimator.detection.captions import find_captions
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 MIN_NEIGHBOR_RATIO = 0.25
-MAX_SIZE_FRACTION = 0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
+MAX_SIZE_FRACTION = (
+    0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
+)
 MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
 VOTES = 0.6  # share of them that must agree
 SAME_TURNED = 5  # least number of streaks that show a roll: two determine it
-SAME_STREAKS, MIN_BROKEN_PX = 3, 12.0  # where streaks break up: least number of whole ones, and their least length
+# where streaks break up: least number of whole ones, and their least length
+SAME_STREAKS = 3
+MIN_BROKEN_PX = 12.0
 # Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
 # noise or, of one blob, by a pair of stars or defocus.
-MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
+MIN_STREAK_PX = 2.0
+MIN_TRACK_PX = 6.0
 # Of a line from the shared one, relative to it: the streaks of one frame differ in length and direction by rotation and
 # distortion, and the ends of bright ones are seen farther out.
 SAME_LINE = 0.5
 # A faint track breaks into pieces: blobs of at least MIN_PIECE_PX on one straight line, within PIECE_OFF_PX of it and
 # within an angle whose double has the cosine PARALLEL (20 degrees). Three of them, or two with a whole track, are one.
-MIN_PIECE_PX, PIECE_OFF_PX, PARALLEL, MIN_PIECES, MAX_PIECES = 3.0, 1.5, 0.77, 3, 200
+MIN_PIECE_PX = 3.0
+PIECE_OFF_PX = 1.5
+PARALLEL = 0.77
+MIN_PIECES = 3
+MAX_PIECES = 200
 
 
 class Flag(IntFlag):
@@ -63,7 +72,9 @@ class Flag(IntFlag):
 
 
 NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE | Flag.TEXT
-SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (int(flag) for flag in Flag)  # plain integers for compiled code
+SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (
+    int(flag) for flag in Flag
+)  # plain integers for compiled code
 
 
 def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
@@ -76,12 +87,14 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
     text = find_captions(blobs.box_px, blobs.peak)
-    streak_px, turn_rad = priors.streak_px, priors.turn_rad
+    streak_px = priors.streak_px
+    turn_rad = priors.turn_rad
     if streak_px is None:
         # Columns of readout smear are no streaks: what crosses half the frame has no say.
         x0, y0, x1, y1 = blobs.box_px.T
         votes = ~text & (x1 - x0 < image.shape[1] / 2) & (y1 - y0 < image.shape[0] / 2)
-        lines, center = shape[votes, 3:], ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
+        lines = shape[votes, 3:]
+        center = ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
         x, y, turn_rad = _field(lines, blobs.xy_px[votes], center, _common_line(lines))
         if turn_rad != 0 or (hypot(x, y) > MIN_STREAK_PX and len(blobs) >= 3):
             streak_px = x, y
@@ -136,7 +149,8 @@ def _flags(
     step   : floor of the noise, from quantization
     """
     height, width = size
-    typical_noise, typical_width2 = max(median(noise), step), median(shape[:, 2])
+    typical_noise = max(median(noise), step)
+    typical_width2 = median(shape[:, 2])
     center = (width - 1) / 2, (height - 1) / 2
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
@@ -175,13 +189,19 @@ def _join_tracks(flag: Ints, shape: Floats, xy: Floats) -> None:
     count = 0
     for n in range(len(shape)):
         length2 = hypot(shape[n, 3], shape[n, 4])
-        if length2 > max(MIN_PIECE_PX**2, 12 * shape[n, 2]) and not flag[n] & (HOT | HUGE) and count < MAX_PIECES:
+        if (
+            length2 > max(MIN_PIECE_PX**2, 12 * shape[n, 2])
+            and not flag[n] & (HOT | HUGE)
+            and count < MAX_PIECES
+        ):
             piece[count] = n
             count += 1
     for i in range(count):
         for j in range(i):
-            a, b = piece[i], piece[j]
-            x, y = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+            a = piece[i]
+            b = piece[j]
+            x = xy[b, 0] - xy[a, 0]
+            y = xy[b, 1] - xy[a, 1]
             if not (_along(shape[a], x, y) and _along(shape[b], x, y)):
                 continue
             weight = 0
@@ -218,7 +238,8 @@ def _common_line(lines: Floats) -> tuple[float, float]:
     SAME_STREAKS like it and over 60 % that are parallel to it and no longer.
     """
     voting = lines[:VOTING_BLOBS]
-    x, y = median(voting[:, 0]), median(voting[:, 1])
+    x = median(voting[:, 0])
+    y = median(voting[:, 1])
     if _count_same(voting, x, y) > VOTES * len(voting):
         return x, y
     for k in range(len(voting)):
@@ -233,9 +254,11 @@ def _common_line(lines: Floats) -> tuple[float, float]:
 @jit
 def _count_pieces(lines: Floats, x: float, y: float) -> int:
     """Number of lines that are parallel to one and no longer."""
-    pieces, square = 0, hypot(x, y)
+    pieces = 0
+    square = hypot(x, y)
     for n in range(len(lines)):
-        along, across = lines[n, 0] * x + lines[n, 1] * y, lines[n, 1] * x - lines[n, 0] * y
+        along = lines[n, 0] * x + lines[n, 1] * y
+        across = lines[n, 1] * x - lines[n, 0] * y
         pieces += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
     return pieces
 
@@ -258,7 +281,8 @@ def _field(
     The turn is 0, and the streak that of the common line, unless a blob would be a track then, and another field, given
     by two of the blobs, agrees with more of them, and with no fewer than are pieces of a long line.
     """
-    count, tracks = min(len(lines), VOTING_BLOBS), 0
+    count = min(len(lines), VOTING_BLOBS)
+    tracks = 0
     dx, dy = _half_angle(line)
     best = dx, dy, 0.0
     for n in range(count):
@@ -277,7 +301,8 @@ def _field(
                 field = _field_of_two(xy[m], first, xy[n], second, center)
                 score, streaks = _agreement(lines, xy, center, field)
                 if score > best_score and streaks >= SAME_TURNED:
-                    best, best_score = field, score
+                    best = field
+                    best_score = score
     return best
 
 
@@ -290,10 +315,16 @@ def _field_of_two(
     center: tuple[float, float],
 ) -> tuple[float, float, float]:
     """Field of two streaks at two places by least squares: the turn from their difference, the rest from their mean."""
-    x, y = end[0] - start[0], end[1] - start[1]
+    x = end[0] - start[0]
+    y = end[1] - start[1]
     turn = ((second[1] - first[1]) * x - (second[0] - first[0]) * y) / max(x * x + y * y, 1.0)
-    mean_x, mean_y = (start[0] + end[0]) / 2 - center[0], (start[1] + end[1]) / 2 - center[1]
-    return (first[0] + second[0]) / 2 + turn * mean_y, (first[1] + second[1]) / 2 - turn * mean_x, turn
+    mean_x = (start[0] + end[0]) / 2 - center[0]
+    mean_y = (start[1] + end[1]) / 2 - center[1]
+    return (
+        (first[0] + second[0]) / 2 + turn * mean_y,
+        (first[1] + second[1]) / 2 - turn * mean_x,
+        turn,
+    )
 
 
 @jit
@@ -301,7 +332,9 @@ def _agreement(
     lines: Floats, xy: Floats, center: tuple[float, float], field: tuple[float, float, float]
 ) -> tuple[float, int]:
     """Return how many of the brightest blobs are like a field's streaks, with how like as a fraction, and streaks."""
-    score, streaks, count = 0.0, 0, min(len(lines), VOTING_BLOBS)
+    score = 0.0
+    streaks = 0
+    count = min(len(lines), VOTING_BLOBS)
     for n in range(count):
         x, y = _line_at(field, xy[n, 0] - center[0], xy[n, 1] - center[1])
         square = hypot(x, y)
@@ -327,7 +360,8 @@ def _double_angle(x: float, y: float) -> tuple[float, float]:
 @jit
 def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
     # L^2 (cos 2a, sin 2a) to (dx, dy).
-    length, angle = sqrt(hypot(line[0], line[1])), atan2(line[1], line[0]) / 2
+    length = sqrt(hypot(line[0], line[1]))
+    angle = atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
 
 
@@ -344,15 +378,22 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
     for n in range(len(boxes)):
         x0, y0, x1, y1 = boxes[n]
         total = x_sum = y_sum = xx = yy = xy = 0.0
-        peak_light, peak_x, peak_y = -np.inf, x0, y0
+        peak_light = -np.inf
+        peak_x = x0
+        peak_y = y0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 sky = interpolate(level, height, width, y, x)
                 light = image[y, x] - sky
                 if light > peak_light:
-                    peak_light, peak_x, peak_y = light, x, y
-                if light > 0 and filtered(image, y, x) - sky > 3 * interpolate(noise, height, width, y, x):
-                    dx, dy = x - x0, y - y0
+                    peak_light = light
+                    peak_x = x
+                    peak_y = y
+                if light > 0 and filtered(image, y, x) - sky > 3 * interpolate(
+                    noise, height, width, y, x
+                ):
+                    dx = x - x0
+                    dy = y - y0
                     total += light
                     x_sum += light * dx
                     y_sum += light * dy
@@ -361,13 +402,20 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
                     xy += light * dx * dy
         sky = interpolate(level, height, width, peak_y, peak_x)
         out[n, 0] = peak_light
-        for a, b in ((peak_x - 1, peak_y), (peak_x + 1, peak_y), (peak_x, peak_y - 1), (peak_x, peak_y + 1)):
+        for a, b in (
+            (peak_x - 1, peak_y),
+            (peak_x + 1, peak_y),
+            (peak_x, peak_y - 1),
+            (peak_x, peak_y + 1),
+        ):
             out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
         if total > 0:
-            xx, yy = xx / total - (x_sum / total) ** 2, yy / total - (y_sum / total) ** 2
+            xx = xx / total - (x_sum / total) ** 2
+            yy = yy / total - (y_sum / total) ** 2
             xy = xy / total - x_sum * y_sum / total**2
             # The variance across is the smaller eigenvalue of the matrix of second moments.
             eigenvalue_gap = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
             out[n, 2] = (xx + yy - eigenvalue_gap) / 2
-            out[n, 3], out[n, 4] = 12 * (xx - yy), 24 * xy
+            out[n, 3] = 12 * (xx - yy)
+            out[n, 4] = 24 * xy
     return out

@@ -26,7 +26,9 @@ FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there 
 # Columns of a blob's sums. STRONG: pixels above the higher threshold. TOP: largest filtered value above the sky.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
-CHUNK_PX = 64  # pixels that are tested together; only a chunk with a bright pixel is examined further
+CHUNK_PX = (
+    64  # pixels that are tested together; only a chunk with a bright pixel is examined further
+)
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 
@@ -38,11 +40,14 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
     """
     sum_type = accumulator_type(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
     if taps is None:
-        taps, ring_type = ONE_TAP, sum_type
+        taps = ONE_TAP
+        ring_type = sum_type
     else:
         ring_type = np.float64 if sum_type == np.float64 else np.int32
-    reach, width = int(np.abs(taps).max()), image.shape[1]
-    sums, ring = np.empty(width + 2, sum_type), np.empty((2 * reach + 1, width + 2 * reach), ring_type)
+    reach = int(np.abs(taps).max())
+    width = image.shape[1]
+    sums = np.empty(width + 2, sum_type)
+    ring = np.empty((2 * reach + 1, width + 2 * reach), ring_type)
     capacity = FIRST_RUNS
     while True:
         runs = np.empty((capacity, 3), np.int32)
@@ -53,20 +58,27 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
 
 
 @jit
-def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints32) -> int:
+def _scan(
+    image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: NDArray, runs: Ints32
+) -> int:
     """Fill `runs` and return the number of runs, which may exceed its capacity.
 
     ring : circular buffer of filtered rows, (2 reach + 1) of them, so that each row is filtered only once
     """
     height, width = image.shape
-    reach, scale = len(ring) // 2, 16.0 * len(taps)
+    reach = len(ring) // 2
+    scale = 16.0 * len(taps)
     padded = max(width, CHUNK_PX)  # a frame narrower than a chunk is padded with zeros
-    bounds, values = np.zeros(padded, ring.dtype), np.zeros(padded, ring.dtype)
-    bound, row = bounds[:width], values[:width]
+    bounds = np.zeros(padded, ring.dtype)
+    values = np.zeros(padded, ring.dtype)
+    bound = bounds[:width]
+    row = values[:width]
     mask = np.zeros(CHUNK_PX, np.uint8)
     words = mask.view(np.uint64)
     # Plain 0 and -1 would be literal types, for which numba compiles every called function once more.
-    count, cell, ready = np.int64(0), np.int64(-1), np.int64(0)
+    count = np.int64(0)
+    cell = np.int64(-1)
+    ready = np.int64(0)
     for y in range(height):
         cell = _lower_bounds(threshold, height, y, cell, scale, bound)
         if reach == 0:
@@ -79,9 +91,12 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
         for first in range(0, width, CHUNK_PX):
             # The last chunk overlaps the one before, to be of full length.
             start = max(min(first, width - CHUNK_PX), 0)
-            chunk, chunk_bounds = values[start : start + CHUNK_PX], bounds[start : start + CHUNK_PX]
+            chunk = values[start : start + CHUNK_PX]
+            chunk_bounds = bounds[start : start + CHUNK_PX]
             hit = False
-            for i in range(CHUNK_PX):  # constant length: the compiler unrolls it into vector instructions
+            for i in range(
+                CHUNK_PX
+            ):  # constant length: the compiler unrolls it into vector instructions
                 hit |= chunk[i] > chunk_bounds[i]
             if not hit:
                 continue
@@ -93,7 +108,11 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
                     continue
                 for i in range(8 * k, 8 * k + 8):
                     x = start + i
-                    if mask[i] and x >= first and row[x] > scale * interpolate(threshold, height, width, y, x):
+                    if (
+                        mask[i]
+                        and x >= first
+                        and row[x] > scale * interpolate(threshold, height, width, y, x)
+                    ):
                         count = _extend(runs, count, y, x)
     return int(count)
 
@@ -101,7 +120,8 @@ def _scan(image: NDArray, threshold: Floats, taps: Ints, sums: NDArray, ring: ND
 @jit
 def _sum_taps(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
     """Sum the filtered rows over the taps around row y; rows beyond the frame repeat its edge."""
-    reach, width = len(ring) // 2, len(out)
+    reach = len(ring) // 2
+    width = len(out)
     out[:] = 0
     for k in range(len(taps)):
         source = ring[min(max(y + taps[k, 1], 0), height - 1) % len(ring)]
@@ -115,7 +135,8 @@ def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray)
     """Write 16 times the filtered row to `out`, padded at both ends by repeating the end values."""
     inner = out[reach : len(out) - reach]
     filtered_row(image, y, sums, inner)
-    out[:reach], out[len(out) - reach :] = inner[0], inner[-1]
+    out[len(out) - reach :] = inner[-1]
+    out[:reach] = inner[0]
 
 
 @jit
@@ -125,12 +146,16 @@ def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
         runs[count - 1, 2] = x
         return count
     if count < len(runs):
-        runs[count, 0], runs[count, 1], runs[count, 2] = y, x, x
+        runs[count, 0] = y
+        runs[count, 1] = x
+        runs[count, 2] = x
     return count + 1
 
 
 @jit
-def _lower_bounds(threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray) -> int:
+def _lower_bounds(
+    threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray
+) -> int:
     """Fill `bound` with `scale` times the smallest threshold of each pixel's grid cell; return the row's cell row.
 
     A bilinear interpolation is never below the smallest of its four corners. If the row is in the same cell row as the
@@ -174,11 +199,13 @@ def label_runs(runs: Ints32) -> tuple[Ints32, int]:
     start = end = 0  # the runs of the row above
     k = 0
     while k < count:
-        y, first = runs[k, 0], k
+        y = runs[k, 0]
+        first = k
         while k < count and runs[k, 0] == y:
             k += 1
         if end > start and runs[start, 0] == y - 1:
-            i, j = start, first
+            i = start
+            j = first
             while i < end and j < k:
                 if runs[i, 1] <= runs[j, 2] + 1 and runs[j, 1] <= runs[i, 2] + 1:
                     _join(parent, i, j)
@@ -186,7 +213,8 @@ def label_runs(runs: Ints32) -> tuple[Ints32, int]:
                     i += 1
                 else:
                     j += 1
-        start, end = first, k
+        start = first
+        end = k
     blob = np.empty(count, np.int32)
     blobs = 0
     for n in range(count):  # a root precedes all other runs of its blob, so its number is known
@@ -210,7 +238,8 @@ def _find(parent: Ints32, n: int) -> int:
 
 @jit
 def _join(parent: Ints32, a: int, b: int) -> None:
-    a, b = _find(parent, a), _find(parent, b)
+    a = _find(parent, a)
+    b = _find(parent, b)
     if a != b:  # the earlier run becomes the root, as `label_runs` relies on
         parent[max(a, b)] = min(a, b)
 
@@ -222,12 +251,15 @@ def accumulate_blobs(
     """Return (blobs, 4) bounding boxes and (blobs, SUMS) sums over each blob's pixels, in the columns AREA .. TOP_Y."""
     height, width = image.shape
     boxes = np.empty((blobs, 4), np.int32)
-    boxes[:, :2], boxes[:, 2:] = max(height, width), -1
+    boxes[:, :2] = max(height, width)
+    boxes[:, 2:] = -1
     sums = np.zeros((blobs, SUMS))
-    sums[:, PEAK], sums[:, TOP] = -np.inf, -np.inf
+    sums[:, PEAK] = -np.inf
+    sums[:, TOP] = -np.inf
     for n in range(len(runs)):
         y, x0, x1 = runs[n]
-        box, total = boxes[blob[n]], sums[blob[n]]
+        box = boxes[blob[n]]
+        total = sums[blob[n]]
         box[0], box[1] = min(box[0], x0), min(box[1], y)
         box[2], box[3] = max(box[2], x1), max(box[3], y)
         total[AREA] += x1 - x0 + 1
@@ -240,7 +272,9 @@ def accumulate_blobs(
             total[Y] += light * y
             total[PEAK] = max(total[PEAK], float(image[y, x]))
             if smooth - sky > total[TOP]:
-                total[TOP], total[TOP_X], total[TOP_Y] = smooth - sky, x, y
+                total[TOP] = smooth - sky
+                total[TOP_X] = x
+                total[TOP_Y] = y
             if smooth > interpolate(strong, height, width, y, x):
                 total[STRONG] += 1
     return boxes, sums
@@ -260,39 +294,53 @@ def brightest_blobs(
     A blob is accepted if it has `min_strong_px` pixels above the higher threshold, or if its total is significant: at
     least `min_total_px` pixels in all, with a flux of at least `min_flux_per_root_px` sqrt(area).
     """
-    rows, count = np.empty(len(sums), np.int64), 0
+    rows = np.empty(len(sums), np.int64)
+    count = 0
     for n in range(len(sums)):
-        area, flux = sums[n, AREA], sums[n, FLUX]
+        area = sums[n, AREA]
+        flux = sums[n, FLUX]
         significant = area >= min_total_px and flux >= min_flux_per_root_px * sqrt(area)
         if flux > 0 and (sums[n, STRONG] >= min_strong_px or significant):
             rows[count] = n
             count += 1
-    rows, kept = _by_flux(sums, rows[:count]), min(count, max_blobs)
-    box, xy, flux = np.empty((kept, 4), np.int64), np.empty((kept, 2)), np.empty(kept)
-    peak, area_px = np.empty(kept), np.empty(kept, np.int64)
+    rows = _by_flux(sums, rows[:count])
+    kept = min(count, max_blobs)
+    box = np.empty((kept, 4), np.int64)
+    xy = np.empty((kept, 2))
+    flux = np.empty(kept)
+    peak = np.empty(kept)
+    area_px = np.empty(kept, np.int64)
     for k in range(kept):
         total = sums[rows[k]]
         for side in range(4):
             box[k, side] = boxes[rows[k], side]
-        xy[k, 0], xy[k, 1] = total[X] / total[FLUX], total[Y] / total[FLUX]
-        flux[k], peak[k], area_px[k] = total[FLUX], total[PEAK], int(total[AREA])
+        xy[k, 0] = total[X] / total[FLUX]
+        xy[k, 1] = total[Y] / total[FLUX]
+        flux[k] = total[FLUX]
+        peak[k] = total[PEAK]
+        area_px[k] = int(total[AREA])
     return box, xy, flux, peak, area_px, count
 
 
 @jit
 def _by_flux(sums: Floats, rows: Ints) -> Ints:
     """The (N,) rows in decreasing order of flux, in their own order where it is equal: a merge sort from the bottom."""
-    count, length = len(rows), 1
+    count = len(rows)
+    length = 1
     merged = np.empty(count, np.int64)
     while length < count:
         for start in range(0, count, 2 * length):
-            middle, end = min(start + length, count), min(start + 2 * length, count)
-            i, j = start, middle
+            middle = min(start + length, count)
+            end = min(start + 2 * length, count)
+            i = start
+            j = middle
             for k in range(start, end):
                 if i < middle and (j == end or sums[rows[i], FLUX] >= sums[rows[j], FLUX]):
-                    merged[k], i = rows[i], i + 1
+                    merged[k] = rows[i]
+                    i = i + 1
                 else:
-                    merged[k], j = rows[j], j + 1
+                    merged[k] = rows[j]
+                    j = j + 1
         rows, merged = merged, rows
         length *= 2
     return rows

@@ -18,7 +18,13 @@ from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import FILTERED_NOISE, estimate_background, median
-from estimator.detection.components import Ints32, accumulate_blobs, brightest_blobs, label_runs, runs_above
+from estimator.detection.components import (
+    Ints32,
+    accumulate_blobs,
+    brightest_blobs,
+    label_runs,
+    runs_above,
+)
 from estimator.detection.shefex import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
@@ -26,15 +32,23 @@ GROW_SIGMA = 3.5
 SPARE = 4  # blobs that are classified, per blob returned: hot pixels and tracks do not take the places of stars
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
-FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
+FEW_STARS = 8
+DIRECTIONS = 8
+SEARCH_LENGTH_PX = 10.0
 # Streaks that are followed: shorter ones are those of a turn about the field, and texture grows to any length.
-SHORTEST_PX, MAX_GROWN_PX = 2.0, 64
-LONGER, LENGTHENED = 1.5, 1.15  # length of the next filter, and growth of the streak that justifies it
+SHORTEST_PX = 2.0
+MAX_GROWN_PX = 64
+# length of the next filter, and growth of the streak that justifies it
+LONGER = 1.5
+LENGTHENED = 1.15
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
 MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
 MAX_TURN_PX = 4.0  # largest difference of streaks by a roll, at the corners, for which they are filtered along one
-MIN_STREAK_AREA_PX = 5  # noise averaged along a line is correlated: several pixels exceed the threshold
-THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
+MIN_STREAK_AREA_PX = (
+    5  # noise averaged along a line is correlated: several pixels exceed the threshold
+)
+THESIS_INTENSITY = 0.04
+THESIS_AREA_PX = 50
 
 # (image, threshold_sigma, min_area_px, max_blobs, priors): the image is (H, W) of any real dtype. Each raises
 # ImageError for an image that cannot be used (see `check_image`).
@@ -64,32 +78,51 @@ def default(
     """
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
-    return _stars_first(_classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors), max_blobs)
+    return _stars_first(
+        _classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors), max_blobs
+    )
 
 
-def _classified(image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors) -> Blobs:
+def _classified(
+    image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors
+) -> Blobs:
     """The brightest blobs with their flags, detected with the filter along the frame's streak if it is smeared."""
     background = estimate_background(image)
     # Where a roll makes the streaks differ by more at the corners, no filter along one of them is that of all.
     largest_turn_rad = MAX_TURN_PX / np.hypot(*image.shape) * 2
     known = priors.streak_px is not None and abs(priors.turn_rad) <= largest_turn_rad
     if not known or not 2 <= max(map(abs, priors.streak_px or ())) <= MAX_STREAK_PX:
-        blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
+        blobs = detect_blobs(
+            image,
+            background,
+            threshold_sigma * background.noise,
+            min_area_px,
+            max_blobs,
+            GROW_SIGMA,
+        )
         blobs = classify.classify(image, blobs, priors)
         if blobs.streak_px is None:
             # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
             stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
-            if priors.streak_px is not None or stars >= FEW_STARS or np.any(blobs.area_px >= LARGE_PX):
+            if (
+                priors.streak_px is not None
+                or stars >= FEW_STARS
+                or np.any(blobs.area_px >= LARGE_PX)
+            ):
                 return blobs
             faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
             if len(faint) <= stars + 1:
                 return blobs
-            return in_full_length(image, classify.classify(image, faint, priors), threshold_sigma, max_blobs, priors)
+            return in_full_length(
+                image, classify.classify(image, faint, priors), threshold_sigma, max_blobs, priors
+            )
         if abs(blobs.turn_rad) > largest_turn_rad or max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
         along = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
-        streaks = classify.classify(image, detect_streaks(image, background, threshold_sigma, max_blobs, along), along)
+        streaks = classify.classify(
+            image, detect_streaks(image, background, threshold_sigma, max_blobs, along), along
+        )
         return in_full_length(image, streaks, threshold_sigma, max_blobs, priors)
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
     return classify.classify(image, streaks, priors)
@@ -114,7 +147,9 @@ def local(
     """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     background = estimate_background(image)
-    return detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
+    return detect_blobs(
+        image, background, threshold_sigma * background.noise, min_area_px, max_blobs
+    )
 
 
 def components(
@@ -143,7 +178,8 @@ def thesis(
     `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
     """
     check_pixel_type(image)
-    pixel, image = image.dtype, prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    pixel = image.dtype
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
     full_scale = priors.saturation
     if not np.isfinite(full_scale):
@@ -155,7 +191,9 @@ def thesis(
     flat = flat_background(estimate_background(image), image.shape)
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.
-    return detect_blobs(image, flat, THESIS_INTENSITY * full_scale - flat.level, THESIS_AREA_PX, max_blobs)
+    return detect_blobs(
+        image, flat, THESIS_INTENSITY * full_scale - flat.level, THESIS_AREA_PX, max_blobs
+    )
 
 
 def sequential(
@@ -195,7 +233,9 @@ DETECTORS: dict[str, Detector] = {
 }
 
 
-def prepare_image(image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, max_blobs: int = 200) -> NDArray:
+def prepare_image(
+    image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, max_blobs: int = 200
+) -> NDArray:
     """Check a detector's image and parameters, and convert the image to a type that compiled code accepts."""
     number("detector: threshold_sigma", threshold_sigma, 1e-9, 1e9, "finite, above 0")
     number("detector: min_area_px", min_area_px, 1, 1e9, "whole, 1 or more", True)
@@ -213,7 +253,8 @@ def check_image(image: NDArray) -> None:
     some = image[::97, ::89]
     if image.dtype.kind != "f" and some.min() != some.max():
         return  # integers are finite, and the sample shows that the image is not constant
-    low, high = image.min(), image.max()
+    low = image.min()
+    high = image.max()
     if not (np.isfinite(low) and np.isfinite(high)):
         raise ImageError("the image holds NaN or infinite pixels; allowed: finite values")
     if low == high:
@@ -223,9 +264,13 @@ def check_image(image: NDArray) -> None:
 def check_pixel_type(image: object) -> None:
     """Raise ImageError unless the image is an array of real numbers."""
     if not isinstance(image, np.ndarray):
-        raise ImageError(f"the image is a {type(image).__name__}; allowed: a numpy array, (height, width)")
+        raise ImageError(
+            f"the image is a {type(image).__name__}; allowed: a numpy array, (height, width)"
+        )
     if image.dtype.kind not in "buif":
-        raise ImageError(f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats")
+        raise ImageError(
+            f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats"
+        )
 
 
 def to_native(image: NDArray) -> NDArray:
@@ -235,7 +280,8 @@ def to_native(image: NDArray) -> NDArray:
     Each further type, order of the axes or protection would cost its user half a minute of compilation. FITS files are
     big-endian, loops are native.
     """
-    kind, size = image.dtype.kind, image.itemsize
+    kind = image.dtype.kind
+    size = image.itemsize
     if kind in "bu" and size <= 2:
         return native("the image", image, np.uint16)
     limits = np.iinfo(np.int32)
@@ -258,7 +304,9 @@ def in_row_order(image: NDArray) -> NDArray:
 def check_size(image: NDArray) -> None:
     """Raise ImageError for an image too small to hold a star field."""
     if min(image.shape) < 16:
-        raise ImageError(f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more")
+        raise ImageError(
+            f"{image.shape[1]}x{image.shape[0]} pixels are too few; allowed: 16x16 and more"
+        )
 
 
 def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
@@ -289,7 +337,8 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
 
 def flat_background(background: Background, shape: tuple[int, ...]) -> Background:
     """Return one level and noise for the whole frame: the medians over the tiles."""
-    level, noise = median(background.level), median(background.noise)
+    level = median(background.level)
+    noise = median(background.noise)
     return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
 
 
@@ -317,12 +366,22 @@ def detect_blobs(
         return _to_blobs(boxes, sums, min_area_px, max_blobs, background)
     min_flux_per_root_px = (median(above) + median(background.noise)) / FILTERED_NOISE
     return _to_blobs(
-        boxes, sums, min_area_px, max_blobs, background, max(min_area_px, MIN_GROWN_PX), min_flux_per_root_px
+        boxes,
+        sums,
+        min_area_px,
+        max_blobs,
+        background,
+        max(min_area_px, MIN_GROWN_PX),
+        min_flux_per_root_px,
     )
 
 
 def detect_streaks(
-    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, priors: FramePriors
+    image: NDArray,
+    background: Background,
+    threshold_sigma: float,
+    max_blobs: int,
+    priors: FramePriors,
 ) -> Blobs:
     """Detect streaks of the priors' (dx, dy) in the filtered image, averaged along the streak.
 
@@ -334,18 +393,28 @@ def detect_streaks(
     taps = line_taps(priors.streak_px)
     above = threshold_sigma * noise_factor(taps) / FILTERED_NOISE * background.noise
     runs = runs_above(image, background.level + above, taps)
-    boxes, sums = accumulate_blobs(image, background.level, background.level + above, runs, *label_runs(runs))
-    blobs = _to_blobs(boxes, sums, MIN_STREAK_AREA_PX, max_blobs, background, MIN_STREAK_AREA_PX, 0.0)
+    boxes, sums = accumulate_blobs(
+        image, background.level, background.level + above, runs, *label_runs(runs)
+    )
+    blobs = _to_blobs(
+        boxes, sums, MIN_STREAK_AREA_PX, max_blobs, background, MIN_STREAK_AREA_PX, 0.0
+    )
     half = np.abs(priors.streak_px) / 2 + 1
     center_px = blobs.xy_px
     edge = np.array(image.shape[::-1]) - 1
-    box = np.concatenate([np.clip(center_px - half, 0, edge), np.clip(center_px + half, 0, edge)], axis=1)
+    box = np.concatenate(
+        [np.clip(center_px - half, 0, edge), np.clip(center_px + half, 0, edge)], axis=1
+    )
     blobs.box_px[:] = np.rint(box)
     return blobs
 
 
 def detect_faint_streaks(
-    image: NDArray, background: Background, threshold_sigma: float, max_blobs: int, priors: FramePriors
+    image: NDArray,
+    background: Background,
+    threshold_sigma: float,
+    max_blobs: int,
+    priors: FramePriors,
 ) -> Blobs:
     """Search for streaks without a prior: return the blobs of the line filter, out of DIRECTIONS, that finds most.
 
@@ -354,13 +423,20 @@ def detect_faint_streaks(
     """
     candidates = []
     for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-        streak_px = (SEARCH_LENGTH_PX * float(np.cos(angle)), SEARCH_LENGTH_PX * float(np.sin(angle)))
+        streak_px = (
+            SEARCH_LENGTH_PX * float(np.cos(angle)),
+            SEARCH_LENGTH_PX * float(np.sin(angle)),
+        )
         along = FramePriors(streak_px, priors.saturation)
-        candidates.append(detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along))
+        candidates.append(
+            detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along)
+        )
     return max(candidates, key=len)
 
 
-def in_full_length(image: NDArray, found: Blobs, threshold_sigma: float, max_blobs: int, priors: FramePriors) -> Blobs:
+def in_full_length(
+    image: NDArray, found: Blobs, threshold_sigma: float, max_blobs: int, priors: FramePriors
+) -> Blobs:
     """Streaks, detected with longer and longer filters as long as the streak that they share grows.
 
     Noise breaks a long faint streak into pieces with centers anywhere along it, so that a frame's first streak is too
@@ -382,7 +458,9 @@ def in_full_length(image: NDArray, found: Blobs, threshold_sigma: float, max_blo
     if found is first:
         return found
     along = FramePriors(found.streak_px, priors.saturation, found.turn_rad)
-    return classify.classify(image, detect_streaks(image, found.background, threshold_sigma, max_blobs, along), along)
+    return classify.classify(
+        image, detect_streaks(image, found.background, threshold_sigma, max_blobs, along), along
+    )
 
 
 def line_taps(streak_px: tuple[float, float]) -> Ints:
@@ -412,7 +490,8 @@ def _scan(
     """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     flat = flat_background(estimate_background(image), image.shape)
-    level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
+    level = float(flat.level[0, 0])
+    noise = float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
     return _to_blobs(boxes, sums, 0, max_blobs, flat)
 

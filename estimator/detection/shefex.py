@@ -28,15 +28,19 @@ def sequential_scan(
     height, width = image.shape
     assigned = np.zeros(image.shape, np.uint8)
     stack = np.empty((image.size, 2), np.int32)
-    boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
-    box, object_sums = np.empty(4, np.int64), np.empty(SUMS)
+    boxes = np.empty((table_size, 4), np.int64)
+    sums = np.zeros((table_size, SUMS))
+    box = np.empty(4, np.int64)
+    object_sums = np.empty(SUMS)
     count = 0
     for y in range(height):
         for x in range(width):
             if image[y, x] <= threshold or assigned[y, x]:
                 continue
             _flood_fill(image, level, threshold, y, x, assigned, stack, box, object_sums)
-            if object_sums[AREA] < min_area_px or (count == table_size and object_sums[FLUX] <= sums[count - 1, FLUX]):
+            if object_sums[AREA] < min_area_px or (
+                count == table_size and object_sums[FLUX] <= sums[count - 1, FLUX]
+            ):
                 continue
             count = _insert(boxes, sums, count, box, object_sums)
     return boxes[:count], sums[:count]
@@ -54,15 +58,21 @@ def maximum_scan(
     height, width = image.shape
     assigned = np.zeros(image.shape, np.uint8)
     stack = np.empty((image.size, 2), np.int32)
-    boxes, sums = np.empty((table_size, 4), np.int64), np.zeros((table_size, SUMS))
-    box, object_sums = np.empty(4, np.int64), np.empty(SUMS)
+    boxes = np.empty((table_size, 4), np.int64)
+    sums = np.zeros((table_size, SUMS))
+    box = np.empty(4, np.int64)
+    object_sums = np.empty(SUMS)
     count = 0
     while count < table_size:
-        top, top_y, top_x = threshold, -1, -1
+        top = threshold
+        top_y = -1
+        top_x = -1
         for y in range(height):
             for x in range(width):
                 if image[y, x] > top and not assigned[y, x]:
-                    top, top_y, top_x = float(image[y, x]), y, x
+                    top = float(image[y, x])
+                    top_y = y
+                    top_x = x
         if top_y < 0:
             break
         _flood_fill(image, level, threshold, top_y, top_x, assigned, stack, box, object_sums)
@@ -88,15 +98,20 @@ def _flood_fill(
     The paper's recursive centroiding as a flood fill with an explicit stack instead of recursion.
     """
     height, width = image.shape
-    box[0], box[1], box[2], box[3] = x, y, x, y
+    box[0] = x
+    box[1] = y
+    box[2] = x
+    box[3] = y
     object_sums[:] = 0.0
     object_sums[PEAK] = -np.inf
-    stack[0, 0], stack[0, 1] = y, x
+    stack[0, 0] = y
+    stack[0, 1] = x
     assigned[y, x] = 1
     depth = 1
     while depth:
         depth -= 1
-        v, u = stack[depth, 0], stack[depth, 1]
+        v = stack[depth, 0]
+        u = stack[depth, 1]
         light = image[v, u] - level
         object_sums[AREA] += 1
         object_sums[FLUX] += light
@@ -109,7 +124,8 @@ def _flood_fill(
             for a in range(max(u - 1, 0), min(u + 2, width)):
                 if image[b, a] > threshold and not assigned[b, a]:
                     assigned[b, a] = 1
-                    stack[depth, 0], stack[depth, 1] = b, a
+                    stack[depth, 0] = b
+                    stack[depth, 1] = a
                     depth += 1
 
 
@@ -118,7 +134,9 @@ def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, object_sums: Float
     """Insert an object into the table by intensity; return the number of objects it then holds."""
     k = min(count, len(sums) - 1)
     while k > 0 and sums[k - 1, FLUX] < object_sums[FLUX]:
-        sums[k], boxes[k] = sums[k - 1], boxes[k - 1]
+        sums[k] = sums[k - 1]
+        boxes[k] = boxes[k - 1]
         k -= 1
-    sums[k], boxes[k] = object_sums, box
+    sums[k] = object_sums
+    boxes[k] = box
     return min(count + 1, len(sums))

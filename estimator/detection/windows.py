@@ -20,7 +20,11 @@ GROW_SIGMA = 3.0
 
 
 def in_windows(
-    image: NDArray, center_px: Floats, half_px: float, threshold_sigma: float, priors: FramePriors = NO_PRIORS
+    image: NDArray,
+    center_px: Floats,
+    half_px: float,
+    threshold_sigma: float,
+    priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect the brightest blob of each window with a peak `threshold_sigma` above the local sky; brightest first.
 
@@ -31,12 +35,15 @@ def in_windows(
     image = prepare_image(image)
     # The background is a sparse sample of the frame; only the windows are read in full.
     background = estimate_background(image)
-    level, noise = background.level, background.noise
+    level = background.level
+    noise = background.noise
     rows = np.ascontiguousarray(center_px, dtype=float)
     boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
-    boxes, sums = boxes[:count], sums[:count]
+    boxes = boxes[:count]
+    sums = sums[:count]
     order = np.argsort(-sums[:, 1], kind="stable")
-    boxes, sums = boxes[order], sums[order]
+    boxes = boxes[order]
+    sums = sums[order]
     flux = sums[:, 1]
     blobs = Blobs(
         boxes,
@@ -52,16 +59,27 @@ def in_windows(
 
 @jit
 def _brightest(
-    image: NDArray, center_px: Floats, half_px: float, level: Floats, noise: Floats, threshold_sigma: float
+    image: NDArray,
+    center_px: Floats,
+    half_px: float,
+    level: Floats,
+    noise: Floats,
+    threshold_sigma: float,
 ) -> tuple[Ints, Floats, int]:
     """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs."""
     height, width = image.shape
-    darkest, least = level.min(), max(noise.min(), 1e-12)  # bounds of the interpolated sky: most pixels need no more
-    boxes, sums, count = np.empty((len(center_px), 4), np.int64), np.zeros((len(center_px), 5)), 0
+    # bounds of the interpolated sky: most pixels need no more
+    darkest = level.min()
+    least = max(noise.min(), 1e-12)
+    boxes = np.empty((len(center_px), 4), np.int64)
+    sums = np.zeros((len(center_px), 5))
+    count = 0
     for n in range(len(center_px)):
         x0, x1 = _span(center_px[n, 0], half_px, width)
         y0, y1 = _span(center_px[n, 1], half_px, height)
-        best, at_x, at_y = threshold_sigma, -1, -1
+        best = threshold_sigma
+        at_x = -1
+        at_y = -1
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 light = filtered(image, y, x)
@@ -70,7 +88,9 @@ def _brightest(
                 spread = max(interpolate(noise, height, width, y, x), 1e-12)
                 above = (light - interpolate(level, height, width, y, x)) / spread
                 if above > best:
-                    best, at_x, at_y = above, x, y
+                    best = above
+                    at_x = x
+                    at_y = y
         # A peak inside the box of an earlier blob is taken to be that blob.
         new = at_x >= 0
         for m in range(count):
@@ -85,18 +105,25 @@ def _brightest(
 @jit
 def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
     """Return first and last pixel of a window along an axis; (0, -1), an empty range, outside the frame and for NaN."""
-    low, high = middle_px - half_px, middle_px + half_px
+    low = middle_px - half_px
+    high = middle_px + half_px
     if not (high > -1 and low < size):
         return 0, -1
     return int(max(low, 0.0)), int(min(high, size - 1.0))
 
 
 @jit
-def _grow(image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray) -> None:
+def _grow(
+    image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray
+) -> None:
     """Sum the pixels connected to a peak by flood fill; stops at 4096 pixels."""
     height, width = image.shape
-    stack, visited = [(x, y)], {(x, y)}
-    box[0], box[1], box[2], box[3] = x, y, x, y
+    stack = [(x, y)]
+    visited = {(x, y)}
+    box[0] = x
+    box[1] = y
+    box[2] = x
+    box[3] = y
     total[:] = 0.0
     while len(stack) > 0 and len(visited) < 4096:
         px, py = stack.pop()

@@ -17,7 +17,9 @@ def not_negative(name: str, value: ArrayLike) -> NDArray:
     """Convert standard deviations to an array. Raises ValueError unless they are 0 or more, one or three."""
     array = np.asarray(value, dtype=float)
     if array.shape not in ((), (3,)) or not (array >= 0).all():
-        raise ValueError(f"{name} is {array.tolist()}; allowed: 0 or more, one number or one for each axis")
+        raise ValueError(
+            f"{name} is {array.tolist()}; allowed: 0 or more, one number or one for each axis"
+        )
     return array
 
 
@@ -35,16 +37,23 @@ def checked_samples(
     numbers, and intervals not above 0 and up to a tenth of the bias's time: the process noise is a series in the ratio
     of the two.
     """
-    ends_s, angle = np.asarray(t_s, float), np.asarray(angle_rad, float)
+    ends_s = np.asarray(t_s, float)
+    angle = np.asarray(angle_rad, float)
     absent = np.zeros(ends_s.shape) if missing is None else np.asarray(missing)
-    count, shapes = ends_s.size, [ends_s.shape, angle.shape, np.shape(saturated), absent.shape]
+    count = ends_s.size
+    shapes = [ends_s.shape, angle.shape, np.shape(saturated), absent.shape]
     if not count or shapes != [(count,), (count, 3), (count,), (count,)]:
-        raise ValueError(f"propagate: shapes {shapes}; allowed: (N,), (N, 3), (N,), (N,) with N of 1 or more")
-    samples, lost = np.empty((count, 5)), absent != 0
-    samples[:, 0], samples[:, 1:4] = ends_s, np.where(lost[:, None] & np.isnan(angle), 0.0, angle)
+        raise ValueError(
+            f"propagate: shapes {shapes}; allowed: (N,), (N, 3), (N,), (N,) with N of 1 or more"
+        )
+    samples = np.empty((count, 5))
+    lost = absent != 0
+    samples[:, 0] = ends_s
+    samples[:, 1:4] = np.where(lost[:, None] & np.isnan(angle), 0.0, angle)
     if not (np.isfinite(samples[:, :4]).all() and np.isfinite(np.asarray(saturated, float)).all()):
         raise ValueError("propagate: NaN or infinite times or angles; allowed: finite ones")
-    step_s, longest_s = np.diff(ends_s, prepend=start_s), 0.1 * gyro.bias_time_s
+    step_s = np.diff(ends_s, prepend=start_s)
+    longest_s = 0.1 * gyro.bias_time_s
     if not (step_s.min() > 0 and step_s.max() <= longest_s):
         bad = int(np.argmax(~((step_s > 0) & (step_s <= longest_s))))
         raise ValueError(
@@ -56,7 +65,9 @@ def checked_samples(
     return samples
 
 
-def checked_covariances(covariance_rad2: ArrayLike, systematic_rad2: ArrayLike | None) -> tuple[Floats, Floats]:
+def checked_covariances(
+    covariance_rad2: ArrayLike, systematic_rad2: ArrayLike | None
+) -> tuple[Floats, Floats]:
     """Return the covariance without its systematic part, and that part, (3, 3) each.
 
     Raises ValueError unless the first is symmetric and positive definite, and the second symmetric and without negative
@@ -64,8 +75,12 @@ def checked_covariances(covariance_rad2: ArrayLike, systematic_rad2: ArrayLike |
     """
     total = np.asarray(covariance_rad2, dtype=float)
     if not is_covariance(total):
-        raise ValueError(f"update: covariance_rad2 {total.tolist()}; allowed: (3, 3), symmetric, positive definite")
-    systematic = np.zeros((3, 3)) if systematic_rad2 is None else np.asarray(systematic_rad2, dtype=float)
+        raise ValueError(
+            f"update: covariance_rad2 {total.tolist()}; allowed: (3, 3), symmetric, positive definite"
+        )
+    systematic = (
+        np.zeros((3, 3)) if systematic_rad2 is None else np.asarray(systematic_rad2, dtype=float)
+    )
     if systematic_rad2 is not None and not (
         is_covariance(systematic, singular=True) and is_covariance(total - systematic)
     ):
@@ -83,5 +98,6 @@ def is_covariance(matrix: NDArray, singular: bool = False) -> bool:
     scale = max(np.trace(matrix), 0.0)
     least = np.linalg.eigvalsh(matrix)[0]
     return bool(
-        np.abs(matrix - matrix.T).max() <= 1e-9 * scale and (least > 0 or (singular and least >= -1e-9 * scale))
+        np.abs(matrix - matrix.T).max() <= 1e-9 * scale
+        and (least > 0 or (singular and least >= -1e-9 * scale))
     )

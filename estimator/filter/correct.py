@@ -57,7 +57,8 @@ def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
     after many solutions, so the expected residual is small; but if the slow error changed faster than
     assumed, the gate would refuse correct solutions.
     """
-    slow, offsets = layout.slices[of_head("systematic", solution.head)], offset_rows(solution, layout)
+    slow = layout.slices[of_head("systematic", solution.head)]
+    offsets = offset_rows(solution, layout)
     measured = Rotation.from_rotvec(offsets @ prior.values) * solution.body_from_ref
     residual = (prior.body_from_ref * measured.inv()).as_rotvec()
     inverse = np.linalg.inv(right_jacobian(residual))
@@ -66,7 +67,11 @@ def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
     noise = inverse @ solution.noise_rad2 @ inverse.T
     apart = H.copy()
     apart[:, slow] = 0.0
-    spread = apart @ prior.covariance @ apart.T + H[:, slow] @ prior.covariance[slow, slow] @ H[:, slow].T + noise
+    spread = (
+        apart @ prior.covariance @ apart.T
+        + H[:, slow] @ prior.covariance[slow, slow] @ H[:, slow].T
+        + noise
+    )
     return Innovation(residual, H, noise, float(residual @ np.linalg.solve(spread, residual)))
 
 
@@ -76,7 +81,8 @@ def correct(prior: State, found: Innovation, layout: Layout) -> State:
     The gain is Kalman's with the rows of the considered states set to 0: their values and their covariance stay, and
     their uncertainty is in the gain and in the covariance of the others through the correlations.
     """
-    H, noise = found.H, found.noise_rad2
+    H = found.H
+    noise = found.noise_rad2
     crossed = H @ prior.covariance
     gain = np.linalg.solve(crossed @ H.T + noise, crossed).T * layout.estimated[:, None]
     error = gain @ found.residual_rad
@@ -87,7 +93,8 @@ def correct(prior: State, found: Innovation, layout: Layout) -> State:
     jacobian = right_jacobian(error[:3])
     covariance[:3] = jacobian @ covariance[:3]
     covariance[:, :3] = covariance[:, :3] @ jacobian.T
-    wxyz, values = prior.ref_from_body_wxyz.copy(), prior.values + error
+    wxyz = prior.ref_from_body_wxyz.copy()
+    values = prior.values + error
     rotate_quaternion(wxyz, error[:3])
     values[:3] = 0.0
     return prior._replace(
@@ -102,7 +109,9 @@ def correct(prior: State, found: Innovation, layout: Layout) -> State:
     )
 
 
-def adopt(prior: State, solution: Solution, layout: Layout, bias_variance: Floats, support: int) -> State:
+def adopt(
+    prior: State, solution: Solution, layout: Layout, bias_variance: Floats, support: int
+) -> State:
     """The state that a solution alone gives: its attitude and covariance, and the filter's other states.
 
     The error is then -(do + v), correlated with the offset's. The variance of the bias is increased, as a wrong bias

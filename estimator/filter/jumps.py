@@ -57,10 +57,13 @@ def log_odds(jump: Jump, model: JumpModel) -> float:
     With the defaults, a jump of many sigma with a quiet gyro is adopted after some 35 solutions in 35 s; one during a
     saturation after CONFIRMATIONS; and an attitude that rests on one wrong solution is given up after 18 right ones.
     """
-    wrong, repeat = math.log(model.wrong_share), math.log(model.wrong_repeat)
+    wrong = math.log(model.wrong_share)
+    repeat = math.log(model.wrong_repeat)
     # 0 / 0 is no jump at all.
     missed = jump.lost_rad / (jump.lost_rad + jump.angle_rad) if jump.lost_rad > 0 else 0.0
-    unsupported = math.exp(wrong + (jump.support - 1) * repeat) if jump.support else model.wrong_start
+    unsupported = (
+        math.exp(wrong + (jump.support - 1) * repeat) if jump.support else model.wrong_start
+    )
     own = math.exp(-jump.distance / MODEL_DISTANCE)
     filter_wrong = model.missed_per_s * jump.since_s + missed + own + unsupported
     # All of them underflow for a supported filter that contradicts itself at one time.
@@ -79,5 +82,6 @@ def shock_rad(start_s: float, samples: Floats, arw_rad_sqrt_s: float) -> float:
     if len(step_s) < 3:
         return 0.0
     bend_rad_s = np.linalg.norm(np.diff(samples[:, 1:4] / step_s[:, None], n=2, axis=0), axis=1)
-    turn_rad, noise_rad = bend_rad_s * step_s[2:], arw_rad_sqrt_s * np.sqrt(step_s[2:])
+    turn_rad = bend_rad_s * step_s[2:]
+    noise_rad = arw_rad_sqrt_s * np.sqrt(step_s[2:])
     return float(turn_rad[turn_rad > SHOCK_SIGMA * noise_rad].max(initial=0.0))

@@ -156,11 +156,14 @@ class AttitudeFilter:
         checks.of_type("filter: gyro", gyro, GyroModel)
         checks.one_rotation("filter: body_from_ref", body_from_ref)
         t_s = checks.number("filter: t_s", t_s, -1e300, 1e300, "a finite time in seconds")
-        self._gyro, self._tracker, self._jumps = gyro, tracker or TrackerModel(), jumps or JumpModel()
+        self._gyro = gyro
+        self._tracker = tracker or TrackerModel()
+        self._jumps = jumps or JumpModel()
         self._floor_rad2 = not_negative("floor_rad", floor_rad) ** 2
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
         self._gate = float(chdtri(3, chdtrc(1, not_negative("gate_sigma", gate_sigma) ** 2)))
-        self._layout, self._heads = build_layout(gyro, self._tracker, considered, heads), heads
+        self._layout = build_layout(gyro, self._tracker, considered, heads)
+        self._heads = heads
         sigma_bias = not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)
         sigmas: dict[str, ArrayLike] = {
             "attitude": not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3),
@@ -172,14 +175,19 @@ class AttitudeFilter:
         }
         self._initial_bias_variance = sigma_bias**2
         self._current = start_state(float(t_s), wxyz_of(body_from_ref), sigmas, self._layout)
-        self._segments = [_Segment(self._current, np.empty((0, 5)), None)]  # rows of checked_samples
-        self._refused: list[tuple[State, Solution]] = []  # in a row, each agrees with the one before
+        self._segments = [
+            _Segment(self._current, np.empty((0, 5)), None)
+        ]  # rows of checked_samples
+        self._refused: list[
+            tuple[State, Solution]
+        ] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
     @property
     def state(self) -> FilterState:
         """Attitude, bias, the gyro's and the mount's errors, and their covariance after the last gyro sample."""
-        state, slices = self._current, self._layout.reported
+        state = self._current
+        slices = self._layout.reported
         size = max(rows.stop for rows in slices.values())
         return FilterState(
             state.t_s,
@@ -210,7 +218,11 @@ class AttitudeFilter:
         return inverse_response(self._current.values, self._layout.columns) @ rate
 
     def propagate(
-        self, t_s: ArrayLike, angle_rad: ArrayLike, saturated: ArrayLike, missing: ArrayLike | None = None
+        self,
+        t_s: ArrayLike,
+        angle_rad: ArrayLike,
+        saturated: ArrayLike,
+        missing: ArrayLike | None = None,
     ) -> None:
         """Propagate the state by gyro samples.
 
@@ -254,11 +266,15 @@ class AttitudeFilter:
             raise ValueError(f"update: head {head}; allowed: 0 to {self._heads - 1}")
         solution = self._solution(body_from_ref_measured, covariance_rad2, systematic_rad2, head)
         if not t_s <= now_s + ROUNDING_S:
-            raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
+            raise ValueError(
+                f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s"
+            )
         if t_s < self._segments[0].state.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
         # Find the segment that contains t_s, and propagate its state to that time.
-        k = next(k for k in reversed(range(len(self._segments))) if self._segments[k].state.t_s <= t_s)
+        k = next(
+            k for k in reversed(range(len(self._segments))) if self._segments[k].state.t_s <= t_s
+        )
         segment = self._segments[k]
         before, after = _split(segment.samples, segment.state.t_s, min(float(t_s), now_s))
         prior = self._prior(segment.state, before)
@@ -267,7 +283,10 @@ class AttitudeFilter:
         if found.distance2 <= self._gate:
             # Split the segment at the solution, then repeat the later solutions from the corrected state.
             corrected = correct(prior, found, self._layout)
-            self._segments[k : k + 1] = [segment._replace(samples=before), _Segment(corrected, after, solution)]
+            self._segments[k : k + 1] = [
+                segment._replace(samples=before),
+                _Segment(corrected, after, solution),
+            ]
             self._replay(k + 1)
         else:
             shock = shock_rad(segment.state.t_s, before, self._gyro.arw_rad_sqrt_s)
@@ -276,14 +295,20 @@ class AttitudeFilter:
                 return update
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
             rest = np.concatenate([after, *(later.samples for later in self._segments[k + 1 :])])
-            adopted = adopt(prior, solution, self._layout, self._initial_bias_variance, update.agreeing)
+            adopted = adopt(
+                prior, solution, self._layout, self._initial_bias_variance, update.agreeing
+            )
             self._segments = [_Segment(adopted, rest, None)]
         self._refused = []
         self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
         return update
 
     def _solution(
-        self, body_from_ref: Rotation, total_rad2: ArrayLike, systematic_rad2: ArrayLike | None, head: int
+        self,
+        body_from_ref: Rotation,
+        total_rad2: ArrayLike,
+        systematic_rad2: ArrayLike | None,
+        head: int,
     ) -> Solution:
         """The solution with the filter's floor and systematic error added to its covariances, after checks."""
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
@@ -296,8 +321,16 @@ class AttitudeFilter:
         if self._refused and not self._agrees(prior, solution):
             self._refused = []
         self._refused.append((prior, solution))
-        agreeing, angle_rad = len(self._refused), float(np.linalg.norm(update.residual_rad))
-        jump = Jump(angle_rad, update.distance, agreeing, prior.t_s - prior.used_s, prior.lost_rad, prior.support)
+        agreeing = len(self._refused)
+        angle_rad = float(np.linalg.norm(update.residual_rad))
+        jump = Jump(
+            angle_rad,
+            update.distance,
+            agreeing,
+            prior.t_s - prior.used_s,
+            prior.lost_rad,
+            prior.support,
+        )
         odds = log_odds(jump, self._jumps)
         status = OUTSIDE_GATE
         if agreeing >= CONFIRMATIONS:
@@ -308,18 +341,24 @@ class AttitudeFilter:
         """Whether a refused solution agrees with the one before, by the gyro alone: none was used in between."""
         state, earlier = self._refused[-1]
         later_from_earlier = prior.body_from_ref * state.body_from_ref.inv()
-        difference = (later_from_earlier * earlier.body_from_ref * solution.body_from_ref.inv()).as_rotvec()
+        difference = (
+            later_from_earlier * earlier.body_from_ref * solution.body_from_ref.inv()
+        ).as_rotvec()
         # Both covariances in the later body axes, plus what the gyro's noise and bias add in the gap.
-        gap_s, R = abs(prior.t_s - state.t_s), later_from_earlier.as_matrix()
+        gap_s = abs(prior.t_s - state.t_s)
+        R = later_from_earlier.as_matrix()
         covariance = R @ (earlier.noise_rad2 + earlier.systematic_rad2) @ R.T
         covariance += solution.noise_rad2 + solution.systematic_rad2
-        covariance += gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * prior.covariance[3:6, 3:6]
+        covariance += (
+            gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * prior.covariance[3:6, 3:6]
+        )
         return bool(difference @ np.linalg.solve(covariance, difference) <= self._gate)
 
     def _replay(self, k: int) -> None:
         """Apply again the solutions after segment k, from its new state; they have passed the gate already."""
         for j in range(k + 1, len(self._segments)):
-            earlier, segment = self._segments[j - 1], self._segments[j]
+            earlier = self._segments[j - 1]
+            segment = self._segments[j]
             assert segment.solution is not None
             prior = self._prior(earlier.state, earlier.samples)
             found = innovation(prior, segment.solution, self._layout)
@@ -354,7 +393,8 @@ def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]
     if k == len(samples) or begin_s == t_s:
         return samples[:k], samples[k:]
     fraction = (t_s - begin_s) / (samples[k, 0] - begin_s)
-    before, after = samples[: k + 1].copy(), samples[k:].copy()
+    before = samples[: k + 1].copy()
+    after = samples[k:].copy()
     before[-1, 0] = t_s
     before[-1, 1:4] *= fraction
     after[0, 1:4] *= 1 - fraction

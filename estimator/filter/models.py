@@ -95,7 +95,9 @@ class JumpModel:
     def __post_init__(self) -> None:
         for field in fields(self):
             if not 0 < getattr(self, field.name) < 1:
-                raise ValueError(f"jumps: {field.name} is {getattr(self, field.name)}; allowed: above 0, below 1")
+                raise ValueError(
+                    f"jumps: {field.name} is {getattr(self, field.name)}; allowed: above 0, below 1"
+                )
 
 
 def _check(model: GyroModel | TrackerModel, what: str, above_0: tuple[str, ...]) -> None:

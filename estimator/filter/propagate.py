@@ -16,7 +16,9 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 
 # The last column of a sample.
-MEASURED, SATURATED, MISSING = 0, 1, 2
+MEASURED = 0
+SATURATED = 1
+MISSING = 2
 
 
 @jit
@@ -39,10 +41,15 @@ def advance(
     """
     t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
     arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
-    wxyz, values, covariance = wxyz.copy(), values.copy(), covariance.copy()
+    wxyz = wxyz.copy()
+    values = values.copy()
+    covariance = covariance.copy()
     size = len(values)
-    rotation, rows, buffer = np.empty(3), np.zeros((3, size)), np.empty((3, size))
-    exponential, decay = np.empty((3, 6)), np.ones(size)
+    rotation = np.empty(3)
+    rows = np.zeros((3, size))
+    buffer = np.empty((3, size))
+    exponential = np.empty((3, 6))
+    decay = np.ones(size)
     for n in range(len(samples)):
         step_s = samples[n, 0] - t_s
         t_s = samples[n, 0]
@@ -58,7 +65,8 @@ def advance(
             values[i] *= decay[i]
         propagate_covariance(rows, decay, covariance, buffer)
         # While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
-        previous_rad, grown_rad = saturation_rad, unknown_rad(samples[n], outage_rad_s * step_s)
+        previous_rad = saturation_rad
+        grown_rad = unknown_rad(samples[n], outage_rad_s * step_s)
         saturation_rad = previous_rad + grown_rad if grown_rad > 0 else 0.0
         lost_rad += grown_rad
         # The variance gained by the bias in the interval, u^2 T to first order.
@@ -71,7 +79,9 @@ def advance(
 
 
 @jit
-def remove_errors(angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats) -> None:
+def remove_errors(
+    angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats
+) -> None:
     """Fill the rotation (3,) A (a - T b) of a measured angle a."""
     for i in range(3):
         out[i] = 0.0
@@ -88,7 +98,9 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
 
 
 @jit
-def add_noise(covariance: Floats, angle_variance: float, bias_variance: float, step_s: float) -> None:
+def add_noise(
+    covariance: Floats, angle_variance: float, bias_variance: float, step_s: float
+) -> None:
     """Add Farrenkopf's process noise of an interval to attitude and bias; `angle_variance` without the bias's part."""
     for i in range(3):
         covariance[i, i] += angle_variance + bias_variance * step_s**2 / 3
@@ -108,7 +120,9 @@ def inverse_response(values: Floats, columns: Ints) -> Floats:
 
 
 @jit
-def fill_rows(exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats) -> None:
+def fill_rows(
+    exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats
+) -> None:
     """Fill the attitude rows (3, N) of the transition matrix: exp(-[p]), -T J A, and -(J A)_i p_j for M_ij.
 
     exponential : (3, 6) of `transition` with an effective time of 1;  inverse : A = (I + M)^-1
@@ -152,11 +166,16 @@ def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer
 def transition(p: Floats, effective_s: float, out: Floats) -> None:
     """Fill the attitude rows of the transition matrix: out[:3] = [exp(-[p]), -effective_s J(p)], with [p] v = p x v."""
     square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-    if square < 1e-6:  # series, whose error in `out` is below 1e-16; the quotients would lose digits
-        sine, cosine, cubic = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
+    if (
+        square < 1e-6
+    ):  # series, whose error in `out` is below 1e-16; the quotients would lose digits
+        sine = 1 - square / 6
+        cosine = 0.5 - square / 24
+        cubic = 1 / 6 - square / 120
     else:
         angle = math.sqrt(square)
-        sine, cosine = math.sin(angle) / angle, (1 - math.cos(angle)) / square
+        sine = math.sin(angle) / angle
+        cosine = (1 - math.cos(angle)) / square
         cubic = (1 - sine) / square
     for i in range(3):
         for j in range(3):
@@ -172,13 +191,19 @@ def transition(p: Floats, effective_s: float, out: Floats) -> None:
 @jit
 def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     """Multiply the unit quaternion by that of a rotation vector in body axes (Hamilton product), in place."""
-    q, (x, y, z) = ref_from_body_wxyz, rotation_rad
+    q = ref_from_body_wxyz
+    (x, y, z) = rotation_rad
     half = math.sqrt(x * x + y * y + z * z) / 2
     scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
-    w, x, y, z = math.cos(half), scale * x, scale * y, scale * z
+    w = math.cos(half)
+    x = scale * x
+    y = scale * y
+    z = scale * z
     a, b, c, d = q
-    q[0], q[1] = a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y
-    q[2], q[3] = a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w
+    q[0] = a * w - b * x - c * y - d * z
+    q[1] = a * x + b * w + c * z - d * y
+    q[2] = a * y - b * z + c * w + d * x
+    q[3] = a * z + b * y - c * x + d * w
     norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     for i in range(4):
         q[i] /= norm

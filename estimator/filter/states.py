@@ -42,7 +42,9 @@ class Layout(NamedTuple):
     @property
     def reported(self) -> dict[str, slice]:
         """The slices without the normalized slow error, whose effect is in the covariance of the attitude."""
-        return {name: rows for name, rows in self.slices.items() if not name.startswith("systematic")}
+        return {
+            name: rows for name, rows in self.slices.items() if not name.startswith("systematic")
+        }
 
 
 class State(NamedTuple):
@@ -76,7 +78,9 @@ def of_head(name: str, head: int) -> str:
     return f"{name}_{head}" if head else name
 
 
-def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...], heads: int = 1) -> Layout:
+def build_layout(
+    gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...], heads: int = 1
+) -> Layout:
     """The states in use. Raises ValueError for a considered one that there is not."""
     unknown = sorted(set(considered) - set(STATES))
     if unknown:
@@ -90,8 +94,14 @@ def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, 
         **{of_head("systematic", head): 3 for head in range(heads)},
     }
     # The mount of the first head defines the attitude of the body, so the others can be estimated beside it.
-    fixed = {of_head(name, head) for name in considered for head in range(heads if name == "systematic" else 1)}
-    slices, size, estimated = {}, 0, []
+    fixed = {
+        of_head(name, head)
+        for name in considered
+        for head in range(heads if name == "systematic" else 1)
+    }
+    slices = {}
+    size = 0
+    estimated = []
     for name, count in counts.items():
         if count:
             slices[name] = slice(size, size + count)
@@ -115,7 +125,9 @@ def start_state(t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: 
     return State(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
 
 
-def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout) -> State:
+def propagate_state(
+    state: State, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout
+) -> State:
     """Propagate a state through gyro samples, rows as of `advance`."""
     if not len(samples):
         return state
@@ -126,7 +138,8 @@ def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: Tra
         1 / tracker.systematic_time_s,
         gyro.outage_rad_s,
     )
-    slow, inverse = layout.slow, inverse_response(state.values, layout.columns)
+    slow = layout.slow
+    inverse = inverse_response(state.values, layout.columns)
     wxyz, values, covariance, saturation_rad, lost_rad = advance(
         tuple(state[:6]), samples, noise, layout.columns, inverse, (slow.start, slow.stop)
     )

@@ -13,7 +13,9 @@ import numpy as np
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-ACCEPT_LOG10_CHANCE = -5.0  # log10 of the expected number of chance matches this good, over all hypotheses
+ACCEPT_LOG10_CHANCE = (
+    -5.0
+)  # log10 of the expected number of chance matches this good, over all hypotheses
 MIN_MATCHES = 4
 
 # Bayes factors
@@ -42,7 +44,9 @@ def log10_tail(trials: int, hits: int, p: float) -> float:
 @jit
 def counts_dex(matched: int, missing: int) -> float:
     """log10 B(matched + 1, missing + 1): likelihood of the counts under a uniform prior of detection probability."""
-    return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(10.0)
+    return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(
+        10.0
+    )
 
 
 @jit

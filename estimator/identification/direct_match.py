@@ -64,7 +64,9 @@ def match_field(
     if len(observed) < MIN_MATCHES:
         return no_match()
     R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
-    observed, star, expected = match_nearest(rays, index, stars[0], R_cam_from_ref, tolerance, stretch)
+    observed, star, expected = match_nearest(
+        rays, index, stars[0], R_cam_from_ref, tolerance, stretch
+    )
     if len(observed) < MIN_MATCHES:
         return no_match()
     chance = log10_chance(index.group[star], len(rays), expected) + np.log10(hypotheses)
@@ -87,7 +89,11 @@ def angle(u: Floats, v: Floats) -> float:
 @jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
     """Triple product u . (v x w); its sign is the handedness of a triangle of directions."""
-    return u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0])
+    return (
+        u[0] * (v[1] * w[2] - v[2] * w[1])
+        + u[1] * (v[2] * w[0] - v[0] * w[2])
+        + u[2] * (v[0] * w[1] - v[1] * w[0])
+    )
 
 
 @jit
@@ -98,7 +104,12 @@ def fit_rotation(cam: Floats, ref: Floats) -> Floats:
 
 @jit
 def match_nearest(
-    rays: Floats, index: PairIndex, center: int, R_cam_from_ref: Floats, tolerance: float, stretch: float
+    rays: Floats,
+    index: PairIndex,
+    center: int,
+    R_cam_from_ref: Floats,
+    tolerance: float,
+    stretch: float,
 ) -> tuple[NDArray, NDArray, float]:
     """Match each observed star to the nearest catalog star within its tolerance; each catalog star is used once.
 
@@ -106,10 +117,12 @@ def match_nearest(
     Returns the rows of the observed stars, the rows of the catalog, and the probability that a random direction has a
     catalog star within the mean tolerance.
     """
-    observed, star = np.empty(len(rays), np.int64), np.empty(len(rays), np.int64)
+    observed = np.empty(len(rays), np.int64)
+    star = np.empty(len(rays), np.int64)
     cap_sr = 2 * pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[center + 1] - index.first[center] + 1) / cap_sr
-    count, covered_sr = 0, 0.0
+    count = 0
+    covered_sr = 0.0
     for n in range(len(rays)):
         u, v, w = rays[n]
         x = R_cam_from_ref[0, 0] * u + R_cam_from_ref[1, 0] * v + R_cam_from_ref[2, 0] * w
@@ -122,7 +135,8 @@ def match_nearest(
         for m in range(count):
             is_used = is_used or star[m] == best
         if best >= 0 and not is_used:
-            observed[count], star[count] = n, best
+            observed[count] = n
+            star[count] = best
             count += 1
     return observed[:count], star[:count], 1 - np.exp(-covered_sr / len(rays))
 
@@ -137,7 +151,9 @@ def log10_chance(groups: NDArray, count: int, p: float) -> float:
     matches of a group are not independent: the second counts 1/10 (it fixes the orientation of the lattice), each
     further one 1/2 (lit or not). If every star is its own group, this is the binomial tail.
     """
-    independent, second, further = 0, 0, 0
+    independent = 0
+    second = 0
+    further = 0
     for n in range(len(groups)):
         earlier = 0
         for m in range(n):

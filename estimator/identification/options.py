@@ -48,12 +48,16 @@ class Options:
     def require_known_focal(self, name: str) -> None:
         """Raise ImageError if the focal length is uncertain: method `name` needs calibrated angles."""
         if self.focal_unknown:
-            raise ImageError(f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid")
+            raise ImageError(
+                f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid"
+            )
 
     def magnitudes(self, count: int) -> Floats:
         """(N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for an array of another shape."""
         if self.magnitude is None:
             return np.full(count, np.nan)
         if np.shape(self.magnitude) != (count,):
-            raise ImageError(f"magnitudes {np.shape(self.magnitude)} of {count} observed stars; allowed: one for each")
+            raise ImageError(
+                f"magnitudes {np.shape(self.magnitude)} of {count} observed stars; allowed: one for each"
+            )
         return np.ascontiguousarray(self.magnitude, dtype=float)

@@ -33,7 +33,9 @@ IDENTIFIERS: dict[str, Identifier] = {
 }
 
 STEP = 0.02  # of the focal length
-CALIBRATED, STRETCH = 5e-4, 0.011  # relative errors of the focal length: calibrated, half a step and what is over
+# relative errors of the focal length: calibrated, half a step and what is over
+CALIBRATED = 5e-4
+STRETCH = 0.011
 EFFORTS = (60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)  # triangles and checks, at most
 
 

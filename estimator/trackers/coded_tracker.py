@@ -29,10 +29,14 @@ from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma
 from estimator.trackers.star_tracker import NO_STARS
 
 COLLECTING = "codes: too few lights have been seen long enough"
-MISSED_FRAMES = 2  # successive frames without a light after which its track ends, if LEDs are never dark
+MISSED_FRAMES = (
+    2  # successive frames without a light after which its track ends, if LEDs are never dark
+)
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
 MIN_FREE_BITS = 8  # where the code's time is unknown
-PHASE_REACH = 25.0  # phases of the code's clock with a misfit above the best one's by more are left out
+PHASE_REACH = (
+    25.0  # phases of the code's clock with a misfit above the best one's by more are left out
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +58,9 @@ class DecoderSettings:
         checks.number("decoder: flux_sigma", self.flux_sigma, 1e-6, 1.0, "1e-6 to 1")
         checks.number("decoder: gate_px", self.gate_px, 1.0, 1e4, "1 to 10,000 pixels")
         if self.frames is not None:
-            checks.number("decoder: frames", self.frames, MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True)
+            checks.number(
+                "decoder: frames", self.frames, MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True
+            )
 
 
 class CodedTracker(DomeTracker):
@@ -77,10 +83,15 @@ class CodedTracker(DomeTracker):
         super().__init__(camera, leds, lever, settings)
         checks.of_type("code", code, LedCode)
         if len(code.levels) != len(leds.position_m):
-            raise ImageError(f"code: {len(code.levels)} words; allowed: {len(leds.position_m)}, one an LED")
+            raise ImageError(
+                f"code: {len(code.levels)} words; allowed: {len(leds.position_m)}, one an LED"
+            )
         if camera.row_time_s and code.bit_time_s is not None:
-            raise ImageError("code: the rows of a rolling shutter show different bits; allowed: bit_time_s None")
-        self.code, self.decoder = code, decoder or DecoderSettings()
+            raise ImageError(
+                "code: the rows of a rolling shutter show different bits; allowed: bit_time_s None"
+            )
+        self.code = code
+        self.decoder = decoder or DecoderSettings()
         radius_m = np.linalg.norm(leds.position_m, axis=1)
         pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
         position_m = np.asarray(leds.position_m, dtype=float)
@@ -97,7 +108,9 @@ class CodedTracker(DomeTracker):
         )
         self.templates = np.zeros((len(code.phases), len(code.levels), self.tracks.frames))
         self.spread = np.zeros_like(self.templates)
-        self.phases = np.ones(len(code.phases), bool)  # those of the code's clock that the lights have not excluded
+        self.phases = np.ones(
+            len(code.phases), bool
+        )  # those of the code's clock that the lights have not excluded
         self.last_s: float | None = None
         codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
 
@@ -114,7 +127,9 @@ class CodedTracker(DomeTracker):
 
         streak_px, rate, exposure_s : as for `DomeTracker.solve`; the rate also predicts the lights' motion
         """
-        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame)
+        solve = partial(
+            self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame
+        )
         return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
 
     def solve_centroids(
@@ -129,11 +144,17 @@ class CodedTracker(DomeTracker):
         """Track, name and solve centroids from any source; the other arguments as in `solve`."""
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
-        clock, exposure_s = clock or Clock(), exposure_s or 0.0
+        clock = clock or Clock()
+        exposure_s = exposure_s or 0.0
         self._advance(centroids, t_s, rate)
         middle_s = t_s or 0.0
-        templates, spread = self.code.templates(frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2)
-        self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = templates, spread
+        templates, spread = self.code.templates(
+            frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2
+        )
+        self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = (
+            templates,
+            spread,
+        )
         if not len(centroids):
             return Attitude(NO_STARS)
         return self._solve_identified(centroids, self._identify_codes(centroids), clock)
@@ -150,7 +171,9 @@ class CodedTracker(DomeTracker):
         turn = None
         if rate is not None and rate.sign_known:
             turn = Rotation.from_rotvec(-rate.rate_rad_s * elapsed_s)
-        relative = np.hypot(self.decoder.flux_sigma, 1 / np.sqrt(centroids.flux * self.settings.gain_e_dn))
+        relative = np.hypot(
+            self.decoder.flux_sigma, 1 / np.sqrt(centroids.flux * self.settings.gain_e_dn)
+        )
         self.tracks.advance(centroids, centroids.flux * relative, elapsed_s, turn)
 
     def _identify_codes(self, centroids: Centroids) -> StarMatch | str:
@@ -165,9 +188,11 @@ class CodedTracker(DomeTracker):
         # An error of the same size in all frames of a light: relative errors of its dim frames would invite noise.
         greatest = np.nanmax(tracks.sigma[usable], axis=1, keepdims=True)
         sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
-        misfit, lights = self._misfit(tracks.light[usable], sigma), len(usable)
+        misfit = self._misfit(tracks.light[usable], sigma)
+        lights = len(usable)
         plausible = misfit.min(axis=(0, 2)) <= codes.expected_misfit(measured[usable])
-        usable, misfit = usable[plausible], misfit[:, plausible]
+        usable = usable[plausible]
+        misfit = misfit[:, plausible]
         if len(usable) < 2:
             self.phases[:] = True
             return COLLECTING
@@ -186,12 +211,17 @@ class CodedTracker(DomeTracker):
 
         The next frame tries these phases and their neighbors.
         """
-        tried, leds = np.flatnonzero(self.phases), len(self.code.levels)
-        templates, spread = (one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread))
+        tried = np.flatnonzero(self.phases)
+        leds = len(self.code.levels)
+        templates, spread = (
+            one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread)
+        )
         flat = np.full((len(light), len(templates)), np.inf)
         for one, row, error in zip(flat, light, sigma, strict=True):
             likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
-            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[0]
+            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[
+                0
+            ]
         each = flat.reshape(-1, len(tried), leds)
         common = each.min(axis=2).sum(axis=0)
         allowed = common <= common.min() + PHASE_REACH
@@ -202,8 +232,11 @@ class CodedTracker(DomeTracker):
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """(K, 3) rays of centroids and (K,) errors of their tangents, of the LED map and the lever too."""
-        rays, focal_px = self.camera.rays(centroids.xy_px), self.camera.focal_px
-        own = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), MIN_ERROR_PX / focal_px)
+        rays = self.camera.rays(centroids.xy_px)
+        focal_px = self.camera.focal_px
+        own = np.hypot(
+            direction_sigma_rad(centroids, self.camera, self.settings), MIN_ERROR_PX / focal_px
+        )
         tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
         lever = self.lever.sigma_m / self.sphere.radius_m.min() * tangent
         leds = float(self.led_sigma_rad.max())

@@ -46,7 +46,9 @@ MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of sur
 FOCAL_UNCERTAINTY = 0.12  # greatest relative error of a focal length that is not calibrated
 FOCAL_CHECKS = 10_000_000  # effort of its search: a second at most
 MAX_FOCAL_SIGMA = 0.5  # of a `Camera`
-FITS_FOCAL = ("non_dimensional",)  # identifiers after which the focal length is fitted with the attitude
+FITS_FOCAL = (
+    "non_dimensional",
+)  # identifiers after which the focal length is fitted with the attitude
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats, Floats | None], StarMatch | str]
 
@@ -76,14 +78,17 @@ def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settin
     )
 
 
-def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+def star_identifier(
+    name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings
+) -> Identify:
     """A star identifier applied to directions from the bearing, where the rays meet one sphere of the median radius.
 
     On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of
     the radii and the lever.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
-    median_radius_m, pupil_m = float(np.median(radius)), lever.cam_from_body.apply(lever.camera_body_m)
+    median_radius_m = float(np.median(radius))
+    pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
     points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
@@ -121,7 +126,8 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
     Equal errors of all LEDs are divided by the least distance of any. Otherwise the rms across the line from the
     bearing is divided by the LED's own distance less the lever.
     """
-    radius_m, lever_m = np.linalg.norm(leds.position_m, axis=1), float(np.linalg.norm(lever.camera_body_m))
+    radius_m = np.linalg.norm(leds.position_m, axis=1)
+    lever_m = float(np.linalg.norm(lever.camera_body_m))
     if leds.covariance_m2 is None:
         return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))
     along = leds.position_m / radius_m[:, None]
@@ -132,7 +138,9 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
 
 def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
     """(N,) standard deviation of rays' tangents by the error of the focal length, rms of both axes."""
-    return np.asarray(camera.focal_sigma * np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1) / np.sqrt(2))
+    return np.asarray(
+        camera.focal_sigma * np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1) / np.sqrt(2)
+    )
 
 
 class DomeTracker:
@@ -153,10 +161,15 @@ class DomeTracker:
         check_algorithms(settings, IDENTIFIERS, SOLVERS)
         check_map(leds)
         check_lever(leds, lever)
-        self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
+        self.camera = camera
+        self.leds = leds
+        self.lever = lever
+        self.settings = settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
-        self.focal_fitted = False  # whether the camera's focal length is one that this frame's lights gave
+        self.focal_fitted = (
+            False  # whether the camera's focal length is one that this frame's lights gave
+        )
 
     def solve(
         self,
@@ -184,7 +197,10 @@ class DomeTracker:
         for toward_m in self.leds.position_m[:: max(len(self.leds.position_m) // 40, 1)]:
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
             xy_px = project(
-                self.lever.cam_from_body.inv() * cam_from_lab, self.leds.position_m, self.lever, self.camera
+                self.lever.cam_from_body.inv() * cam_from_lab,
+                self.leds.position_m,
+                self.lever,
+                self.camera,
             )
             fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
         xy_px = max(fields, key=len)
@@ -209,18 +225,23 @@ class DomeTracker:
         if self.camera.row_time_s:
             solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(self._solve_global(centroids, clock, exposure_s), centroids, exposure_s, rate, lights)
+        return with_streak_rate(
+            self._solve_global(centroids, clock, exposure_s), centroids, exposure_s, rate, lights
+        )
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
         """K centroids with their total errors: the LEDs' places and the focal length too."""
         rays = self.camera.rays(centroids.xy_px)
         pixel_rad = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings), focal_error_rad(rays, self.camera)
+            direction_sigma_rad(centroids, self.camera, self.settings),
+            focal_error_rad(rays, self.camera),
         )
         sigma_px = self.camera.focal_px * np.hypot(pixel_rad, self.led_sigma_rad[star])
         return replace(centroids, sigma_px=sigma_px, covariance_px2=None)
 
-    def _solve_global(self, centroids: Centroids, clock: Clock, exposure_s: float | None) -> Attitude:
+    def _solve_global(
+        self, centroids: Centroids, clock: Clock, exposure_s: float | None
+    ) -> Attitude:
         """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
         rays = self.camera.rays(bright.xy_px)
@@ -230,7 +251,9 @@ class DomeTracker:
         match = self.identify(rays, sigma_rad, bright.flux / exposure_s if exposure_s else None)
         return self._solve_identified(centroids, match, clock)
 
-    def _solve_identified(self, centroids: Centroids, match: StarMatch | str, clock: Clock) -> Attitude:
+    def _solve_identified(
+        self, centroids: Centroids, match: StarMatch | str, clock: Clock
+    ) -> Attitude:
         """The attitude of a match, or without one for the reason of a refusal."""
         clock.lap("identify")
         if isinstance(match, str):
@@ -248,7 +271,8 @@ class DomeTracker:
         """
         if self.settings.identifier not in FITS_FOCAL:
             return self._solve_calibrated(centroids, match)
-        tracker, attitude = self, Attitude(NO_MATCH)
+        tracker = self
+        attitude = Attitude(NO_MATCH)
         for _ in range(2):
             try:
                 tracker = tracker._with_fitted_focal(centroids, match)
@@ -262,19 +286,27 @@ class DomeTracker:
 
     def _with_fitted_focal(self, centroids: Centroids, match: StarMatch) -> DomeTracker:
         """This tracker with the focal length that fits the matches, and its error by centroids and map."""
-        observed, star = match.observed, match.star
+        observed = match.observed
+        star = match.star
         rays = self.camera.rays(centroids.xy_px[observed])
         pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
         sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
-        ratio = fit_focal_ratio(rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab)
+        ratio = fit_focal_ratio(
+            rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab
+        )
         fitted = copy(self)
-        fitted.camera, fitted.focal_fitted = self.camera.zoomed(ratio), True
+        fitted.camera = self.camera.zoomed(ratio)
+        fitted.focal_fitted = True
         view, common_rad = fitted._common_rad(match.cam_from_ref, star)
         view = systematic.with_focal(view)
-        variance = systematic.from_independent(view, sigma_rad, systematic.isotropic(sigma_rad))[3, 3]
+        variance = systematic.from_independent(view, sigma_rad, systematic.isotropic(sigma_rad))[
+            3, 3
+        ]
         variance += systematic.from_common(view, sigma_rad, common_rad)[3, 3]
-        fitted.camera = replace(fitted.camera, focal_sigma=min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA))
+        fitted.camera = replace(
+            fitted.camera, focal_sigma=min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA)
+        )
         return fitted
 
     def _focal_rad(self, rays: Floats) -> Floats:
@@ -287,31 +319,47 @@ class DomeTracker:
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
         compared on the same matches.
         """
-        observed, star = match.observed, match.star
+        observed = match.observed
+        star = match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
-        pixel_rad = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays))
-        radius_px = max(4.0, 4 * self.camera.focal_px * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))))
+        pixel_rad = np.hypot(
+            direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays)
+        )
+        radius_px = max(
+            4.0,
+            4
+            * self.camera.focal_px
+            * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))),
+        )
         try:
             for factor in (3.0, 1.0):
                 sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
-                body_from_lab, _ = self._solve("rotation_only", rays, sigma_rad, observed, star, body_from_lab)
+                body_from_lab, _ = self._solve(
+                    "rotation_only", rays, sigma_rad, observed, star, body_from_lab
+                )
                 observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
             sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
-            observed, star, misfit = self._reject_blends(centroids, sigma_rad, observed, star, body_from_lab)
+            observed, star, misfit = self._reject_blends(
+                centroids, sigma_rad, observed, star, body_from_lab
+            )
             solver = self.settings.solver
             sigma_rad = self._sigma_rad(solver, pixel_rad, rays, observed, star)
-            body_from_lab, covariance = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
+            body_from_lab, covariance = self._solve(
+                solver, rays, sigma_rad, observed, star, body_from_lab
+            )
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
         cam_from_lab = self.lever.cam_from_body * body_from_lab
         R_cam_from_body = self.lever.cam_from_body.as_matrix()
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         covariance = R_cam_from_body @ covariance @ R_cam_from_body.T
-        covariance, shared = self._with_survey(covariance, misfit, cam_from_lab, rays[observed], sigma_rad, star)
+        covariance, shared = self._with_survey(
+            covariance, misfit, cam_from_lab, rays[observed], sigma_rad, star
+        )
         lever_covariance = self._lever_covariance(cam_from_lab, star)
         return Attitude(
             "solved",
@@ -323,9 +371,13 @@ class DomeTracker:
             shared + lever_covariance,
         )
 
-    def _sigma_rad(self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray) -> Floats:
+    def _sigma_rad(
+        self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray
+    ) -> Floats:
         """(K,) standard deviation of a solver's residuals for K matches, from the centroids and the LED positions."""
-        return np.hypot(fitted_sigma_rad(solver, rays[observed], pixel_rad[observed]), self.led_sigma_rad[star])
+        return np.hypot(
+            fitted_sigma_rad(solver, rays[observed], pixel_rad[observed]), self.led_sigma_rad[star]
+        )
 
     def _with_survey(
         self,
@@ -342,27 +394,40 @@ class DomeTracker:
         misfit     : factor of `_reject_blends` on all but the common errors
         sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
         """
-        led_rad, focal_rad = self.led_sigma_rad[star], self._focal_rad(rays)
-        if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
+        led_rad = self.led_sigma_rad[star]
+        focal_rad = self._focal_rad(rays)
+        if (
+            self.leds.covariance_m2 is None
+            and self.leds.common_m is None
+            and not self.camera.focal_sigma
+        ):
             # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
-            return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
+            return misfit * covariance, float(
+                np.mean(led_rad**2 / sigma_rad**2)
+            ) * misfit * covariance
         view, common_rad = self._common_rad(cam_from_lab, star)
         own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
-        noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
+        noise_rad2 = systematic.isotropic(
+            np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0))
+        )
         errors = misfit * noise_rad2, misfit * own_rad2, common_rad
         return systematic.with_survey(covariance, view, sigma_rad, *errors, self.focal_fitted)
 
-    def _common_rad(self, cam_from_lab: Rotation, star: NDArray) -> tuple[systematic.Geometry, Floats]:
+    def _common_rad(
+        self, cam_from_lab: Rotation, star: NDArray
+    ) -> tuple[systematic.Geometry, Floats]:
         """K LEDs as the camera sees them, and the (M, K, 2) change of their tangents by the errors that all share.
 
         Each is changed by one standard deviation: of the focal length first, unless it is fitted, then of the map's
         common errors.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
-        view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
+        view = systematic.geometry(
+            place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        )
         common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
@@ -370,7 +435,9 @@ class DomeTracker:
             common_rad = np.concatenate([common_rad, moved])
         return view, common_rad
 
-    def _residual_px(self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation) -> Floats:
+    def _residual_px(
+        self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
+    ) -> Floats:
         """(K, 2) predicted minus observed pixels."""
         predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
         return predicted - centroids.xy_px[observed]
@@ -397,9 +464,12 @@ class DomeTracker:
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
         dof = 2 * int(inlier.sum()) - (4 if self.focal_fitted else 3)
-        mean, spread = float(dof), np.sqrt(2 * dof)
+        mean = float(dof)
+        spread = np.sqrt(2 * dof)
         if self.leds.common_m is not None or self.camera.focal_sigma:
-            view, common_rad = self._common_rad(self.lever.cam_from_body * body_from_lab, star[inlier])
+            view, common_rad = self._common_rad(
+                self.lever.cam_from_body * body_from_lab, star[inlier]
+            )
             fit = systematic.with_focal(view) if self.focal_fitted else view
             left = systematic.residual_products(fit, sigma_rad[inlier], common_rad)
             # The focal length's error is in the sigmas too, as if it were independent.
@@ -407,7 +477,9 @@ class DomeTracker:
             focal_rad = focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
             noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
             mean = noise * dof + float(np.trace(left))
-            spread = np.sqrt(2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left))
+            spread = np.sqrt(
+                2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left)
+            )
         chi2 = float(np.sum(length[inlier] ** 2))
         return observed[inlier], star[inlier], chi2 / mean if chi2 > mean + 3 * spread else 1.0
 
@@ -432,9 +504,13 @@ class DomeTracker:
     ) -> tuple[Rotation, Floats]:
         """body_from_lab and its covariance in body axes, from the matched rays."""
         position_m = self.leds.position_m[star]
-        return SOLVERS[solver](rays[observed], sigma_rad, position_m, self.leds, self.lever, body_from_lab)
+        return SOLVERS[solver](
+            rays[observed], sigma_rad, position_m, self.leds, self.lever, body_from_lab
+        )
 
-    def _nearest(self, centroids: Centroids, body_from_lab: Rotation, radius_px: float) -> tuple[NDArray, NDArray]:
+    def _nearest(
+        self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
+    ) -> tuple[NDArray, NDArray]:
         """Mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         # An LED whose center is just off the chip may still have light on it.

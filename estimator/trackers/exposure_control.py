@@ -26,7 +26,8 @@ from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
 
 # The camera's own range and increment (table 1).
-CAMERA_SHORTEST_S, CAMERA_LONGEST_S = 10e-6, 10.0
+CAMERA_SHORTEST_S = 10e-6
+CAMERA_LONGEST_S = 10.0
 INCREMENT_S = 1e-6
 
 
@@ -53,16 +54,22 @@ class Control:
 
     def __post_init__(self) -> None:
         for name in ("mean_dn", "shortest_s", "longest_s", "step_s"):
-            checks.of_type(f"exposure: {name}", getattr(self, name), float, int, np.floating, np.integer)
+            checks.of_type(
+                f"exposure: {name}", getattr(self, name), float, int, np.floating, np.integer
+            )
         for name in ("min_stars", "overexposed_objects", "saturated_px"):
-            checks.number(f"exposure: {name}", getattr(self, name), 0, 1e9, "whole, 0 or more", True)
+            checks.number(
+                f"exposure: {name}", getattr(self, name), 0, 1e9, "whole, 0 or more", True
+            )
         if not CAMERA_SHORTEST_S <= self.shortest_s <= self.longest_s <= CAMERA_LONGEST_S:
             raise ValueError(
                 f"exposure: limits of {self.shortest_s:g} s and {self.longest_s:g} s; allowed: "
                 f"{CAMERA_SHORTEST_S:g} s to {CAMERA_LONGEST_S:g} s, the shortest first"
             )
         if not INCREMENT_S <= self.step_s < math.inf:
-            raise ValueError(f"exposure: step_s is {self.step_s}; allowed: {INCREMENT_S:g} s or more")
+            raise ValueError(
+                f"exposure: step_s is {self.step_s}; allowed: {INCREMENT_S:g} s or more"
+            )
         if math.isnan(self.mean_dn):
             raise ValueError("exposure: mean_dn is NaN; allowed: a mean, inf for none")
 
@@ -92,7 +99,10 @@ class Exposure:
 
 def step(state: Exposure, observation: Observation, control: Control) -> Exposure:
     """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
-    saturated = observation.mean_dn > control.mean_dn or observation.overexposed >= control.overexposed_objects
+    saturated = (
+        observation.mean_dn > control.mean_dn
+        or observation.overexposed >= control.overexposed_objects
+    )
     no_stars = observation.stars < control.min_stars
     direction = -1 if saturated else int(no_stars)
     target_s = INCREMENT_S * round((state.time_s + direction * control.step_s) / INCREMENT_S)
@@ -111,8 +121,12 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     checks.of_type("exposure: control", control, Control)
     check_pixel_type(image)
     if image.ndim != 2:
-        raise ImageError(f"exposure: an image of shape {image.shape}; allowed: monochrome, (height, width)")
-    saturation_dn = checks.number("exposure: saturation_dn", saturation_dn, -math.inf, math.inf, "a number")
+        raise ImageError(
+            f"exposure: an image of shape {image.shape}; allowed: monochrome, (height, width)"
+        )
+    saturation_dn = checks.number(
+        "exposure: saturation_dn", saturation_dn, -math.inf, math.inf, "a number"
+    )
     boxes = checks.native("exposure: box_px", box_px, np.int64)
     if boxes.size % 4:
         raise ImageError(f"exposure: box_px has shape {boxes.shape}; allowed: (N, 4)")
@@ -120,7 +134,9 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     height, width = image.shape
     x0, y0, x1, y1 = boxes.T
     if not ((x0 >= 0) & (y0 >= 0) & (x1 < width) & (y1 < height)).all():
-        raise ImageError(f"exposure: an object's box reaches beyond the image of {width}x{height} pixels")
+        raise ImageError(
+            f"exposure: an object's box reaches beyond the image of {width}x{height} pixels"
+        )
     mean, overexposed = _measure(to_native(image), boxes, saturation_dn, control.saturated_px)
     return Observation(mean, len(boxes), overexposed)
 

@@ -33,7 +33,9 @@ SATURATED = "the frame is saturated"
 # with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
 MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
-BAD_PIXEL_SIGMA_PX = 0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
+BAD_PIXEL_SIGMA_PX = (
+    0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
+)
 
 
 class Allowed(NamedTuple):
@@ -45,7 +47,8 @@ class Allowed(NamedTuple):
     whole: bool = False
 
 
-TINY, GREATEST = 1e-300, 1e300
+TINY = 1e-300
+GREATEST = 1e300
 POSITIVE = Allowed(TINY, GREATEST, "finite, above 0")
 NOT_NEGATIVE = Allowed(0.0, GREATEST, "finite, 0 or more")
 COUNT = Allowed(1, 1e9, "whole, 1 or more", True)
@@ -113,10 +116,14 @@ class Settings:
     def __post_init__(self) -> None:
         for name, allowed in ALLOWED.items():
             value = getattr(self, name)
-            value = checks.number(f"settings: {name}", value, allowed.low, allowed.high, allowed.words, allowed.whole)
+            value = checks.number(
+                f"settings: {name}", value, allowed.low, allowed.high, allowed.words, allowed.whole
+            )
             object.__setattr__(self, name, value)  # a plain float or int, which compiled code knows
         if self.zero_point_mag is not None:
-            zero = checks.number("settings: zero_point_mag", self.zero_point_mag, -100, 100, "-100 to 100, or None")
+            zero = checks.number(
+                "settings: zero_point_mag", self.zero_point_mag, -100, 100, "-100 to 100, or None"
+            )
             object.__setattr__(self, "zero_point_mag", zero)
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
@@ -126,7 +133,9 @@ class Settings:
                 )
 
 
-def check_algorithms(settings: Settings, identifiers: Iterable[str], solvers: Iterable[str]) -> None:
+def check_algorithms(
+    settings: Settings, identifiers: Iterable[str], solvers: Iterable[str]
+) -> None:
     """Raise ImageError unless each stage's algorithm is there; identifiers and solvers are those of the tracker."""
     checks.of_type("settings", settings, Settings)
     stages: dict[str, Iterable[str]] = {
@@ -175,7 +184,8 @@ def detect_and_centroid(
     Raises ImageError for a frame of another shape than the camera's, or a saturated one.
     """
     check_frame(image, camera)
-    image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
+    image = in_row_order(image)
+    streak_px = checks.pixel_step("streak_px", streak_px)
     if np.isfinite(settings.saturation):
         sample = image[::37]  # every 37th row is enough to estimate the saturated fraction
         if np.count_nonzero(sample >= settings.saturation) > 0.5 * sample.size:
@@ -207,14 +217,18 @@ def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) 
     extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
     if settings.bad_px is not None and len(blobs):
         bad_px = np.asarray(settings.bad_px)[:, None]
-        inside = np.all((bad_px >= blobs.box_px[:, :2] - 1) & (bad_px <= blobs.box_px[:, 2:] + 1), axis=2)
+        inside = np.all(
+            (bad_px >= blobs.box_px[:, :2] - 1) & (bad_px <= blobs.box_px[:, 2:] + 1), axis=2
+        )
         extra = np.where(inside.any(axis=0), np.hypot(extra, BAD_PIXEL_SIGMA_PX), extra)
     if not extra.any():
         return centroids
     covariance_px2 = centroids.covariance_px2
     if covariance_px2 is not None:
         covariance_px2 = covariance_px2 + (extra**2)[:, None, None] * np.eye(2)
-    return replace(centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=covariance_px2)
+    return replace(
+        centroids, sigma_px=np.hypot(centroids.sigma_px, extra), covariance_px2=covariance_px2
+    )
 
 
 def process_frame(
@@ -230,9 +244,11 @@ def process_frame(
 
     Without streak_px, a rate of known sign and the exposure time give the streak.
     """
-    clock, turn_rad = Clock(), 0.0
+    clock = Clock()
+    turn_rad = 0.0
     if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
-        streak_px, turn_rad = center_streak_px(camera, rate, exposure_s), -float(rate.rate_rad_s[2]) * exposure_s
+        streak_px = center_streak_px(camera, rate, exposure_s)
+        turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
     centroids = detect_and_centroid(image, camera, settings, clock, streak_px, turn_rad)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 

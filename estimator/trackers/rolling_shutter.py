@@ -27,7 +27,9 @@ from estimator.core.types import Attitude, Centroids, RateEstimate
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
 SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
 SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
-PRIOR_FACTOR = 4.0  # of slow rates, in the fit: streaks that differ over the field are not seen either
+PRIOR_FACTOR = (
+    4.0  # of slow rates, in the fit: streaks that differ over the field are not seen either
+)
 SAME_FOCAL = 2e-3  # relative difference of focal lengths that a rate not yet fitted causes
 ROUNDS = 5  # of the fit: the lights change with the rate
 
@@ -68,7 +70,9 @@ def solve_rolling(
     """
     best: Attitude | None = None
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
-        attitude = _solve_with(camera, lights, centroids, solve_global, (candidate, prior), exposure_s)
+        attitude = _solve_with(
+            camera, lights, centroids, solve_global, (candidate, prior), exposure_s
+        )
         if attitude.solved and (best is None or _chance(attitude) < _chance(best)):
             best = attitude
         if best is not None and candidate.sign_known:
@@ -93,9 +97,12 @@ def _solve_with(
     """Attitude and rate from one candidate of the rate with its prior."""
     candidate = start[0]
     attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
-    fitted, matched = candidate, np.empty((2, 0), int)
+    fitted = candidate
+    matched = np.empty((2, 0), int)
     for _ in range(ROUNDS):
-        if attitude.match is None or np.array_equal((attitude.match.observed, attitude.match.star), matched):
+        if attitude.match is None or np.array_equal(
+            (attitude.match.observed, attitude.match.star), matched
+        ):
             break
         matched = np.stack([attitude.match.observed, attitude.match.star])
         try:
@@ -103,12 +110,18 @@ def _solve_with(
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
         exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
-        attitude = solve_global(at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids)))
+        attitude = solve_global(
+            at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids))
+        )
     return _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
 
 
 def candidates(
-    camera: Camera, sight: Sight, centroids: Centroids, rate: RateEstimate | None, exposure_s: float | None
+    camera: Camera,
+    sight: Sight,
+    centroids: Centroids,
+    rate: RateEstimate | None,
+    exposure_s: float | None,
 ) -> Iterator[tuple[RateEstimate, RateEstimate]]:
     """Rates with which a frame is identified, and the prior with which attitude and rate are then fitted.
 
@@ -126,13 +139,22 @@ def candidates(
     if streaks:
         yield from ((streak, anything) for streak in streaks)
         return
-    slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
+    slow_rad_s = (
+        SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
+    )
     shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
     # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.
     sigma = slow_rad_s * np.array([1.0, 1.0, 2 * camera.focal_px / camera.height_px])
-    slow, prior = (RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR))
+    slow, prior = (
+        RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR)
+    )
     if shear_px > SMALL_SHEAR_PX:
-        yield replace(slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2), prior
+        yield (
+            replace(
+                slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2
+            ),
+            prior,
+        )
     yield slow, prior
 
 
@@ -152,15 +174,26 @@ def _fit(
 
     The rows alone tell the rate with its sign. The streaks are used if the rows tell their sign beyond doubt.
     """
-    match, (candidate, prior), lens = attitude.match, start, _lens(attitude, camera)
+    match = attitude.match
+    lens = _lens(attitude, camera)
+    (candidate, prior) = start
     assert match is not None
     seen = lights.with_errors(centroids.take(match.observed), match.star)
     places = lights.place_ref[match.star]
-    by_rows = rolling.fit(lens, seen, places, lights.lever_cam_m, (match.cam_from_ref, candidate.rate_rad_s), prior)
-    streaks = from_streaks(lens, seen, exposure_s, _radii(lights, places)) if exposure_s is not None else []
+    by_rows = rolling.fit(
+        lens, seen, places, lights.lever_cam_m, (match.cam_from_ref, candidate.rate_rad_s), prior
+    )
+    streaks = (
+        from_streaks(lens, seen, exposure_s, _radii(lights, places))
+        if exposure_s is not None
+        else []
+    )
     if not streaks:
         return by_rows.rate
-    signed = min((streak.resolved(by_rows.rate) for streak in streaks), key=lambda one: _apart(one, by_rows.rate))
+    signed = min(
+        (streak.resolved(by_rows.rate) for streak in streaks),
+        key=lambda one: _apart(one, by_rows.rate),
+    )
     if not signed.sign_known:
         return by_rows.rate
     first = by_rows.cam_from_ref, signed.rate_rad_s
@@ -176,7 +209,9 @@ def _lens(attitude: Attitude, camera: Camera) -> Camera:
 def _apart(one: RateEstimate, other: RateEstimate) -> float:
     """Squared Mahalanobis distance of two rates."""
     difference = one.rate_rad_s - other.rate_rad_s
-    return float(difference @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference))
+    return float(
+        difference @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference)
+    )
 
 
 def _radii(lights: Lights, places: Floats) -> Sight:
@@ -188,7 +223,9 @@ def _sight_of(lights: Lights, attitude: Attitude, centroids: Centroids) -> Sight
     """The sight of all centroids, those at their own distance that are identified."""
     assert attitude.match is not None
     radius_m = np.full(len(centroids), lights.sight.radius_m)
-    radius_m[attitude.match.observed] = np.linalg.norm(lights.place_ref[attitude.match.star], axis=1)
+    radius_m[attitude.match.observed] = np.linalg.norm(
+        lights.place_ref[attitude.match.star], axis=1
+    )
     return Sight(lights.lever_cam_m, radius_m)
 
 
@@ -196,11 +233,13 @@ def _with_rate(
     camera: Camera, lights: Lights, centroids: Centroids, attitude: Attitude, rate: RateEstimate
 ) -> Attitude:
     """The attitude with its rate, whose error is added to the covariance."""
-    match, cam_from_ref = attitude.match, attitude.cam_from_ref
+    match = attitude.match
+    cam_from_ref = attitude.cam_from_ref
     assert match is not None
     assert cam_from_ref is not None
     assert attitude.covariance_rad2 is not None
-    lens, seen = _lens(attitude, camera), lights.with_errors(centroids.take(match.observed), match.star)
+    lens = _lens(attitude, camera)
+    seen = lights.with_errors(centroids.take(match.observed), match.star)
     place = cam_from_ref.apply(lights.place_ref[match.star])
     jacobian = tangent_jacobian(place, place - lights.lever_cam_m).reshape(-1, 2, 3)
     by_rate = rolling.rate_covariance_rad2(lens, seen, jacobian, rate.covariance_rad2_s2)
@@ -215,7 +254,8 @@ def with_streak_rate(
     lights: Lights | None = None,
 ) -> Attitude:
     """The attitude of a global shutter with the rate that the streaks of its lights tell; a gyro tells their sign."""
-    match, camera = attitude.match, attitude.camera
+    match = attitude.match
+    camera = attitude.camera
     if match is None or camera is None or exposure_s is None:
         return attitude
     sight = STARS if lights is None else _radii(lights, lights.place_ref[match.star])

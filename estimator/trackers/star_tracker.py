@@ -34,10 +34,22 @@ from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
 from estimator.identification.stars import quads, search
-from estimator.identification.stars.detections import Detections, FlatCentroids, Sensor, detections_of
+from estimator.identification.stars.detections import (
+    Detections,
+    FlatCentroids,
+    Sensor,
+    detections_of,
+)
 from estimator.identification.stars.evidence import Solution
 from estimator.trackers import warm_up
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
+from estimator.trackers.pipeline import (
+    Clock,
+    Report,
+    Settings,
+    brightest,
+    check_algorithms,
+    process_frame,
+)
 from estimator.trackers.residuals import companions, misfit
 from estimator.trackers.residuals.misfit import Refit
 from estimator.trackers.residuals.refinement import NO_MATCH, FieldMatcher
@@ -82,7 +94,9 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),
 )
-QUAD_SEARCHES = tuple(model for model in UNCALIBRATED_SEARCHES if model.by_quads)  # of an unknown field of view
+QUAD_SEARCHES = tuple(
+    model for model in UNCALIBRATED_SEARCHES if model.by_quads
+)  # of an unknown field of view
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -114,33 +128,47 @@ class StarTracker:
         checks.of_type("camera", camera, Camera)
         default = getattr(settings, "identifier", "default") == "default"
         check_algorithms(settings, ["default"] if default else _published(), SOLVERS)
-        focal_uncertainty = checks.number("focal_uncertainty", focal_uncertainty, 0.0, 0.5, "0 to 0.5, relative")
-        stars, vectors = catalog.checked(stars), checks.unit_rows("vectors", vectors, len(stars))
+        focal_uncertainty = checks.number(
+            "focal_uncertainty", focal_uncertainty, 0.0, 0.5, "0 to 0.5, relative"
+        )
+        vectors = checks.unit_rows("vectors", vectors, len(stars))
+        stars = catalog.checked(stars)
         if air is not None:
             vectors = air.seen(vectors, 0.0)
-        self.camera, self.settings, self.air = camera, settings, air
+        self.camera = camera
+        self.settings = settings
+        self.air = air
         self.focal_uncertainty = focal_uncertainty
-        self.searches = searches or (UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES)
+        self.searches = searches or (
+            UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
+        )
         apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         index_stars = self.stars.take(
-            self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+            self.stars.v_mag
+            <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
         )
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
         if settings.identifier == "default":
-            self.sky = sky_index.build(self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars))
+            self.sky = sky_index.build(
+                self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars)
+            )
             self.pairs = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
             self.index = pair_index.build(index_stars.vectors, longest_rad)
             self.pairs = len(self.index.pair)
-        self.field_matcher = FieldMatcher(camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs)
+        self.field_matcher = FieldMatcher(
+            camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
+        )
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
-        self.field = np.array([corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()])
+        self.field = np.array(
+            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+        )
         zero_point_mag = np.nan if settings.zero_point_mag is None else settings.zero_point_mag
         lens = camera.focal_px, camera.center_px, camera.distortion
         self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
@@ -153,7 +181,10 @@ class StarTracker:
     @property
     def _height_rad(self) -> float:
         """The smaller side of the field of view."""
-        return float(2 * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px))
+        return float(
+            2
+            * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px)
+        )
 
     @classmethod
     def for_sky(
@@ -175,7 +206,9 @@ class StarTracker:
         Raises ImageError for a date that cannot be read, or a catalog without a star as bright as limit_mag.
         """
         if limit_mag is not None or stars is None:
-            limit_mag = checks.number("limit_mag", 6.0 if limit_mag is None else limit_mag, -30, 30, "-30 to 30")
+            limit_mag = checks.number(
+                "limit_mag", 6.0 if limit_mag is None else limit_mag, -30, 30, "-30 to 30"
+            )
         stars = catalog.hipparcos() if stars is None else catalog.checked(stars)
         if limit_mag is not None:
             stars = catalog.brighter_than(stars, limit_mag)
@@ -251,7 +284,9 @@ class StarTracker:
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         if effort is not None:
-            effort = checks.number("effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True)
+            effort = checks.number(
+                "effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True
+            )
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
@@ -259,7 +294,9 @@ class StarTracker:
             lights = Lights(self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen))
             solve = functools.partial(self._solve_global, clock=clock, effort=effort)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(self._solve_global(centroids, clock, effort), centroids, exposure_s, rate)
+        return with_streak_rate(
+            self._solve_global(centroids, clock, effort), centroids, exposure_s, rate
+        )
 
     def _solve_through_air(
         self,
@@ -288,7 +325,9 @@ class StarTracker:
         """The centroids with their total errors as covariances."""
         sigma_px = self.sigma_px(centroids)
         excess_px2 = (sigma_px**2 - centroids.sigma_px**2)[:, None, None] * np.eye(2)
-        return replace(centroids, sigma_px=sigma_px, covariance_px2=covariance_of(centroids) + excess_px2)
+        return replace(
+            centroids, sigma_px=sigma_px, covariance_px2=covariance_of(centroids) + excess_px2
+        )
 
     def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
         """Identify and solve centroids of one time."""
@@ -327,9 +366,12 @@ class StarTracker:
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
-        observed, star = checks.row_pairs(("observed", observed, len(centroids)), ("star", star, len(self.stars)))
+        observed, star = checks.row_pairs(
+            ("observed", observed, len(centroids)), ("star", star, len(self.stars))
+        )
         sigma_px = self.sigma_px(centroids)[observed]
-        rays, vectors = self.camera.rays(centroids.xy_px[observed]), self.stars.vectors[star]
+        rays = self.camera.rays(centroids.xy_px[observed])
+        vectors = self.stars.vectors[star]
         sigma_rad = sigma_px / self.camera.focal_px
         try:
             cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
@@ -340,12 +382,18 @@ class StarTracker:
         xy_px = centroids.xy_px[observed]
         sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual / sigma_px[:, None], 3))
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad)
+        covariance_rad2, common_rad2 = with_focal_error(
+            covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad
+        )
         match = StarMatch(observed, star, cam_from_ref, float("nan"))
         rms_px = float(np.sqrt(np.mean(residual**2)))
-        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2)
+        return Attitude(
+            "solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2
+        )
 
-    def sigma_px(self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0) -> Floats:
+    def sigma_px(
+        self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0
+    ) -> Floats:
         """(N,) total centroid error: its own, a floor, and relative_error times the distance from the image center.
 
         The error of a calibrated focal length is the least relative_error.
@@ -357,12 +405,18 @@ class StarTracker:
         radius_px = np.linalg.norm(centroids.xy_px - self.camera.center_px, axis=1)
         return np.hypot(sigma_px, relative_error * radius_px)
 
-    def detections(self, centroids: Centroids, sigma_px: Floats, focal_uncertainty: float = 0.0) -> Detections:
+    def detections(
+        self, centroids: Centroids, sigma_px: Floats, focal_uncertainty: float = 0.0
+    ) -> Detections:
         """The centroids as input of the search, with magnitudes if the zero point is known.
 
         sigma_px : (N,) total errors;  focal_uncertainty : relative, if it is greater than that of the tracker
         """
-        return detections_of(_lights(centroids, sigma_px), self.sensor, max(self.focal_uncertainty, focal_uncertainty))
+        return detections_of(
+            _lights(centroids, sigma_px),
+            self.sensor,
+            max(self.focal_uncertainty, focal_uncertainty),
+        )
 
     def _identify_by_evidence(
         self,
@@ -388,12 +442,15 @@ class StarTracker:
             if not len(solution.star):
                 continue
             refitted = self.refit(centroids, solution, sigma_px, variance)
-            partial = not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids)
+            partial = not self.focal_uncertainty and self.field_matcher.misfits(
+                refitted.solution, centroids
+            )
             if partial or refitted.sheared:
                 continue
             attitude = self.attitude_of(centroids, refitted, sigma_px)
             if self.focal_uncertainty and not (
-                model.min_error_px == MIN_ERROR_PX and self.field_matcher.fits(solution, centroids, sigma_px)
+                model.min_error_px == MIN_ERROR_PX
+                and self.field_matcher.fits(solution, centroids, sigma_px)
             ):
                 fitted = self.field_matcher.refine(
                     centroids,
@@ -406,7 +463,9 @@ class StarTracker:
                 return attitude
         return Attitude(NO_MATCH)
 
-    def _search(self, centroids: Centroids, sigma_px: Floats, model: SearchModel) -> tuple[Solution, float]:
+    def _search(
+        self, centroids: Centroids, sigma_px: Floats, model: SearchModel
+    ) -> tuple[Solution, float]:
         """One search of the default identifier, and the factor of the variances if it is known, else 0."""
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
@@ -419,15 +478,21 @@ class StarTracker:
         known = not self.focal_uncertainty
         return quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
 
-    def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0) -> Refit:
+    def refit(
+        self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
+    ) -> Refit:
         """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell.
 
         variance : factor of the variances if the solution has been matched anew already; else 0
         """
-        camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
+        camera = (
+            self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
+        )
         if not len(solution.star) or 0 < variance < misfit.TELLING:
             return Refit(solution, camera, variance or 1.0)
-        detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
+        detections = self.detections(
+            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL
+        )
         if not variance:
             solution, detections = companions.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
@@ -437,24 +502,35 @@ class StarTracker:
             # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
             variance = variance_factor(dof * solution.chi2, dof)
-            return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
+            return Refit(
+                solution._replace(covariance_rad2=variance * solution.covariance_rad2),
+                camera,
+                variance,
+            )
         fit_lens = not self.camera.focal_sigma
-        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance)
+        return misfit.refit(
+            solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
+        )
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-        covariance_rad2, common_rad2, solver = solution.covariance_rad2, None, self.settings.solver
+        covariance_rad2 = solution.covariance_rad2
+        common_rad2 = None
+        solver = self.settings.solver
         if solver != "default" or camera.focal_sigma:
-            xy_px, vectors = centroids.xy_px[solution.observed], self.stars.vectors[solution.star]
+            xy_px = centroids.xy_px[solution.observed]
+            vectors = self.stars.vectors[solution.star]
             sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px
             if solver != "default":
                 rays = camera.rays(xy_px)
                 cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
                 covariance_rad2 = covariance(rays, sigma_rad, solver)
             seen_cam = cam_from_ref.apply(vectors)
-            covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)
+            covariance_rad2, common_rad2 = with_focal_error(
+                covariance_rad2, camera, xy_px, seen_cam, sigma_rad
+            )
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)

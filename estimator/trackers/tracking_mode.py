@@ -32,7 +32,9 @@ from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, infl
 from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
 
-WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
+WINDOW_SIGMA = (
+    4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
+)
 LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
@@ -91,16 +93,28 @@ class TrackingMode:
     """
 
     def __init__(
-        self, tracker: StarTracker, reach_px: float = 8.0, max_windows: int = 25, max_age_s: float = 5.0
+        self,
+        tracker: StarTracker,
+        reach_px: float = 8.0,
+        max_windows: int = 25,
+        max_age_s: float = 5.0,
     ) -> None:
         checks.of_type("TrackingMode: tracker", tracker, StarTracker)
         if tracker.focal_uncertainty:
-            raise ImageError(f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0")
+            raise ImageError(
+                f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0"
+            )
         self.tracker = tracker
-        self.reach_px = checks.number("TrackingMode: reach_px", reach_px, 1.0, 1e4, "1 to 10,000 pixels")
+        self.reach_px = checks.number(
+            "TrackingMode: reach_px", reach_px, 1.0, 1e4, "1 to 10,000 pixels"
+        )
         least = MIN_EVIDENCE_MATCHES
-        self.max_windows = checks.number("TrackingMode: max_windows", max_windows, least, 1e6, f"{least} or more", True)
-        self.max_age_s = checks.number("TrackingMode: max_age_s", max_age_s, 0.0, np.inf, "0 or more")
+        self.max_windows = checks.number(
+            "TrackingMode: max_windows", max_windows, least, 1e6, f"{least} or more", True
+        )
+        self.max_age_s = checks.number(
+            "TrackingMode: max_age_s", max_age_s, 0.0, np.inf, "0 or more"
+        )
         self.last: LastSolution | None = None
 
     def solve(
@@ -121,7 +135,8 @@ class TrackingMode:
         exposure_s    : to estimate the rate from streaks
         """
         check_frame(image, self.tracker.camera)
-        image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
+        image = in_row_order(image)
+        streak_px = checks.pixel_step("streak_px", streak_px)
         t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")
         if now_from_then is not None:
             checks.one_rotation("now_from_then", now_from_then)
@@ -158,12 +173,20 @@ class TrackingMode:
             now_from_then = Rotation.from_rotvec(last.rate_rad_s * (t_s - last.t_s))
         return now_from_then * last.cam_from_ref
 
-    def _with_rate(self, t_s: float, attitude: Attitude, centroids: Centroids, exposure_s: float | None) -> Attitude:
+    def _with_rate(
+        self, t_s: float, attitude: Attitude, centroids: Centroids, exposure_s: float | None
+    ) -> Attitude:
         """The attitude with the rate of its streaks, whose sign the last attitude tells."""
         if attitude.rate is None:
             attitude = with_streak_rate(attitude, centroids, exposure_s)
-        last, cam_from_ref = self.last, attitude.cam_from_ref
-        if attitude.rate is None or cam_from_ref is None or last is None or not 0 < t_s - last.t_s <= self.max_age_s:
+        last = self.last
+        cam_from_ref = attitude.cam_from_ref
+        if (
+            attitude.rate is None
+            or cam_from_ref is None
+            or last is None
+            or not 0 < t_s - last.t_s <= self.max_age_s
+        ):
             return attitude
         between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
         sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
@@ -175,7 +198,8 @@ class TrackingMode:
         cam_from_ref = attitude.cam_from_ref
         if cam_from_ref is None:
             return
-        last, rate_rad_s = self.last, np.zeros(3)
+        last = self.last
+        rate_rad_s = np.zeros(3)
         if attitude.rate is not None and attitude.rate.sign_known:
             rate_rad_s = -attitude.rate.rate_rad_s
         if last is not None and 0 < t_s - last.t_s <= self.max_age_s:
@@ -183,7 +207,11 @@ class TrackingMode:
         self.last = LastSolution(t_s, cam_from_ref, rate_rad_s)
 
     def _track(
-        self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
+        self,
+        image: NDArray,
+        predicted: Rotation,
+        streak_px: tuple[float, float] | None,
+        clock: Clock,
     ) -> TrackedReport | None:
         """Solve from the detections in windows.
 
@@ -200,11 +228,15 @@ class TrackingMode:
         detections = tracker.detections(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
-        hypothesis = evidence.evaluate(detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf)
+        hypothesis = evidence.evaluate(
+            detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
+        )
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
-        prior_gain_dex = log10(8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)))
+        prior_gain_dex = log10(
+            8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi))
+        )
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
         solution = evidence.build_solution(detections, tracker.sky, hypothesis)
@@ -215,16 +247,24 @@ class TrackingMode:
         refitted = refitted._replace(solution=found._replace(dex=found.dex + prior_gain_dex))
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
-        return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
+        return self._report(
+            attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px
+        )
 
     def _search(
-        self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock, exposure_s: float | None
+        self,
+        image: NDArray,
+        streak_px: tuple[float, float] | None,
+        clock: Clock,
+        exposure_s: float | None,
     ) -> TrackedReport:
         """Solve the whole frame lost in space."""
         tracker = self.tracker
         centroids = detect_and_centroid(image, tracker.camera, tracker.settings, clock, streak_px)
         attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
-        return self._report(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
+        return self._report(
+            attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px
+        )
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
         """(N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
@@ -240,10 +280,15 @@ class TrackingMode:
         return xy[~shadowed][: self.max_windows]
 
     def _in_windows(
-        self, image: NDArray, window_centers_px: Floats, streak_px: tuple[float, float] | None, clock: Clock
+        self,
+        image: NDArray,
+        window_centers_px: Floats,
+        streak_px: tuple[float, float] | None,
+        clock: Clock,
     ) -> tuple[Centroids, bool]:
         """Centroids of the detections in windows, and whether any of them is saturated."""
-        settings, priors = self.tracker.settings, FramePriors(streak_px, self.tracker.settings.saturation)
+        settings = self.tracker.settings
+        priors = FramePriors(streak_px, self.tracker.settings.saturation)
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
             centroids = detect_and_centroid(image, self.tracker.camera, settings, clock, streak_px)
             near = np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
@@ -288,4 +333,6 @@ class TrackingMode:
         ):
             health |= flag if raised else Health.GOOD
         odds = -match.log10_chance
-        return TrackedReport(attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected)
+        return TrackedReport(
+            attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected
+        )

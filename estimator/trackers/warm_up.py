@@ -17,9 +17,14 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.detection.detect import to_native
 
-SKY, NOISE = 100.0, 2.0
-DIM, BRIGHT = 1500.0, 6000.0  # peaks of the brightest light: 12-bit pixels have narrower sums than 16-bit ones
-SPOT_SIGMA_PX, REACH_PX, STREAK_PX = 1.0, 6, (7.0, 4.0)
+SKY = 100.0
+NOISE = 2.0
+# peaks of the brightest light: 12-bit pixels have narrower sums than 16-bit ones
+DIM = 1500.0
+BRIGHT = 6000.0
+SPOT_SIGMA_PX = 1.0
+REACH_PX = 6
+STREAK_PX = (7.0, 4.0)
 MAX_SPOTS = 40
 
 Step = tuple[float, float]
@@ -30,18 +35,26 @@ def loop_type(dtype: DTypeLike) -> np.dtype:
     try:
         return to_native(np.zeros((1, 1), dtype)).dtype
     except (TypeError, ImageError):
-        raise ImageError(f"warm_up: dtype is {dtype!r}; allowed: the type of the frames' pixels, numbers") from None
+        raise ImageError(
+            f"warm_up: dtype is {dtype!r}; allowed: the type of the frames' pixels, numbers"
+        ) from None
 
 
-def draw(camera: Camera, xy_px: Floats, peak: Floats, dtype: np.dtype, streak_px: Step = (0.0, 0.0)) -> NDArray:
+def draw(
+    camera: Camera, xy_px: Floats, peak: Floats, dtype: np.dtype, streak_px: Step = (0.0, 0.0)
+) -> NDArray:
     """A frame with Gaussian spots of (N,) peak light at (N, 2) places, drawn out along a streak, over sky and noise."""
-    image = np.random.Generator(np.random.PCG64(1)).normal(SKY, NOISE, (camera.height_px, camera.width_px))
+    image = np.random.Generator(np.random.PCG64(1)).normal(
+        SKY, NOISE, (camera.height_px, camera.width_px)
+    )
     steps = np.linspace(-0.5, 0.5, 1 + 2 * int(np.hypot(*streak_px)))[:, None] * np.array(streak_px)
     for middle_px, light in zip(xy_px, peak, strict=True):
         for x_px, y_px in middle_px + steps:
-            left, top = max(int(x_px) - REACH_PX, 0), max(int(y_px) - REACH_PX, 0)
+            left = max(int(x_px) - REACH_PX, 0)
+            top = max(int(y_px) - REACH_PX, 0)
             part = image[top : int(y_px) + REACH_PX, left : int(x_px) + REACH_PX]
-            across, down = np.arange(part.shape[1]) + left - x_px, np.arange(part.shape[0]) + top - y_px
+            across = np.arange(part.shape[1]) + left - x_px
+            down = np.arange(part.shape[0]) + top - y_px
             squares = across**2 + down[:, None] ** 2
             part += light / np.sqrt(len(steps)) * np.exp(-squares / (2 * SPOT_SIGMA_PX**2))
     return image.astype(dtype)
@@ -55,15 +68,23 @@ def run(
     look: Callable[[NDArray, Step | None], object],
 ) -> None:
     """Call `look(image, streak_px)` on every kind of frame of lights at (N, 2) places with (N,) relative brightness."""
-    kind, spots = loop_type(dtype), slice(0, MAX_SPOTS)
-    xy_px, light = xy_px[spots], np.maximum(light[spots] / light.max(), 0.05)
+    kind = loop_type(dtype)
+    spots = slice(0, MAX_SPOTS)
+    xy_px = xy_px[spots]
+    light = np.maximum(light[spots] / light.max(), 0.05)
     dim, bright = (draw(camera, xy_px, peak * light, kind) for peak in (DIM, BRIGHT))
     smeared = draw(camera, xy_px, DIM * light, kind, STREAK_PX)
     square = bright.copy()
-    y, x = camera.height_px // 2, camera.width_px // 2
+    y = camera.height_px // 2
+    x = camera.width_px // 2
     square[y - 5 : y + 5, x - 5 : x + 5] = BRIGHT
     few = draw(camera, xy_px[:2], DIM * light[:2], kind, STREAK_PX)
-    frames: list[tuple[NDArray, Step | None]] = [(dim, None), (bright, None), (square, (0.0, 0.0)), (few, None)]
+    frames: list[tuple[NDArray, Step | None]] = [
+        (dim, None),
+        (bright, None),
+        (square, (0.0, 0.0)),
+        (few, None),
+    ]
     frames += [(smeared, None), (smeared, STREAK_PX), (np.ascontiguousarray(dim[:, ::-1]), None)]
     for image, streak_px in frames:
         look(image, streak_px)

@@ -17,15 +17,22 @@ class BuildWithCatalog(build_py):
     def run(self) -> None:
         super().run()
         package = Path(self.build_lib) / "estimator"
-        for source, name in () if self.editable_mode else ((CATALOG, CATALOG), ("LICENSE", "LICENSE")):
+        for source, name in (
+            () if self.editable_mode else ((CATALOG, CATALOG), ("LICENSE", "LICENSE"))
+        ):
             (package / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / source, package / name)
 
 
-shutil.rmtree(BUILD, ignore_errors=True)  # a module that is gone from the checkout would stay in the wheel
+shutil.rmtree(
+    BUILD, ignore_errors=True
+)  # a module that is gone from the checkout would stay in the wheel
 BUILD.mkdir(parents=True, exist_ok=True)
 setup(
-    packages=["estimator", *(f"estimator.{name}" for name in find_packages(str(ROOT / "estimator")))],
+    packages=[
+        "estimator",
+        *(f"estimator.{name}" for name in find_packages(str(ROOT / "estimator"))),
+    ],
     package_dir={"estimator": "../../estimator"},
     cmdclass={"build_py": BuildWithCatalog},
     options={"build": {"build_base": str(BUILD)}, "egg_info": {"egg_base": str(BUILD)}},

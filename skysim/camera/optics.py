@@ -50,7 +50,8 @@ class Optics:
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Optics:
         """The optics of a scene's camera."""
-        area_m2, fold = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
+        area_m2 = np.pi / 4 * camera.pupil_m**2
+        fold = fold_r(camera.distortion)
         return cls(camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
@@ -59,8 +60,10 @@ class Optics:
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise (Brown 1971).
         """
         z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
-        x, y = vectors_cam[..., 0] / z, vectors_cam[..., 1] / z
-        focal, center = self.camera.focal_px, self.camera.center_px
+        x = vectors_cam[..., 0] / z
+        y = vectors_cam[..., 1] / z
+        focal = self.camera.focal_px
+        center = self.camera.center_px
         if any(self.camera.distortion):
             x, y = self._distort(x, y)
         return np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
@@ -91,7 +94,9 @@ class ScaledOptics(Optics):
     @classmethod
     def of(cls, optics: Optics, scale: float) -> ScaledOptics:
         """A lens with its image scaled, and all else unchanged."""
-        return cls(optics.camera, optics.collecting_m2, optics.fold_r, optics.field_rad, scale=scale)
+        return cls(
+            optics.camera, optics.collecting_m2, optics.fold_r, optics.field_rad, scale=scale
+        )
 
     def project(self, vectors_cam: Floats) -> Floats:
         """As `Optics.project`, then scaled."""
@@ -122,6 +127,8 @@ def field_rad(camera: CameraConfig, fold_r: float) -> float:
 def fold_r(distortion: tuple[float, ...]) -> float:
     """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
     k1, k2, _, _, k3 = distortion
-    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # polynomial in 1 / r^2: its leading coefficient is never 0
+    roots = np.roots(
+        [1.0, 3 * k1, 5 * k2, 7 * k3]
+    )  # polynomial in 1 / r^2: its leading coefficient is never 0
     extrema = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

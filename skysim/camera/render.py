@@ -33,14 +33,22 @@ from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
 STEP = 1.3  # largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma)
 MAX_PIECES = 100_000
-MIN_POSES, MAX_POSES = 9, 32_769  # number of poses in an exposure
-SINGLE_PIECE_STEPS = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
+# number of poses in an exposure
+MIN_POSES = 9
+MAX_POSES = 32_769
+SINGLE_PIECE_STEPS = (
+    0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
+)
 STILL_PX = 1e-3  # an image that moves less is drawn as one point
 MIN_BAND_STARS = 20_000  # below, a pass over all takes less than 50 us
-MAX_BAND_SHARE = 0.1  # of the sky, up to which a band of it holds a field's stars sooner than a pass over all
+MAX_BAND_SHARE = (
+    0.1  # of the sky, up to which a band of it holds a field's stars sooner than a pass over all
+)
 MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
-OcclusionTest = Callable[[Floats], NDArray[np.bool_]]  # (N,) which of N sources at `Sources.place` are occluded
+OcclusionTest = Callable[
+    [Floats], NDArray[np.bool_]
+]  # (N,) which of N sources at `Sources.place` are occluded
 
 
 class Window(NamedTuple):
@@ -109,13 +117,18 @@ def render(
     all_poses = poses(trajectory, mount, t_s)
     # Coarse selection with a few poses, before the sources are projected at all of them.
     few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
-    candidates = sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
+    candidates = (
+        sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
+    )
     if occluded:
         candidates = candidates.take(~occluded(candidates.place))
-    emitter, middle = emitter or Emitter(), len(t_s) // 2
+    emitter = emitter or Emitter()
+    middle = len(t_s) // 2
     tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
     mid_px = tracks.xy_px[middle]
-    disks = led_images(candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter)
+    disks = led_images(
+        candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter
+    )
     is_led = candidates.place[:, 3] > 0
     kernels = source_kernels(
         optics.camera,
@@ -160,7 +173,8 @@ def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
     for n in range(len(begin_s)):
         x0, y0, _ = _interpolate(tracks, n, begin_s[n])
         x1, y1, _ = _interpolate(tracks, n, end_s[n])
-        out[n, 0], out[n, 1] = x1 - x0, y1 - y0
+        out[n, 0] = x1 - x0
+        out[n, 1] = y1 - y0
     return out
 
 
@@ -199,13 +213,23 @@ def image_tracks(
 
 
 def rates_e_s(
-    sources: Sources, optics: Optics, emitter: Emitter, distance_m: Floats, cos_out: Floats, cos_in: Floats
+    sources: Sources,
+    optics: Optics,
+    emitter: Emitter,
+    distance_m: Floats,
+    cos_out: Floats,
+    cos_in: Floats,
 ) -> Floats:
     """(..., N) photo-electrons a second of N lit sources, from what `project` returns."""
     throughput = optics.throughput(cos_in)
-    rate, is_led = sources.strength * throughput, sources.place[:, 3] > 0
+    rate = sources.strength * throughput
+    is_led = sources.place[:, 3] > 0
     if is_led.any():
-        rate = np.where(is_led, irradiance_e_s_m2(sources.strength, emitter, cos_out, throughput, distance_m), rate)
+        rate = np.where(
+            is_led,
+            irradiance_e_s_m2(sources.strength, emitter, cos_out, throughput, distance_m),
+            rate,
+        )
     return rate * optics.collecting_m2
 
 
@@ -228,12 +252,16 @@ def project(
     return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, :, 2]
 
 
-def project_each(sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]) -> tuple[Floats, ...]:
+def project_each(
+    sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]
+) -> tuple[Floats, ...]:
     """As `project` at mid-exposure, of sources in groups, each at a pose of its own: the results are (N, 2) and (N,).
 
     ends : (K + 1,) 0, and the number of sources up to the end of each group
     """
-    direction_cam, distance, cos_out = _directions_each(sources.place, NO_MOTION, NOW, sources.normal, *poses, ends)
+    direction_cam, distance, cos_out = _directions_each(
+        sources.place, NO_MOTION, NOW, sources.normal, *poses, ends
+    )
     return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, 2]
 
 
@@ -248,14 +276,23 @@ def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
 
 @jit
 def _directions(
-    place: Floats, motion: Floats, after_s: Floats, normal: Floats, cam_from_lab: Floats, camera_m: Floats
+    place: Floats,
+    motion: Floats,
+    after_s: Floats,
+    normal: Floats,
+    cam_from_lab: Floats,
+    camera_m: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """(K, N, 3) unit directions in camera axes, (K, N) distances in m and cosines at the emitters.
 
     motion : as of `Sources`, or of length 0 where nothing moves;  after_s : (K,), or (1,) for all poses
     """
-    poses, count, moves = len(cam_from_lab), len(place), len(motion) > 0
-    direction, distance, cosine = np.empty((poses, count, 3)), np.empty((poses, count)), np.empty((poses, count))
+    poses = len(cam_from_lab)
+    count = len(place)
+    moves = len(motion) > 0
+    direction = np.empty((poses, count, 3))
+    distance = np.empty((poses, count))
+    cosine = np.empty((poses, count))
     offset = np.empty(3)
     for k in range(poses):
         t = after_s[min(k, len(after_s) - 1)]
@@ -291,24 +328,34 @@ def _directions_each(
     ends: NDArray[np.int64],
 ) -> tuple[Floats, Floats, Floats]:
     """As `_directions` of sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
-    direction, distance, cosine = np.empty((len(place), 3)), np.empty(len(place)), np.empty(len(place))
+    direction = np.empty((len(place), 3))
+    distance = np.empty(len(place))
+    cosine = np.empty(len(place))
     for k in range(len(ends) - 1):
-        a, b = ends[k], ends[k + 1]
-        own = _directions(place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1])
+        a = ends[k]
+        b = ends[k + 1]
+        own = _directions(
+            place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1]
+        )
         for n in range(a, b):
-            distance[n], cosine[n] = own[1][0, n - a], own[2][0, n - a]
+            distance[n] = own[1][0, n - a]
+            cosine[n] = own[2][0, n - a]
             for i in range(3):
                 direction[n, i] = own[0][0, n - a, i]
     return direction, distance, cosine
 
 
-def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) -> DiskImages | None:
+def led_images(
+    sources: Sources, optics: Optics, pose: Poses, emitter: Emitter
+) -> DiskImages | None:
     """The geometric images of N sources at one pose, NaN for stars; None if all are stars."""
     led = np.flatnonzero(sources.radius_m * sources.place[:, 3] > 0)
     if not len(led):
         return None
     cam_from_lab, camera_m = pose
-    offset_cam, normal_cam = (a @ cam_from_lab.T for a in (sources.place[led, :3] - camera_m, sources.normal[led]))
+    offset_cam, normal_cam = (
+        a @ cam_from_lab.T for a in (sources.place[led, :3] - camera_m, sources.normal[led])
+    )
     images = disk_images(optics, emitter, offset_cam, normal_cam, sources.radius_m[led])
     if len(led) == len(sources):
         return images
@@ -318,7 +365,9 @@ def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) 
     return full
 
 
-def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25) -> NDArray[np.int64]:
+def in_view(
+    sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25
+) -> NDArray[np.int64]:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
     The cone's half-angle is the field's circle, `reach` of it more for images that reach in from outside, and half of
@@ -328,8 +377,11 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     rotation_rad, span_rad = _rotations_rad(boresight)
     half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
-    cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
-    place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
+    cos_limit, cos_any = (
+        math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad)
+    )
+    place = sources.place
+    camera_m = np.ascontiguousarray(poses.camera_m)
     by_band = len(sources) >= MIN_BAND_STARS and (1 - cos_any) / 2 <= MAX_BAND_SHARE
     if by_band and isinstance(sources, StarSources):
         near = sources.within(boresight[0], half_rad + span_rad)
@@ -340,9 +392,11 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
 @jit
 def _rotations_rad(boresight: Floats) -> tuple[float, float]:
     """The greatest angles of K boresights between one and the next, and between any and the first."""
-    next_rad, first_rad = 0.0, 0.0
+    next_rad = 0.0
+    first_rad = 0.0
     for k in range(1, len(boresight)):
-        to_last, to_first = 0.0, 0.0
+        to_last = 0.0
+        to_first = 0.0
         for i in range(3):
             to_last += boresight[k, i] * boresight[k - 1, i]
             to_first += boresight[k, i] * boresight[0, i]
@@ -352,7 +406,9 @@ def _rotations_rad(boresight: Floats) -> tuple[float, float]:
 
 
 @jit
-def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float, cos_any: float) -> Any:
+def _in_cone(
+    place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float, cos_any: float
+) -> Any:
     """(N,) whether a source's direction from any of K cameras is within the cone: cosine with the boresight
     above `cos_limit`. A star whose cosine with the first boresight is below `cos_any` is in none of the cones.
     """
@@ -363,7 +419,8 @@ def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: floa
         if place[n, 3] == 0 and at_first < cos_any:
             continue
         for k in range(len(boresight)):
-            along, square = 0.0, 0.0
+            along = 0.0
+            square = 0.0
             for i in range(3):
                 offset = place[n, i] - place[n, 3] * camera_m[k, i]
                 along += offset * boresight[k, i]
@@ -374,7 +431,9 @@ def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: floa
     return inside
 
 
-def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window) -> Floats:
+def draw(
+    image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
+) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
 
     step_px : (N,) largest motion of each image in one piece of the exposure; of an ellipse in units of `sharpest_px`
@@ -432,7 +491,17 @@ def _draw(
         x0, x1, y0, y1 = boxes[i]
         if x1 > x0 and y1 > y0:
             patch = buffer[starts[i] : starts[i + 1]].reshape(y1 - y0, x1 - x0)
-            _expose_source(patch, x0, y0, first + i, tracks, kernels, step_px[first + i], window, out[first + i])
+            _expose_source(
+                patch,
+                x0,
+                y0,
+                first + i,
+                tracks,
+                kernels,
+                step_px[first + i],
+                window,
+                out[first + i],
+            )
             _patch_statistics(patch, x0, y0, out[first + i])
 
 
@@ -460,11 +529,14 @@ def _expose_source(
     for j in range(0, len(patch), rows):
         delay_s = (y0 + j) * window.row_time_s
         begin_s = window.open_s + delay_s
-        sums = _integrate(patch, j, j + rows, x0, y0, n, tracks, kernels, table, step_px, begin_s, end_s + delay_s)
+        sums = _integrate(
+            patch, j, j + rows, x0, y0, n, tracks, kernels, table, step_px, begin_s, end_s + delay_s
+        )
     if rolling:
         row[2], row[3] = _centroid(patch, x0, y0)
     elif sums[0] > 0:
-        row[2], row[3] = sums[1] / sums[0] + kernels.disk[n, 2], sums[2] / sums[0] + kernels.disk[n, 3]
+        row[2] = sums[1] / sums[0] + kernels.disk[n, 2]
+        row[3] = sums[2] / sums[0] + kernels.disk[n, 3]
 
 
 @jit
@@ -492,7 +564,9 @@ def _integrate(
 
     Returns the electrons of the whole image and their first moments in x and y.
     """
-    total, total_x, total_y = 0.0, 0.0, 0.0
+    total = 0.0
+    total_x = 0.0
+    total_y = 0.0
     speed = _speed(tracks, n, begin_s, end_s)
     steps = speed * (end_s - begin_s) / step_px
     # One piece more than the motion needs: in a short path the ends, where the error is largest, weigh more.
@@ -500,7 +574,9 @@ def _integrate(
     for k in range(pieces):
         a = begin_s + (end_s - begin_s) * k / pieces
         b = begin_s + (end_s - begin_s) * (k + 1) / pieces
-        lit, mean, spread = lit_moments_s(a, b, tracks.pulse_s[n, 0], tracks.pulse_s[n, 1], tracks.pulse_s[n, 2])
+        lit, mean, spread = lit_moments_s(
+            a, b, tracks.pulse_s[n, 0], tracks.pulse_s[n, 1], tracks.pulse_s[n, 2]
+        )
         if lit <= 0:  # no pulse in this piece
             continue
         points = 1 if speed * spread < STILL_PX else 2
@@ -510,7 +586,9 @@ def _integrate(
             if not electrons > 0:  # no image at this time (NaN position), or the LED faces away
                 continue
             _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels, table)
-            total, total_x, total_y = total + electrons, total_x + electrons * x, total_y + electrons * y
+            total = total + electrons
+            total_x = total_x + electrons * x
+            total_y = total_y + electrons * y
     return total, total_x, total_y
 
 
@@ -521,13 +599,37 @@ def _sampled(n: int, kernels: Kernels) -> Any:
         return np.empty((0, 0, 0), np.float32)
     begin, end, waves, samples = kernels.table[n]
     d = kernels.disk[n]
-    disk = EllipseDisk(d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10], d[11], d[12], d[13], d[14])
+    disk = EllipseDisk(
+        d[0],
+        d[1],
+        d[2],
+        d[3],
+        d[4],
+        d[5],
+        d[6],
+        d[7],
+        d[8],
+        d[9],
+        d[10],
+        d[11],
+        d[12],
+        d[13],
+        d[14],
+    )
     return ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
 
 
 @jit
 def _splat_point(
-    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, kernels: Kernels, table: Singles
+    patch: Any,
+    row0: int,
+    row1: int,
+    x: float,
+    y: float,
+    electrons: float,
+    n: int,
+    kernels: Kernels,
+    table: Singles,
 ) -> None:
     """Add the image of a point of light to the patch, by its kind of kernel."""
     begin, end, p, q = kernels.table[n]
@@ -536,7 +638,9 @@ def _splat_point(
     elif kernels.kind[n] == ROUND:
         add_round(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, q))
     elif kernels.kind[n] == ELLIPSE:
-        add_ellipse(patch, row0, row1, x + kernels.disk[n, 0], y + kernels.disk[n, 1], electrons, table)
+        add_ellipse(
+            patch, row0, row1, x + kernels.disk[n, 0], y + kernels.disk[n, 1], electrons, table
+        )
     else:
         add_grid(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, p, q, q))
 
@@ -552,7 +656,8 @@ def _interpolate(tracks: Tracks, n: int, t_s: float) -> Any:
     w1 = u * (u - 2) * (u - 3) / 2
     w2 = u * (u - 1) * (u - 3) / -2
     w3 = u * (u - 1) * (u - 2) / 6
-    xy, rate = tracks.xy_px, tracks.rate_e_s
+    xy = tracks.xy_px
+    rate = tracks.rate_e_s
     x = w0 * xy[k, n, 0] + w1 * xy[k + 1, n, 0] + w2 * xy[k + 2, n, 0] + w3 * xy[k + 3, n, 0]
     y = w0 * xy[k, n, 1] + w1 * xy[k + 1, n, 1] + w2 * xy[k + 2, n, 1] + w3 * xy[k + 3, n, 1]
     e = w0 * rate[k, n] + w1 * rate[k + 1, n] + w2 * rate[k + 2, n] + w3 * rate[k + 3, n]
@@ -582,7 +687,8 @@ def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
         x1, y1, _ = _interpolate(tracks, n, begin_s + (end_s - begin_s) * (k + 1) / chords)
         chord = np.hypot(x1 - x, y1 - y)
         total += chord if np.isfinite(chord) else 0.0
-        x, y = x1, y1
+        x = x1
+        y = y1
     return total
 
 
@@ -595,17 +701,23 @@ def _patch_statistics(patch: Any, x0: int, y0: int, row: Any) -> None:
             row[0] += e
             row[4] += e * e
             if e > row[1]:
-                row[1], row[6], row[7] = e, x0 + i, y0 + j
+                row[1] = e
+                row[6] = x0 + i
+                row[7] = y0 + j
 
 
 @jit
 def _centroid(patch: Any, x0: int, y0: int) -> Any:
     """Center of gravity of a patch; its corner if it is empty."""
-    total, x, y = 0.0, 0.0, 0.0
+    total = 0.0
+    x = 0.0
+    y = 0.0
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
             e = patch[j, i]
-            total, x, y = total + e, x + e * i, y + e * j
+            total = total + e
+            x = x + e * i
+            y = y + e * j
     return (x0 + x / total, y0 + y / total) if total > 0 else (float(x0), float(y0))
 
 
@@ -614,9 +726,11 @@ def _deposit(image: Any, buffer: Any, starts: Any, boxes: Any) -> None:
     """Add all patches to the image, one after another: patches overlap, so threads would collide."""
     for i in range(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
-        k, width = starts[i], x1 - x0
+        k = starts[i]
+        width = x1 - x0
         for j in range(y0, y1):
-            row, pixels = image[j, x0:x1], buffer[k : k + width]
+            row = image[j, x0:x1]
+            pixels = buffer[k : k + width]
             for x in range(width):
                 row[x] += pixels[x]
             k += width

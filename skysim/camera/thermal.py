@@ -74,7 +74,9 @@ def leds_at(config: ThermalConfig, leds: Sources, t_s: float) -> Sources:
     return replace(leds, place=place)
 
 
-def camera_at(config: ThermalConfig, mount: Mount, optics: Optics, t_s: float) -> tuple[Mount, Optics]:
+def camera_at(
+    config: ThermalConfig, mount: Mount, optics: Optics, t_s: float
+) -> tuple[Mount, Optics]:
     """Mount and lens as they are at a time since the scene's start, from what they were at the calibration.
 
     With the temperature's difference dT the camera is turned by beta dT about its own axes, and the image is

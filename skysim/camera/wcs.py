@@ -47,7 +47,8 @@ def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
     Axes are the ICRS's; directions are apparent, aberration included (`sky.apparent`).
     """
     right, down, boresight = cam_from_icrs.as_matrix()
-    ra, dec = np.arctan2(boresight[1], boresight[0]), np.arcsin(np.clip(boresight[2], -1, 1))
+    ra = np.arctan2(boresight[1], boresight[0])
+    dec = np.arcsin(np.clip(boresight[2], -1, 1))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     scale = np.degrees(1 / camera.focal_px)
@@ -106,18 +107,24 @@ def fit_sip(camera: CameraConfig) -> Sip | None:
     if not on_chip.any():
         return None
     # Offsets are scaled to 1, or the high powers would make the least squares ill-conditioned.
-    scale, fits = np.abs(distorted_px).max(), []
+    scale = np.abs(distorted_px).max()
+    fits = []
     for order in range(2, MAX_ORDER + 1):
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
-        solution = np.linalg.lstsq(monomials(distorted_px / scale, powers), undistorted_px - distorted_px, rcond=None)[
-            0
-        ]
+        solution = np.linalg.lstsq(
+            monomials(distorted_px / scale, powers), undistorted_px - distorted_px, rcond=None
+        )[0]
         a, b = (
-            {(p, q): float(value) / scale ** (p + q) for (p, q), value in zip(powers, column, strict=True)}
+            {
+                (p, q): float(value) / scale ** (p + q)
+                for (p, q), value in zip(powers, column, strict=True)
+            }
             for column in solution.T
         )
         round_trip = distorted(chip_px + monomials(chip_px / scale, powers) @ solution, camera)
-        fits.append(Sip(a, b, *brown(camera), float(np.linalg.norm(round_trip - chip_px, axis=1).max())))
+        fits.append(
+            Sip(a, b, *brown(camera), float(np.linalg.norm(round_trip - chip_px, axis=1).max()))
+        )
         if fits[-1].worst_px <= TARGET_ERROR_PX:
             break
     return min(fits, key=lambda fit: fit.worst_px)
@@ -134,7 +141,8 @@ def fit_grid(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[n
 
     The others are slightly beyond its edges, so that the fit does not extrapolate at an edge.
     """
-    center, size = np.array(camera.center_px), np.array([camera.width_px, camera.height_px])
+    center = np.array(camera.center_px)
+    size = np.array([camera.width_px, camera.height_px])
     corner = camera.focal_px * np.tan(Optics.from_camera(camera).field_rad)
     widening = max(corner / camera.corner_px, 1.0) * (1 + 2 * MARGIN)
     edges = np.array([-0.5 - center, size - 0.5 - center])
@@ -145,7 +153,9 @@ def fit_grid(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[n
     pixels = distorted_px + center
 
     def inside(out: float) -> NDArray[np.bool_]:
-        return np.asarray(((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1))
+        return np.asarray(
+            ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1)
+        )
 
     on_fit_area = inside(MARGIN)
     return undistorted_px[on_fit_area], distorted_px[on_fit_area], inside(0)[on_fit_area]
@@ -172,10 +182,12 @@ def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
     down: Coefficients = {(1, 1): 2 * p2, (0, 2): 3 * p1, (2, 0): p1}
     for n, k in ((1, k1), (2, k2), (3, k3)):
         for m, times in enumerate(binomials[n]):
-            p, q = 2 * (n - m), 2 * m
+            p = 2 * (n - m)
+            q = 2 * m
             across[p + 1, q] = k * times
             down[p, q + 1] = k * times
     focal = camera.focal_px
     return tuple(  # type: ignore[return-value]
-        {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value} for table in (across, down)
+        {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value}
+        for table in (across, down)
     )

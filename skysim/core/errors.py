@@ -18,7 +18,9 @@ def note(message: str) -> None:
 
 def printable(text: object) -> str:
     """Text from outside on one line, with ? for control characters and others that a terminal cannot show."""
-    return "".join(character if character.isprintable() else "?" for character in " ".join(str(text).split()))
+    return "".join(
+        character if character.isprintable() else "?" for character in " ".join(str(text).split())
+    )
 
 
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> tuple[str, str]:
@@ -38,7 +40,9 @@ class Where(NamedTuple):
     unit: str = "line"
 
     def __str__(self) -> str:
-        return printable(self.file if self.line is None else f"{self.file}, {self.unit} {self.line}")
+        return printable(
+            self.file if self.line is None else f"{self.file}, {self.unit} {self.line}"
+        )
 
 
 OVERRIDES = Where("overrides")  # of a value that the caller gave in place of the file's
@@ -61,17 +65,23 @@ class InputError(ValueError):
     allowed: str
     where: Where | None
 
-    def __init__(self, key: object, problem: object, allowed: object = "", where: Where | None = None) -> None:
+    def __init__(
+        self, key: object, problem: object, allowed: object = "", where: Where | None = None
+    ) -> None:
         self.key = printable(key)  # the parts may quote a file, and a file may hold anything
         self.problem = printable(problem)
         self.allowed = printable(allowed)
         self.where = where and where._replace(file=str(where.file))
-        super().__init__(self.key, self.problem, self.allowed, self.where)  # from these it is unpickled
+        super().__init__(
+            self.key, self.problem, self.allowed, self.where
+        )  # from these it is unpickled
 
     @property
     def fault(self) -> str:
         """The problem and what is allowed, without the key and the place."""
-        return "; ".join(part for part in (self.problem, self.allowed and f"allowed: {self.allowed}") if part)
+        return "; ".join(
+            part for part in (self.problem, self.allowed and f"allowed: {self.allowed}") if part
+        )
 
     @property
     def is_of_file(self) -> bool:

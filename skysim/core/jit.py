@@ -23,7 +23,9 @@ class CompilationNotice(event.Listener):
 
     def on_start(self, _: event.Event) -> None:
         event.unregister("numba:compile", self)
-        errors.note("compiling numba functions (once after an installation or update): about a minute")
+        errors.note(
+            "compiling numba functions (once after an installation or update): about a minute"
+        )
 
     def on_end(self, _: event.Event) -> None:
         """Required by the interface; prints nothing."""

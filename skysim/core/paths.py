@@ -22,7 +22,11 @@ def title_of(path: Path) -> str:
 
     Only its line is parsed: a list of all scenes would otherwise take a second.
     """
-    lines = dict(re.findall(r"^(title|base):(.*)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE))
+    lines = dict(
+        re.findall(
+            r"^(title|base):(.*)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
+        )
+    )
     try:
         values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
     except yaml.YAMLError:

@@ -40,7 +40,9 @@ CHUNK_BYTES = 1 << 20
 QUOTED_LINES = 3  # of standard error that an error message quotes
 FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
 
-Respond = Callable[[dict[str, Any], IO[bytes]], dict[str, Any]]  # a message's header and what follows it, to an answer
+Respond = Callable[
+    [dict[str, Any], IO[bytes]], dict[str, Any]
+]  # a message's header and what follows it, to an answer
 
 
 class PluginKind(NamedTuple):
@@ -59,7 +61,11 @@ class PluginKind(NamedTuple):
 
     def entry_points(self) -> dict[str, metadata.EntryPoint]:
         """The plug-ins of installed packages by name; none is loaded."""
-        return {point.name: point for point in metadata.entry_points(group=self.group) if point.name not in self.own}
+        return {
+            point.name: point
+            for point in metadata.entry_points(group=self.group)
+            if point.name not in self.own
+        }
 
     def release(self, name: str) -> str:
         """Name and version of the package that offers a plug-in; empty for skysim's own and for programs."""
@@ -167,7 +173,10 @@ class Program:
         limit_s: float,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self.name, self.arguments, self.limit_s, self.environment = name, arguments, limit_s, environment
+        self.name = name
+        self.arguments = arguments
+        self.limit_s = limit_s
+        self.environment = environment
         self.setup_message = (json.dumps(setup) + "\n").encode()
         self.running: RunningProcess | None = None
         self.received = bytearray()
@@ -198,12 +207,15 @@ class Program:
                 shutil.rmtree(folder, ignore_errors=True)
             raise ProgramError(f"{arguments[0]!r} cannot be started: {error.strerror}") from None
         running = RunningProcess(process, folder)
-        self.running, self.received = running, bytearray()
+        self.running = running
+        self.received = bytearray()
         # Ends the program with this process; `atexit` does not run in a multiprocessing worker, Finalize does.
         self._finalizer = Finalize(self, running.stop, (0.0,), exitpriority=10)
         assert process.stdin is not None
         assert process.stdout is not None
-        running.stderr_reader = threading.Thread(target=running.collect_stderr, args=(process.stderr,), daemon=True)
+        running.stderr_reader = threading.Thread(
+            target=running.collect_stderr, args=(process.stderr,), daemon=True
+        )
         running.stderr_reader.start()
         for pipe_end in (process.stdin, process.stdout):
             os.set_blocking(pipe_end.fileno(), False)
@@ -231,7 +243,9 @@ class Program:
             pipes.register(process.stdout, selectors.EVENT_READ)
             pipes.register(process.stdin, selectors.EVENT_WRITE)
             while unsent or b"\n" not in self.received:
-                ready = {key.fileobj for key, _ in pipes.select(max(until_s - time.monotonic(), 0.0))}
+                ready = {
+                    key.fileobj for key, _ in pipes.select(max(until_s - time.monotonic(), 0.0))
+                }
                 if time.monotonic() >= until_s:
                     raise self.fail(f"no answer within {limit_s:g} s", 0.0)
                 if process.stdin in ready and unsent:
@@ -288,7 +302,8 @@ def serve(create: Callable[[dict[str, Any]], Respond]) -> None:
 
     create(setup) : returns the function that answers; an exception becomes {"ready": false, "status": reason}
     """
-    messages, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    messages = sys.stdin.buffer
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def send(reply: dict[str, Any]) -> None:

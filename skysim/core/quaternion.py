@@ -32,8 +32,14 @@ def to_rotation(a_from_b: Floats) -> Rotation:
 @jit
 def multiply(a_from_b: Floats, b_from_c: Floats) -> Floats:
     """a_from_c = a_from_b * b_from_c."""
-    aw, ax, ay, az = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
-    bw, bx, by, bz = b_from_c[0], b_from_c[1], b_from_c[2], b_from_c[3]
+    aw = a_from_b[0]
+    ax = a_from_b[1]
+    ay = a_from_b[2]
+    az = a_from_b[3]
+    bw = b_from_c[0]
+    bx = b_from_c[1]
+    by = b_from_c[2]
+    bz = b_from_c[3]
     return np.array(
         [
             aw * bw - ax * bx - ay * by - az * bz,
@@ -53,20 +59,38 @@ def inverse(a_from_b: Floats) -> Floats:
 @jit
 def apply(a_from_b: Floats, v_b: Floats) -> Floats:
     """v_a (3,) of v_b (3,): v + 2 w (u x v) + 2 u x (u x v) with u the vector part."""
-    w, x, y, z = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
-    p, q, r = v_b[0], v_b[1], v_b[2]
-    a, b, c = 2 * (y * r - z * q), 2 * (z * p - x * r), 2 * (x * q - y * p)
-    return np.array([p + w * a + y * c - z * b, q + w * b + z * a - x * c, r + w * c + x * b - y * a])
+    w = a_from_b[0]
+    x = a_from_b[1]
+    y = a_from_b[2]
+    z = a_from_b[3]
+    p = v_b[0]
+    q = v_b[1]
+    r = v_b[2]
+    a = 2 * (y * r - z * q)
+    b = 2 * (z * p - x * r)
+    c = 2 * (x * q - y * p)
+    return np.array(
+        [p + w * a + y * c - z * b, q + w * b + z * a - x * c, r + w * c + x * b - y * a]
+    )
 
 
 @jit
 def to_matrix(a_from_b: Floats) -> Floats:
     """(3, 3) a_from_b."""
-    w, x, y, z = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
+    w = a_from_b[0]
+    x = a_from_b[1]
+    y = a_from_b[2]
+    z = a_from_b[3]
     matrix = np.empty((3, 3))
-    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    matrix[0, 0] = 1 - 2 * (y * y + z * z)
+    matrix[0, 1] = 2 * (x * y - w * z)
+    matrix[0, 2] = 2 * (x * z + w * y)
+    matrix[1, 0] = 2 * (x * y + w * z)
+    matrix[1, 1] = 1 - 2 * (x * x + z * z)
+    matrix[1, 2] = 2 * (y * z - w * x)
+    matrix[2, 0] = 2 * (x * z - w * y)
+    matrix[2, 1] = 2 * (y * z + w * x)
+    matrix[2, 2] = 1 - 2 * (x * x + y * y)
     return matrix
 
 
@@ -75,7 +99,9 @@ def from_rotvec(rotvec_rad: Floats) -> Floats:
     """The rotation by |turn_rad| about turn_rad (3,): (cos(a / 2), sin(a / 2) axis)."""
     angle = math.sqrt(rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2)
     scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5  # the limit for small angles
-    return np.array([math.cos(angle / 2), scale * rotvec_rad[0], scale * rotvec_rad[1], scale * rotvec_rad[2]])
+    return np.array(
+        [math.cos(angle / 2), scale * rotvec_rad[0], scale * rotvec_rad[1], scale * rotvec_rad[2]]
+    )
 
 
 @jit
@@ -83,7 +109,9 @@ def to_rotvec(a_from_b: Floats) -> Floats:
     """(3,) axis times angle, the angle at most pi."""
     # q and -q are the same rotation: take the one with w >= 0.
     sign = 1.0 if a_from_b[0] >= 0 else -1.0
-    x, y, z = sign * a_from_b[1], sign * a_from_b[2], sign * a_from_b[3]
+    x = sign * a_from_b[1]
+    y = sign * a_from_b[2]
+    z = sign * a_from_b[3]
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2 * math.atan2(sine, sign * a_from_b[0]) / sine if sine > 1e-12 else 2.0
     return np.array([scale * x, scale * y, scale * z])
@@ -92,13 +120,17 @@ def to_rotvec(a_from_b: Floats) -> Floats:
 @jit
 def cross(a: Floats, b: Floats) -> Floats:
     """a x b; np.cross takes ten times as long for a single pair."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 @jit
 def matrix_vector(matrix: Floats, v: Floats) -> Floats:
     """matrix (3, 3) times v (3,)."""
-    p, q, r = v[0], v[1], v[2]
+    p = v[0]
+    q = v[1]
+    r = v[2]
     return np.array(
         [
             matrix[0, 0] * p + matrix[0, 1] * q + matrix[0, 2] * r,
@@ -109,7 +141,9 @@ def matrix_vector(matrix: Floats, v: Floats) -> Floats:
 
 
 @jit
-def interpolate(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], fraction: Floats) -> Floats:
+def interpolate(
+    knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], fraction: Floats
+) -> Floats:
     """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
 
     hermite_rad : (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
@@ -117,11 +151,16 @@ def interpolate(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64]
     """
     out = np.empty((len(knot), 4))
     for m in range(len(knot)):
-        k, s = knot[m], fraction[m]
+        k = knot[m]
+        s = fraction[m]
         # Hermite basis: value at the end, slope at the beginning, slope at the end. The value at the beginning is zero.
-        a, b, c = s * s * (3 - 2 * s), s * (1 - s) ** 2, -s * s * (1 - s)
+        a = s * s * (3 - 2 * s)
+        b = s * (1 - s) ** 2
+        c = -s * s * (1 - s)
         rotvec, begin, end = hermite_rad[k]
         turned = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
-        for n in range(4):  # an assignment to the row would take longer to compile than all the rest
+        for n in range(
+            4
+        ):  # an assignment to the row would take longer to compile than all the rest
             out[m, n] = turned[n]
     return out

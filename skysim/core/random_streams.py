@@ -11,10 +11,17 @@ from __future__ import annotations
 import numpy as np
 
 # First number of the key under a scene's seed; the second is the frame, if it is drawn anew for each.
-DETECTOR, JITTER, IMU, AIR_CURRENT, LED_CLOCKS, CAMERA_TIMING = 1, 2, 3, 4, 5, 6
+DETECTOR = 1
+JITTER = 2
+IMU = 3
+AIR_CURRENT = 4
+LED_CLOCKS = 5
+CAMERA_TIMING = 6
 SCINTILLATION = 10
 BALANCE = 15  # what a lab assumes of a vehicle; the second key is 0, or 1 for the readings of wheel speeds
-LED_CODE, LED_CODE_CLOCK = 12, 13  # the second key of LED_CODE is the bit
+# the second key of LED_CODE is the bit
+LED_CODE = 12
+LED_CODE_CLOCK = 13
 VARIABLE_STARS = 11  # under `light.variability_seed`
 HEAD_SEED = 14  # seed of a further star camera; the second key is its number
 SATELLITES = 7  # under the seed of `light.satellites.random`

@@ -16,13 +16,21 @@ from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
-J2000 = datetime.datetime(2000, 1, 1, 12)  # the calendar date of J2000.0, in the scale that is counted from it
+J2000 = datetime.datetime(
+    2000, 1, 1, 12
+)  # the calendar date of J2000.0, in the scale that is counted from it
 J2000_JD = 2451545.0
 MJD_ZERO_JD = 2400000.5
 DAY = datetime.timedelta(days=1)
 TT_MINUS_TAI_S = 32.184
 GPS_MINUS_TAI_S = -19.0
-SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}  # astropy's, by CCSDS's time systems
+SCALES = {
+    "UTC": "utc",
+    "TAI": "tai",
+    "TT": "tt",
+    "TDB": "tdb",
+    "GPS": "tai",
+}  # astropy's, by CCSDS's time systems
 
 
 def in_utc(moment: datetime.datetime) -> datetime.datetime:
@@ -44,7 +52,9 @@ def tai_minus_utc_s(time: datetime.datetime) -> float:
     moment = in_utc(time)
     midnight = datetime.datetime(moment.year, moment.month, moment.day)
     # The function without its warnings: later leap seconds are unknown, and before 1960 there was no UTC.
-    seconds, _status = erfa.ufunc.dat(moment.year, moment.month, moment.day, (moment - midnight) / DAY)
+    seconds, _status = erfa.ufunc.dat(
+        moment.year, moment.month, moment.day, (moment - midnight) / DAY
+    )
     return float(seconds)
 
 
@@ -80,7 +90,9 @@ def ut1_jd(time: datetime.datetime) -> float:
     """
     mjd, ut1_minus_utc_s = ut1_table()
     utc = utc_jd(time)
-    return utc + float(np.interp(utc - MJD_ZERO_JD, mjd, ut1_minus_utc_s, left=0.0, right=0.0)) / DAY_S
+    return (
+        utc + float(np.interp(utc - MJD_ZERO_JD, mjd, ut1_minus_utc_s, left=0.0, right=0.0)) / DAY_S
+    )
 
 
 @lru_cache(maxsize=1)

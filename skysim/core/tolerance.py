@@ -25,7 +25,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, Length, Number, Time
 
-SIGMAS_OF_TOLERANCE = 3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
+SIGMAS_OF_TOLERANCE = (
+    3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
+)
 
 
 class Tolerance(float):
@@ -51,7 +53,8 @@ class Tolerance(float):
             density = math.exp(-(k**2) / 2) / math.sqrt(2 * math.pi)
             sigma = parent_sigma * math.sqrt(1 - 2 * k * density / math.erf(k / math.sqrt(2)))
         self = super().__new__(cls, sigma)
-        self.half_width, self.parent_sigma = half_width, parent_sigma
+        self.half_width = half_width
+        self.parent_sigma = parent_sigma
         return self
 
     def __reduce__(self) -> tuple[type[Tolerance], tuple[float, float | None]]:
@@ -105,11 +108,17 @@ class ToleranceConfig(ConfigModel):
     def check_distribution(self) -> Self:
         half_width, sigma = self.numbers()
         if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
-            raise InputError("", f"{self.distribution or 'an error'} requires a tolerance", "tolerance, or sigma")
+            raise InputError(
+                "", f"{self.distribution or 'an error'} requires a tolerance", "tolerance, or sigma"
+            )
         if half_width is not None and self.distribution == "normal":
-            raise InputError("tolerance", "a normal distribution has none", "uniform, truncated_normal")
+            raise InputError(
+                "tolerance", "a normal distribution has none", "uniform, truncated_normal"
+            )
         if half_width is not None and sigma is not None and self.distribution != "truncated_normal":
-            raise InputError("sigma", "a uniform distribution has none", "distribution: truncated_normal")
+            raise InputError(
+                "sigma", "a uniform distribution has none", "distribution: truncated_normal"
+            )
         if half_width is not None and sigma is not None and not 0.01 <= half_width / sigma <= 100:
             raise InputError("sigma", "", "a hundredth to a hundred times the tolerance")
         return self
@@ -120,7 +129,9 @@ class ToleranceConfig(ConfigModel):
         if half_width is None:
             return float(sigma or 0.0)
         truncated = self.distribution == "truncated_normal"
-        return Tolerance(half_width, (sigma or half_width / SIGMAS_OF_TOLERANCE) if truncated else None)
+        return Tolerance(
+            half_width, (sigma or half_width / SIGMAS_OF_TOLERANCE) if truncated else None
+        )
 
 
 def without_sign(value: Any) -> Any:
@@ -138,7 +149,8 @@ SIGNED_QUANTITY = BeforeValidator(
     ],
 )
 SIGNED_NUMBER = BeforeValidator(
-    without_sign, json_schema_input_type=float | Annotated[str, Field(description="±0.1", pattern=SIGNED)]
+    without_sign,
+    json_schema_input_type=float | Annotated[str, Field(description="±0.1", pattern=SIGNED)],
 )
 
 
@@ -182,7 +194,11 @@ def error_of(value: Any) -> Any:
 
 def in_file(value: float) -> Any:
     """For `model_dump`: a number for a Gaussian, and all that defines a tolerance for the rest."""
-    return {"tolerance": value.half_width, "sigma": value.parent_sigma} if isinstance(value, Tolerance) else value
+    return (
+        {"tolerance": value.half_width, "sigma": value.parent_sigma}
+        if isinstance(value, Tolerance)
+        else value
+    )
 
 
 @dataclass(frozen=True)
@@ -192,9 +208,14 @@ class ErrorSchema:
     quantity: Any
     section: type[ToleranceConfig]
 
-    def __get_pydantic_core_schema__(self, _source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, _source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         tag = self.section.__name__  # an error names the keys of the section only if there is one
-        kinds = {"quantity": handler.generate_schema(self.quantity), tag: handler.generate_schema(self.section)}
+        kinds = {
+            "quantity": handler.generate_schema(self.quantity),
+            tag: handler.generate_schema(self.section),
+        }
         chosen = core_schema.tagged_union_schema(
             kinds, lambda value: tag if isinstance(value, dict | ToleranceConfig) else "quantity"
         )

@@ -52,7 +52,9 @@ class Trajectory:
         return cls(np.array([0.0, end_s]), ends, np.zeros((2, 3)))
 
     @classmethod
-    def at_rate(cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats) -> Trajectory:
+    def at_rate(
+        cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats
+    ) -> Trajectory:
         """A constant rate (3,) in body axes, with this attitude at at_s; sampled at times (N,)."""
         turned = Rotation.from_rotvec(np.outer(t_s - at_s, rate_body_rad_s))
         return cls(t_s, lab_from_body * turned, np.tile(rate_body_rad_s, (len(t_s), 1)))
@@ -75,7 +77,8 @@ class Trajectory:
         if not self._segments:
             step = np.diff(self.t_s)[:, None]
             rotvec = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
-            begin, end = self.rate_body_rad_s[:-1] * step, self.rate_body_rad_s[1:] * step
+            begin = self.rate_body_rad_s[:-1] * step
+            end = self.rate_body_rad_s[1:] * step
             # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
             end = end + np.cross(rotvec, end) / 2
             wxyz = self.lab_from_body.as_quat(scalar_first=True)
@@ -90,10 +93,16 @@ class Trajectory:
         """
         t = np.atleast_1d(np.asarray(t_s, dtype=float))
         if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
-            raise ValueError(f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s")
-        k = np.minimum(np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2)
+            raise ValueError(
+                f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
+            )
+        k = np.minimum(
+            np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2
+        )
         fraction = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
-        lab_from_body = Rotation.from_quat(interpolate(*self.hermite_segments(), k, fraction), scalar_first=True)
+        lab_from_body = Rotation.from_quat(
+            interpolate(*self.hermite_segments(), k, fraction), scalar_first=True
+        )
         return lab_from_body if np.ndim(t_s) else lab_from_body[0]
 
     def rate_at(self, t_s: float) -> Floats:
@@ -193,7 +202,10 @@ class Sources:
         """The chosen sources, by mask or index."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
-        return Sources(*(None if column is None else column.take(rows, axis=0) for column in columns))  # type: ignore[arg-type]
+        chosen: list[Any] = [
+            None if column is None else column.take(rows, axis=0) for column in columns
+        ]
+        return Sources(*chosen)
 
 
 class StarSources(Sources):
@@ -212,18 +224,26 @@ class StarSources(Sources):
         """
         order, sorted_place = self.by_z
         from_pole = math.acos(min(max(float(direction[2]), -1.0), 1.0))
-        ends = (math.cos(min(from_pole + angle_rad, math.pi)), math.cos(max(from_pole - angle_rad, 0.0)))
+        ends = (
+            math.cos(min(from_pole + angle_rad, math.pi)),
+            math.cos(max(from_pole - angle_rad, 0.0)),
+        )
         first, last = np.searchsorted(sorted_place[:, 2], (ends[0] - ROUNDING, ends[1] + ROUNDING))
         chord = 2.0 * math.sin(min(angle_rad, math.pi) / 2.0)
-        return np.sort(order[first + _closer(sorted_place[first:last], np.asarray(direction), chord)])
+        return np.sort(
+            order[first + _closer(sorted_place[first:last], np.asarray(direction), chord)]
+        )
 
 
 @jit
 def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]:
     """Which of (N, 3) unit vectors are at most a chord from another one."""
-    found, count = np.empty(len(place), np.int64), 0
+    found = np.empty(len(place), np.int64)
+    count = 0
     for n in range(len(place)):
-        x, y, z = place[n, 0] - direction[0], place[n, 1] - direction[1], place[n, 2] - direction[2]
+        x = place[n, 0] - direction[0]
+        y = place[n, 1] - direction[1]
+        z = place[n, 2] - direction[2]
         found[count] = n
         count += x * x + y * y + z * z <= chord * chord
     return found[:count]
@@ -232,7 +252,9 @@ def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]
 def with_sources(parts: Sequence[Sources]) -> Sources:
     """All sources of several sets of which none moves, in their order."""
     columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
-    return Sources(**{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None})
+    return Sources(
+        **{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None}
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,9 @@ from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 
 MAX_CHARACTERS = 80  # of a quantity
-QUANTITY_PATTERN = r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
+QUANTITY_PATTERN = (
+    r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
+)
 
 # Suffixes that the YAML key lacks, of fields that `quantity` parses. `dark_e_s` and `rate_deg_s` are bare numbers and
 # keep theirs.
@@ -29,8 +31,18 @@ SI_SUFFIX = re.compile(
 
 # The SI unit of each suffix, as the loader accepts it.
 SI_UNITS = {
-    **{"m": "m", "s": "s", "n": "N", "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m2", "cd": "cd", "w_sr": "W/sr"},
-    **{"nm": "N m", "nm_rad": "N m/rad", "nms": "N m s", "nms2": "N m s2"},
+    "m": "m",
+    "s": "s",
+    "n": "N",
+    "kg": "kg",
+    "kg_m": "kg m",
+    "kg_m2": "kg m2",
+    "cd": "cd",
+    "w_sr": "W/sr",
+    "nm": "N m",
+    "nm_rad": "N m/rad",
+    "nms": "N m s",
+    "nms2": "N m s2",
 }
 
 
@@ -49,7 +61,9 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
         try:
             return in_si(value, si_unit)
         except InputError as error:
-            raise InputError("", f"{value!r} is not a {what}", f"a {what} such as {examples}") from error
+            raise InputError(
+                "", f"{value!r} is not a {what}", f"a {what} such as {examples}"
+            ) from error
 
     return parse
 
@@ -57,12 +71,22 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
 def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
     """`quantity` as the validator of a key; the JSON schema declares the value as a string."""
     schema = Field(description=f"a {what} such as {examples}", pattern=QUANTITY_PATTERN)
-    return BeforeValidator(quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, schema])
+    return BeforeValidator(
+        quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, schema]
+    )
 
 
 # Factors of the units that scenes use most, as astropy has them, to the bit: astropy takes 0.2 s to import.
 COMMON_UNITS = {
-    "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": math.nextafter(INCH_M, 1), "ft": 0.3048},
+    "m": {
+        "m": 1.0,
+        "cm": 0.01,
+        "mm": 1e-3,
+        "um": 1e-6,
+        "nm": 1e-9,
+        "in": math.nextafter(INCH_M, 1),
+        "ft": 0.3048,
+    },
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
     "kg": {"kg": 1.0, "g": 1e-3},
     "kg m2": {"kg m2": 1.0},
@@ -90,7 +114,11 @@ def in_si(value: str, si_unit: str | None = None) -> float:
         try:
             number = units.Quantity(value)
             return float(number.to_value(si_unit) if si_unit else number.si.value)
-        except (TypeError, ValueError, ArithmeticError) as error:  # UnitsError is a ValueError; "3 m(1/0)", "3 m(9e9)"
+        except (
+            TypeError,
+            ValueError,
+            ArithmeticError,
+        ) as error:  # UnitsError is a ValueError; "3 m(1/0)", "3 m(9e9)"
             raise InputError("", error) from None
 
 
@@ -128,7 +156,9 @@ Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
 QuantityRange = tuple[str, str, str, float, float]
 
 
-def quantities_within(section: str, ranges: Mapping[str, QuantityRange], texts: Sequence[str]) -> list[float]:
+def quantities_within(
+    section: str, ranges: Mapping[str, QuantityRange], texts: Sequence[str]
+) -> list[float]:
     """Quantities in SI units. Raises InputError for an invalid or out-of-range value.
 
     section : of the keys in errors;  ranges : by the name of the quantity;  texts : one each, in that order
@@ -158,7 +188,9 @@ class ConfigModel(BaseModel):
     )
 
 
-def check_table(first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg") -> None:
+def check_table(
+    first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg"
+) -> None:
     """Raise InputError unless two columns have equal length and the first, the angle, ascends."""
     if len(first) != len(values):
         raise InputError("", f"{first_name} has {len(first)} numbers, {name} has {len(values)}")

@@ -14,7 +14,9 @@ from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.sections.motion import ControlConfig
 
-TORQUE_DEFICIT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
+TORQUE_DEFICIT = (
+    0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
+)
 
 
 @dataclass(slots=True)
@@ -70,7 +72,9 @@ class Pid:
         still integrated.
         """
         if not self.limited:
-            integrate_error(self.error_sum_rad_s, self.error_rad, commanded_nm, achieved_nm, period_s)
+            integrate_error(
+                self.error_sum_rad_s, self.error_rad, commanded_nm, achieved_nm, period_s
+            )
 
 
 @jit
@@ -94,7 +98,8 @@ def pid_torque(
     feedback_size = math.sqrt((feedback**2).sum())
     error_angle = math.sqrt((error**2).sum())
     feedback_limit = kd * min(
-        rate_limit, math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * error_angle)
+        rate_limit,
+        math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * error_angle),
     )
     # Small errors are not limited: there the integral must be free to balance a constant torque.
     limited = feedback_size > feedback_limit and kp * error_angle > feedback_limit
@@ -109,7 +114,9 @@ def pid_torque(
 
 
 @jit
-def integrate_error(error_sum: Floats, error: Floats, commanded: Floats, achieved: Floats, period_s: float) -> None:
+def integrate_error(
+    error_sum: Floats, error: Floats, commanded: Floats, achieved: Floats, period_s: float
+) -> None:
     """`Pid.integrate` on one error sum (3,), in place."""
     for i in range(3):
         # Anti-windup: do not integrate further into a limit, but do integrate out of it.
@@ -135,7 +142,9 @@ def build_controller(
     """
     config = config or ControlConfig()
     inertia = np.asarray(inertia_kg_m2, dtype=float)
-    b, z, p = config.bandwidth_rad_s, config.damping, config.integral_rad_s if config.law == "pid" else 0.0
+    b = config.bandwidth_rad_s
+    z = config.damping
+    p = config.integral_rad_s if config.law == "pid" else 0.0
     return Pid(
         reference,
         inertia if inertia.ndim == 2 else np.diag(inertia).copy(),

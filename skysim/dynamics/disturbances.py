@@ -58,7 +58,9 @@ def lab_and_earth_torque(
     lab_from_body, rate, momentum = state
     body_from_lab = inverse(lab_from_body)
     earth = apply(body_from_lab, earth_lab_rad_s)
-    return apply(body_from_lab, torque_lab_nm) + earth_torque_nm(inertia_kg_m2, momentum, rate, earth)
+    return apply(body_from_lab, torque_lab_nm) + earth_torque_nm(
+        inertia_kg_m2, momentum, rate, earth
+    )
 
 
 class AirCurrent:
@@ -120,7 +122,12 @@ class DisturbanceModel:
     @property
     def inactive(self) -> bool:
         """Whether there is no disturbance."""
-        return not (self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or self.air_current or self.impulses)
+        return not (
+            self.turbine_lab_nm.any()
+            or self.earth_lab_rad_s.any()
+            or self.air_current
+            or self.impulses
+        )
 
     def torque_nm(
         self,
@@ -135,7 +142,11 @@ class DisturbanceModel:
         thousandth. An impulse is a half-sine of torque whose integral is J times its change of rate; each step gets
         the mean torque of its part.
         """
-        torque_lab_nm = self.turbine_lab_nm + self.air_current.sample() if self.air_current else self.turbine_lab_nm
+        torque_lab_nm = (
+            self.turbine_lab_nm + self.air_current.sample()
+            if self.air_current
+            else self.turbine_lab_nm
+        )
         torque_nm = np.empty((len(times_s) - 1, 3))
         torque_nm[:] = lab_and_earth_torque(
             torque_lab_nm,
@@ -147,6 +158,8 @@ class DisturbanceModel:
             if impulse.begin_s < times_s[-1] and times_s[0] < impulse.begin_s + impulse.duration_s:
                 # Impulse fraction of each step over its length: the mean torque of the step for a unit
                 # impulse.
-                mean_per_impulse = [impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)]
+                mean_per_impulse = [
+                    impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)
+                ]
                 torque_nm += np.outer(mean_per_impulse, self.inertia_kg_m2 @ impulse.rate_rad_s)
         return torque_nm

@@ -14,7 +14,12 @@ import numpy as np
 
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers.adapter import NO_SOURCE, ControllerSource, ExternalLaw, external_law
+from skysim.dynamics.controllers.adapter import (
+    NO_SOURCE,
+    ControllerSource,
+    ExternalLaw,
+    external_law,
+)
 from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
@@ -62,7 +67,11 @@ class FlightComputer:
     """
 
     def __init__(
-        self, scene: Scene, vehicle: VehicleModel, reference: Reference, source: ControllerSource = NO_SOURCE
+        self,
+        scene: Scene,
+        vehicle: VehicleModel,
+        reference: Reference,
+        source: ControllerSource = NO_SOURCE,
     ) -> None:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
@@ -76,7 +85,9 @@ class FlightComputer:
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
-            self.momentum_dump = MomentumDump(self.actuator_sets["fans"], Desaturator(self.config.desaturation))
+            self.momentum_dump = MomentumDump(
+                self.actuator_sets["fans"], Desaturator(self.config.desaturation)
+            )
 
     def build_law(
         self, scene: Scene, vehicle: VehicleModel, reference: Reference, source: ControllerSource
@@ -84,9 +95,12 @@ class FlightComputer:
         """The control law that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         config = self.config
         assert config is not None
-        torque_nm, rate_limit_rad_s = authority_nm(self.actuator), return_rate_limit_rad_s(scene)
+        torque_nm = authority_nm(self.actuator)
+        rate_limit_rad_s = return_rate_limit_rad_s(scene)
         if source.factory is None and config.law in BUILT_IN_LAWS:
-            return build_controller(reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s)
+            return build_controller(
+                reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s
+            )
         setup = ControllerSetup(
             self.period_s,
             np.array(vehicle.inertia_kg_m2),
@@ -137,7 +151,9 @@ class FlightComputer:
         actuator_torque_nm = self.control_torque_nm
         if self.momentum_dump:
             # The other actuators give the commanded torque minus the fans', which removes their momentum.
-            actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(control, momentum_nms, inputs)
+            actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(
+                control, momentum_nms, inputs
+            )
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
@@ -149,7 +165,8 @@ def return_rate_limit_rad_s(scene: Scene) -> float:
 
     A saturated gyro reads less than the true rate, so a return faster than its limit would not be braked.
     """
-    control, imu = scene.motion.control, scene.vehicle.imu
+    control = scene.motion.control
+    imu = scene.vehicle.imu
     if control is None or control.feedback == "truth" or imu is None:
         return math.inf
     return GYRO_RATE_FRACTION * math.radians(imu.gyro.rate_limit_deg_s)

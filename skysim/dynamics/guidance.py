@@ -22,7 +22,14 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.profiles.angle import AngleProfile, linear_sweep, log_sweep, rest_to_rest, steady, still
+from skysim.dynamics.profiles.angle import (
+    AngleProfile,
+    linear_sweep,
+    log_sweep,
+    rest_to_rest,
+    steady,
+    still,
+)
 from skysim.dynamics.profiles.rate_change import integrate_knots, rate_change_state
 from skysim.dynamics.profiles.spline import AttitudeSpline
 from skysim.scene.sections.motion import (
@@ -45,24 +52,34 @@ State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, accelera
 KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most this rotation ...
 MIN_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `RateChangeLeg`
 MAX_KNOTS = 5_000_000
-MAX_JUMP_DEG, MAX_JUMP_DEG_S = 0.1, 0.1  # of attitude and rate where a profile begins
+# of attitude and rate where a profile begins
+MAX_JUMP_DEG = 0.1
+MAX_JUMP_DEG_S = 0.1
 
 
 def attitude(angles: AttitudeConfig) -> Rotation:
     """3-2-1 Euler angles (intrinsic ZYX) to lab_from_body = Rz(yaw) Ry(pitch) Rx(roll); degrees in."""
-    return Rotation.from_euler("ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True)
+    return Rotation.from_euler(
+        "ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True
+    )
 
 
 def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
     """lab_from_body at the start: the identity for a pointing, since then the lab is defined by the body."""
     if motion.start == "profile":
         return quaternion.to_rotation(profile_start(motion, profiles)[0])
-    return attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
+    return (
+        attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
+    )
 
 
 def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Floats:
     """(3,) rate at the start, in body axes."""
-    return profile_start(motion, profiles)[1] if motion.start == "profile" else np.radians(motion.rate_deg_s)
+    return (
+        profile_start(motion, profiles)[1]
+        if motion.start == "profile"
+        else np.radians(motion.rate_deg_s)
+    )
 
 
 def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> State:
@@ -74,10 +91,16 @@ def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> S
 
 @jit
 def rotated_state(
-    lab_from_start_wxyz: Floats, axis: Floats, angle_rad: float, rate_rad_s: float, acceleration_rad_s2: float
+    lab_from_start_wxyz: Floats,
+    axis: Floats,
+    angle_rad: float,
+    rate_rad_s: float,
+    acceleration_rad_s2: float,
 ) -> tuple[Floats, Floats, Floats]:
     """The state after a rotation by an angle about a unit axis, which is the same in lab and body axes."""
-    lab_from_ref_wxyz = quaternion.multiply(lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis))
+    lab_from_ref_wxyz = quaternion.multiply(
+        lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis)
+    )
     return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
 
 
@@ -111,7 +134,9 @@ class RateChangeLeg:
     change_rad_s: Floats
 
     def state_at(self, t_s: float) -> State:
-        return rate_change_state(self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s)
+        return rate_change_state(
+            self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +175,9 @@ def length_and_direction(vector: Floats) -> tuple[float, Floats]:
 def hold(element: Any, start: LegStart) -> Leg:
     """Rest at the present attitude; a preceding rate drops to zero at once."""
     caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
-    return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still)
+    return FixedAxisLeg(
+        start.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still
+    )
 
 
 def step(element: StepConfig, start: LegStart) -> Leg:
@@ -167,14 +194,21 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
     """
     lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
     back_wxyz = quaternion.inverse(start.lab_from_ref_wxyz)
-    angle, axis = length_and_direction(quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there)))
+    angle, axis = length_and_direction(
+        quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there))
+    )
     if angle < 1e-12:
         return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
     accel = math.radians(element.acceleration_deg_s2)
     rate = min(math.radians(element.rate_deg_s), math.sqrt(accel * angle / 1.5))
     ramp = 1.5 * rate / accel
     duration_s = ramp + angle / rate
-    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, partial(rest_to_rest, angle, rate, ramp, duration_s))
+    return FixedAxisLeg(
+        start.lab_from_ref_wxyz,
+        axis,
+        duration_s,
+        partial(rest_to_rest, angle, rate, ramp, duration_s),
+    )
 
 
 def rate(element: RateConfig, start: LegStart) -> Leg:
@@ -188,7 +222,8 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
 
     Raises InputError (one line) where more than five million knots would be needed.
     """
-    duration_s, start_rate = element.duration_s, start.rate_rad_s
+    duration_s = element.duration_s
+    start_rate = start.rate_rad_s
     change = np.radians(element.rate_deg_s) - start_rate
     fastest = max(float(np.linalg.norm(start_rate)), float(np.linalg.norm(start_rate + change)))
     axis_moves = np.linalg.norm(np.cross(start_rate, change)) > 1e-12 * fastest**2
@@ -214,7 +249,8 @@ def sine(element: SineConfig, start: LegStart) -> Leg:
     The three axes have the same phase, so that the axis of rotation is fixed. The envelope rises and falls within a
     period, or half of the duration if that is shorter.
     """
-    duration_s, omega = element.duration_s, 2 * math.pi * element.frequency_hz
+    duration_s = element.duration_s
+    omega = 2 * math.pi * element.frequency_hz
     growth_s = min(1 / element.frequency_hz, duration_s / 2)
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
     profile = partial(linear_sweep, size, omega, 0.0, duration_s, growth_s, growth_s)
@@ -227,13 +263,18 @@ def chirp(element: ChirpConfig, start: LegStart) -> Leg:
     linear: f = f0 + (f1 - f0) t / T;  log: f = f0 (f1 / f0)^(t / T). The envelope rises within a period of f0 and falls
     within one of f1.
     """
-    duration_s, omega = element.duration_s, 2 * math.pi * element.from_hz
+    duration_s = element.duration_s
+    omega = 2 * math.pi * element.from_hz
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
     if element.sweep == "log":
-        sweep, change = log_sweep, math.log(element.to_hz / element.from_hz) / duration_s
+        sweep = log_sweep
+        change = math.log(element.to_hz / element.from_hz) / duration_s
     else:
-        sweep, change = linear_sweep, 2 * math.pi * (element.to_hz - element.from_hz) / duration_s
-    profile = partial(sweep, size, omega, change, duration_s, 1 / element.from_hz, 1 / element.to_hz)
+        sweep = linear_sweep
+        change = 2 * math.pi * (element.to_hz - element.from_hz) / duration_s
+    profile = partial(
+        sweep, size, omega, change, duration_s, 1 / element.from_hz, 1 / element.to_hz
+    )
     return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, profile)
 
 
@@ -245,7 +286,8 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     """
     spline = start.spline
     assert spline is not None
-    first_s, last_s = float(spline.t_s[0]), float(spline.t_s[-1])
+    first_s = float(spline.t_s[0])
+    last_s = float(spline.t_s[-1])
     begin_s = first_s if element.begin == "first_sample" else start.begin_s * spline.absolute
     step_s = float(spline.t_s[1]) - first_s
     if first_s - begin_s > step_s + 1e-9 or last_s <= begin_s:
@@ -309,11 +351,15 @@ class Reference:
 
     def attitudes(self, t_s: Floats) -> Rotation:
         """lab_from_ref at (N,) times."""
-        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4), scalar_first=True)
+        return Rotation.from_quat(
+            np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4), scalar_first=True
+        )
 
 
 def plan(
-    motion: MotionConfig, lab_from_start: Rotation | None = None, profiles: Sequence[AttitudeSpline] = ()
+    motion: MotionConfig,
+    lab_from_start: Rotation | None = None,
+    profiles: Sequence[AttitudeSpline] = (),
 ) -> Reference:
     """The reference of the list of maneuvers; each begins where the previous one ended.
 
@@ -337,7 +383,9 @@ def plan(
         spline = next(splines) if element.kind == "profile" else None
         legs.append(LEGS[element.kind](element, leg_start._replace(spline=spline)))
         lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].state_at(legs[-1].duration_s)
-        leg_start = LegStart(lab_from_ref_wxyz, rate_rad_s, home, leg_start.begin_s + legs[-1].duration_s)
+        leg_start = LegStart(
+            lab_from_ref_wxyz, rate_rad_s, home, leg_start.begin_s + legs[-1].duration_s
+        )
     size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
     final_leg = FixedAxisLeg(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
     start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
@@ -360,7 +408,9 @@ class Impulse:
 
     def fraction(self, from_s: float, to_s: float) -> float:
         """The fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
-        a, b = (min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s))
+        a, b = (
+            min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s)
+        )
         return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
 
 

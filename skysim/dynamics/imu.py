@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skysim.core import quaternion
-from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM, STANDARD_GRAVITY_M_S2
+from skysim.core.constants import (
+    ARCSEC_RAD,
+    DEG_H_RAD_S,
+    EARTH_RATE_RAD_S,
+    PPM,
+    STANDARD_GRAVITY_M_S2,
+)
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
@@ -27,8 +33,12 @@ from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
-CUBIC_POINTS = 4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
-GAUSS_OFFSET = 0.5 / math.sqrt(3)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
+CUBIC_POINTS = (
+    4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
+)
+GAUSS_OFFSET = 0.5 / math.sqrt(
+    3
+)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
 TIME_TOLERANCE_S = 1e-9  # tolerance for rounding of sample times
 NO_RATE = np.zeros(3)
 
@@ -58,9 +68,12 @@ def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
 
     Lab z is up, x at the azimuth from north through east, y = z cross x.
     """
-    latitude, azimuth = math.radians(site.latitude_deg), math.radians(site.x_azimuth_deg)
+    latitude = math.radians(site.latitude_deg)
+    azimuth = math.radians(site.x_azimuth_deg)
     north = math.cos(latitude)
-    return EARTH_RATE_RAD_S * np.array([north * math.cos(azimuth), north * math.sin(azimuth), math.sin(latitude)])
+    return EARTH_RATE_RAD_S * np.array(
+        [north * math.cos(azimuth), north * math.sin(azimuth), math.sin(latitude)]
+    )
 
 
 def ideal_increments(
@@ -96,7 +109,8 @@ def ideal_increments(
     """
     if len(t_s) < 2:
         raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
-    first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
+    first_s = np.min(ends_s, initial=np.inf) - step_s
+    last_s = np.max(ends_s, initial=-np.inf)
     if len(ends_s) and not (
         t_s[0] - TIME_TOLERANCE_S <= first_s and last_s <= t_s[-1] + TIME_TOLERANCE_S
     ):  # also rejects NaN
@@ -137,7 +151,8 @@ def inertial_knots(
         centripetal = quaternion.cross(rate, quaternion.cross(rate, position_m))
         weight = quaternion.apply(body_from_lab, up)
         for i in range(3):
-            knots[k, i], knots[k, 3 + i] = rate[i], centripetal[i] + weight[i]
+            knots[k, i] = rate[i]
+            knots[k, 3 + i] = centripetal[i] + weight[i]
     return knots
 
 
@@ -149,17 +164,21 @@ def integrate_intervals(
 
     An interval is split at the knots; each part is one cubic, which two Gauss points integrate exactly.
     """
-    angle, velocity = np.empty((len(ends_s), 3)), np.empty((len(ends_s), 3))
+    angle = np.empty((len(ends_s), 3))
+    velocity = np.empty((len(ends_s), 3))
     last = len(t_s) - 2
     for n in range(len(ends_s)):
-        begin, end = ends_s[n] - step_s, ends_s[n]
+        begin = ends_s[n] - step_s
+        end = ends_s[n]
         first = min(max(np.searchsorted(t_s, begin, side="right") - 1, 0), last)
         # change = w(end) - w(begin), which is the integral of dw/dt.
-        total, change = np.zeros(6), np.zeros(6)
+        total = np.zeros(6)
+        change = np.zeros(6)
         add_cubic(t_s, knots, first, begin, -1.0, change)
         for k in range(first, last + 1):
             stop = end if k == last else min(end, t_s[k + 1])
-            middle, length = (begin + stop) / 2, stop - begin
+            middle = (begin + stop) / 2
+            length = stop - begin
             add_cubic(t_s, knots, k, middle - GAUSS_OFFSET * length, length / 2, total)
             add_cubic(t_s, knots, k, middle + GAUSS_OFFSET * length, length / 2, total)
             begin = stop
@@ -168,7 +187,8 @@ def integrate_intervals(
         add_cubic(t_s, knots, k, end, 1.0, change)
         turned = quaternion.cross(change[:3], position_m)
         for i in range(3):
-            angle[n, i], velocity[n, i] = total[i], total[3 + i] + turned[i]
+            angle[n, i] = total[i]
+            velocity[n, i] = total[3 + i] + turned[i]
     return angle, velocity
 
 
@@ -214,7 +234,9 @@ class Triad:
     quantum: float
     remainder: Floats = field(default_factory=lambda: np.zeros(3))
 
-    def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def measure(
+        self, ideal: Floats, step_s: float, normal: Floats
+    ) -> tuple[Floats, NDArray[np.bool_]]:
         """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
         decay = math.exp(-step_s / self.markov_time_s)
         innovation = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
@@ -225,7 +247,14 @@ class Triad:
             self.markov_bias,
             self.remainder,
             normal,
-            (step_s, decay, innovation, self.white * math.sqrt(step_s), self.limit * step_s, self.quantum),
+            (
+                step_s,
+                decay,
+                innovation,
+                self.white * math.sqrt(step_s),
+                self.limit * step_s,
+                self.quantum,
+            ),
         )
         return counted, limited
 
@@ -248,7 +277,8 @@ def corrupt(
     The clipped part is lost; the quantization remainder is carried to the next sample.
     """
     step, decay, innovation, white, limit, quantum = parameters
-    counted, limited = np.empty(ideal.shape), np.zeros(len(ideal), dtype=np.bool_)
+    counted = np.empty(ideal.shape)
+    limited = np.zeros(len(ideal), dtype=np.bool_)
     for n in range(len(ideal)):
         for i in range(3):
             markov_bias[i] = decay * markov_bias[i] + innovation * normal[n, 3 + i]
@@ -330,7 +360,9 @@ class Imu:
         """The unit's output for the next samples of `ideal_increments`."""
         normal = self.rng.standard_normal((len(ideal.t_s), 2, 6))
         angle, saturated = self.gyro.measure(ideal.angle_rad, ideal.step_s, normal[:, 0])
-        velocity, overloaded = self.accelerometer.measure(ideal.velocity_m_s, ideal.step_s, normal[:, 1])
+        velocity, overloaded = self.accelerometer.measure(
+            ideal.velocity_m_s, ideal.step_s, normal[:, 1]
+        )
         return Increments(ideal.t_s, ideal.step_s, angle, velocity, saturated, overloaded)
 
     @property
@@ -357,12 +389,17 @@ class Navigator:
     def add(self, increments: Increments) -> None:
         """Integrate the next samples, in order; see `integrate_attitude`."""
         self.lab_from_body_wxyz = integrate_attitude(
-            self.lab_from_body_wxyz, increments.angle_rad, self.earth_rate_lab_rad_s, increments.step_s
+            self.lab_from_body_wxyz,
+            increments.angle_rad,
+            self.earth_rate_lab_rad_s,
+            increments.step_s,
         )
 
 
 @jit
-def integrate_attitude(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float) -> Floats:
+def integrate_attitude(
+    lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float
+) -> Floats:
     """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
 
     The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated continuously and
@@ -375,7 +412,9 @@ def integrate_attitude(lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate
         attitude = quaternion.multiply(
             lab_now_from_before, quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n]))
         )
-        attitude = attitude / math.sqrt(attitude[0] ** 2 + attitude[1] ** 2 + attitude[2] ** 2 + attitude[3] ** 2)
+        attitude = attitude / math.sqrt(
+            attitude[0] ** 2 + attitude[1] ** 2 + attitude[2] ** 2 + attitude[3] ** 2
+        )
     return attitude
 
 

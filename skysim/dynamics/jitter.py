@@ -22,12 +22,16 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.guidance import Reference, plan, vibration_intervals
 from skysim.dynamics.profiles.angle import envelope
-from skysim.scene.sections.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
+from skysim.scene.sections.motion import (
+    JitterBandConfig,
+    JitterLineConfig,
+    JitterPart,
+    MotionConfig,
+)
 
 SINES_PER_BAND = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
-SAMPLES_PER_PERIOD = (
-    16  # samples per shortest period: cubic Hermite interpolation has an error of (2 pi / 16)^4 / 384 = 6e-5
-)
+# Samples per shortest period: cubic Hermite interpolation has an error of (2 pi / 16)^4 / 384 = 6e-5.
+SAMPLES_PER_PERIOD = 16
 MAX_SAMPLES = 5_000_000
 RISE_FRACTION = 0.1  # duration of the rise and of the fall, as a fraction of the interval ...
 MAX_RISE_S = 1.0  # ... at most
@@ -59,12 +63,16 @@ def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
     exact in expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed;
     `assumed`).
     """
-    edges = np.linspace(0, math.log(config.to_hz / config.from_hz), SINES_PER_BAND + 1)  # logarithm of f / from_hz
+    edges = np.linspace(
+        0, math.log(config.to_hz / config.from_hz), SINES_PER_BAND + 1
+    )  # logarithm of f / from_hz
     exponent = config.slope + 1  # power up to f is proportional to f^exponent
-    low, high = edges[:-1], edges[1:]
+    low = edges[:-1]
+    high = edges[1:]
     uniform = rng.uniform(size=SINES_PER_BAND)
     if abs(exponent) < 1e-6:
-        power, middle = high - low, low + uniform * (high - low)
+        power = high - low
+        middle = low + uniform * (high - low)
     else:
         # Power of each piece, and a frequency drawn from it by inverting its cumulative power.
         power = np.exp(exponent * low) * np.expm1(exponent * (high - low)) / exponent
@@ -73,7 +81,10 @@ def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
 
 
 def with_phases(
-    frequency_hz: Floats, power_fraction: Floats, rms_arcsec: Sequence[float], rng: np.random.Generator
+    frequency_hz: Floats,
+    power_fraction: Floats,
+    rms_arcsec: Sequence[float],
+    rng: np.random.Generator,
 ) -> Sines:
     """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis."""
     amplitude = np.sqrt(2 * power_fraction)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
@@ -121,7 +132,9 @@ class VibrationComponent:
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
-        phi, rate = evaluate_sines(t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad)
+        phi, rate = evaluate_sines(
+            t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad
+        )
         if not math.isfinite(self.begin_s):
             return phi, rate
         gain, slope = envelopes(t_s - self.begin_s, self.end_s - self.begin_s, self.rise_s)
@@ -135,19 +148,26 @@ class Vibration:
     components: tuple[VibrationComponent, ...]
 
     @classmethod
-    def draw(cls, motion: MotionConfig, rng: np.random.Generator, reference: Reference | None = None) -> Vibration:
+    def draw(
+        cls, motion: MotionConfig, rng: np.random.Generator, reference: Reference | None = None
+    ) -> Vibration:
         """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval.
 
         reference : that of the maneuvers; by default planned here, which a profile does not allow
         """
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
         for begin_s, end_s, configs in vibration_intervals(motion, reference or plan(motion)):
-            components.append(draw_component(configs, rng, f"motion.maneuver jitter at {begin_s:g} s", begin_s, end_s))
+            components.append(
+                draw_component(
+                    configs, rng, f"motion.maneuver jitter at {begin_s:g} s", begin_s, end_s
+                )
+            )
         return cls(tuple(component for component in components if component))
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) rotation vector phi and (N, 3) its derivative (rad/s), body axes, at (N,) ascending times."""
-        phi, rate = np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))
+        phi = np.zeros((len(t_s), 3))
+        rate = np.zeros((len(t_s), 3))
         for component in self.components:
             active = slice(*np.searchsorted(t_s, [component.begin_s, component.end_s]))
             component_phi, component_rate = component.evaluate(t_s[active])
@@ -169,7 +189,9 @@ class Vibration:
         t_s = subdivide(trajectory.t_s, self.subdivisions(trajectory.t_s))
         phi, phi_rate = self.evaluate(t_s)
         vibration = Rotation.from_rotvec(phi)
-        rate = np.column_stack([np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T])
+        rate = np.column_stack(
+            [np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T]
+        )
         return Trajectory(
             t_s,
             trajectory.attitude_at(t_s) * vibration,
@@ -184,13 +206,17 @@ class Vibration:
         """
         highest_hz = np.zeros(len(t_s) - 1)
         for component in self.components:
-            np.maximum(highest_hz, component.highest_hz, out=highest_hz, where=component.active(t_s))
+            np.maximum(
+                highest_hz, component.highest_hz, out=highest_hz, where=component.active(t_s)
+            )
         count = np.ceil(np.maximum(np.diff(t_s) * highest_hz * SAMPLES_PER_PERIOD * (1 - 1e-12), 1))
         needed = int(count.sum()) + 1
         if self.components and needed > MAX_SAMPLES:
             densest = max(
                 self.components,
-                key=lambda component: component.highest_hz * np.diff(t_s)[component.active(t_s)].sum(),
+                key=lambda component: (
+                    component.highest_hz * np.diff(t_s)[component.active(t_s)].sum()
+                ),
             )
             raise InputError(
                 densest.name,
@@ -230,7 +256,9 @@ def subdivide(t_s: Floats, counts: NDArray[np.int64]) -> Floats:
     """The sample times with each step divided evenly into its pieces."""
     begin = np.repeat(np.cumsum(counts) - counts, counts)  # the first sample of the step of each
     within = (np.arange(len(begin)) - begin) / np.repeat(counts, counts)
-    return np.append(np.repeat(t_s[:-1], counts) + within * np.repeat(np.diff(t_s), counts), t_s[-1])
+    return np.append(
+        np.repeat(t_s[:-1], counts) + within * np.repeat(np.diff(t_s), counts), t_s[-1]
+    )
 
 
 def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
@@ -243,7 +271,9 @@ def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
     angle = np.linalg.norm(phi, axis=1, keepdims=True)
     first = np.sinc(angle / (2 * np.pi)) ** 2 / 2
     # For small a the quotient loses precision; there it is 1/6 to a^2 / 120, and its term is only a^2 of the rate.
-    second = np.where(angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6)
+    second = np.where(
+        angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6
+    )
     cross = np.cross(phi, phi_rate)
     return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))
 
@@ -251,24 +281,40 @@ def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
 @jit
 def envelopes(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
     """(N, 1) envelope and (N, 1) its derivative."""
-    gain, slope = np.empty((len(t_s), 1)), np.empty((len(t_s), 1))
+    gain = np.empty((len(t_s), 1))
+    slope = np.empty((len(t_s), 1))
     for n in range(len(t_s)):
         gain[n, 0], slope[n, 0], _ = envelope(t_s[n], duration_s, rise_s, rise_s)
     return gain, slope
 
 
 @jit(parallel=True)
-def evaluate_sines(t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats) -> tuple[Floats, Floats]:
+def evaluate_sines(
+    t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats
+) -> tuple[Floats, Floats]:
     """(N, 3) phi and (N, 3) its derivative at every time."""
-    phi, rate = np.empty((len(t_s), 3)), np.empty((len(t_s), 3))
+    phi = np.empty((len(t_s), 3))
+    rate = np.empty((len(t_s), 3))
     for n in numba.prange(len(t_s)):
         x = y = z = u = v = w = 0.0
         for k in range(len(omega_rad_s)):
-            omega, a, b = omega_rad_s[k], sine_rad[k], cosine_rad[k]
-            s, c = np.sin(omega * t_s[n]), np.cos(omega * t_s[n])
-            x, y, z = x + a[0] * s + b[0] * c, y + a[1] * s + b[1] * c, z + a[2] * s + b[2] * c
-            s, c = omega * s, omega * c
-            u, v, w = u + a[0] * c - b[0] * s, v + a[1] * c - b[1] * s, w + a[2] * c - b[2] * s
-        phi[n, 0], phi[n, 1], phi[n, 2] = x, y, z
-        rate[n, 0], rate[n, 1], rate[n, 2] = u, v, w
+            omega = omega_rad_s[k]
+            a = sine_rad[k]
+            b = cosine_rad[k]
+            s = np.sin(omega * t_s[n])
+            c = np.cos(omega * t_s[n])
+            x = x + a[0] * s + b[0] * c
+            y = y + a[1] * s + b[1] * c
+            z = z + a[2] * s + b[2] * c
+            s = omega * s
+            c = omega * c
+            u = u + a[0] * c - b[0] * s
+            v = v + a[1] * c - b[1] * s
+            w = w + a[2] * c - b[2] * s
+        phi[n, 0] = x
+        phi[n, 1] = y
+        phi[n, 2] = z
+        rate[n, 0] = u
+        rate[n, 1] = v
+        rate[n, 2] = w
     return phi, rate

@@ -48,13 +48,18 @@ class TrackerScore:
     refusals: dict[str, int]
 
 
-def build_trackers(lab: Lab, names: Sequence[str], programs: Mapping[str, str]) -> dict[str, factory.Estimator]:
+def build_trackers(
+    lab: Lab, names: Sequence[str], programs: Mapping[str, str]
+) -> dict[str, factory.Estimator]:
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError("trackers", f"{repeated[0]} is given twice", "once")
     scenes = {name: with_config(lab.scene, "tracker", name=name) for name in names}
-    return {name: build_tracker(lab.with_scene(scene).camera, programs) for name, scene in scenes.items()}
+    return {
+        name: build_tracker(lab.with_scene(scene).camera, programs)
+        for name, scene in scenes.items()
+    }
 
 
 def compare_frames(
@@ -106,16 +111,23 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     )
 
 
-def write_scores(folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene) -> list[TrackerScore]:
+def write_scores(
+    folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene
+) -> list[TrackerScore]:
     """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv, without `refusals`: the status of each frame is
     in the solutions. Returns the statistics of each tracker."""
     from astropy.table import Table
 
     scores = [score_tracker(name, tracker_rows) for name, tracker_rows in rows.items()]
     for name, tracker_rows in rows.items():
-        files.write_table(folder / f"solutions.{name}.ecsv", scoring.table(tracker_rows, scoring.angle_names(scene)))
+        files.write_table(
+            folder / f"solutions.{name}.ecsv",
+            scoring.table(tracker_rows, scoring.angle_names(scene)),
+        )
     score_rows = as_dicts(scores)
-    columns = {name: [row[name] for row in score_rows] for name in score_rows[0] if name != "refusals"}
+    columns = {
+        name: [row[name] for row in score_rows] for name in score_rows[0] if name != "refusals"
+    }
     files.write_table(folder / "scoreboard.ecsv", Table(columns))
     return scores
 
@@ -123,6 +135,7 @@ def write_scores(folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene)
 def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
     """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
-        asdict(score) | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
+        asdict(score)
+        | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
         for score in scores
     ]

@@ -12,7 +12,9 @@ from skysim.sources.false_lights import light_name
 
 LEGEND_PX = 20  # height of the legend
 MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones
-TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
+TRUTH_BGR = (200, 160, 60)
+DETECTED_BGR = (80, 80, 235)
+MATCHED_BGR = (110, 220, 90)
 
 
 def frame_levels(image: NDArray) -> tuple[float, float]:
@@ -27,8 +29,12 @@ def frame_levels(image: NDArray) -> tuple[float, float]:
 def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
     """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
     scale = 2 if max(image.shape) < 1000 else 1
-    picture = cv2.cvtColor(to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR)
-    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), np.uint8)
+    picture = cv2.cvtColor(
+        to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR
+    )
+    picture = np.asarray(
+        cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), np.uint8
+    )
     return picture, scale, max(8, min(picture.shape[:2]) // 70)
 
 
@@ -60,7 +66,11 @@ def annotate(
             draw_label(picture, labels[n], x + size + 6, y + 4, MATCHED_BGR)
     if truth_px is None:
         return picture
-    meanings = {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "detected": DETECTED_BGR, "matched": MATCHED_BGR}
+    meanings = {
+        f"true, SNR > {MIN_SNR:g}": TRUTH_BGR,
+        "detected": DETECTED_BGR,
+        "matched": MATCHED_BGR,
+    }
     return with_legend(picture, meanings)
 
 
@@ -82,7 +92,9 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
     return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
 
 
-def with_legend(picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]) -> NDArray[np.uint8]:
+def with_legend(
+    picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]
+) -> NDArray[np.uint8]:
     """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
     strip = cv2.copyMakeBorder(picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0))
     x = 6
@@ -92,14 +104,19 @@ def with_legend(picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, 
     return np.asarray(strip, np.uint8)
 
 
-def draw_ticks(picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]) -> None:
+def draw_ticks(
+    picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]
+) -> None:
     """Draw four strokes around (x, y), with an open center."""
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        begin, end = size - 4, size + 6
+        begin = size - 4
+        end = size + 6
         cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), color, 1)
 
 
-def draw_label(picture: NDArray[np.uint8], text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
+def draw_label(
+    picture: NDArray[np.uint8], text: str, x: int, y: int, color: tuple[int, int, int]
+) -> None:
     """Draw a small label with its lower left corner at (x, y)."""
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
 
@@ -109,7 +126,8 @@ def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDA
 
     All use the black and white levels of the first frame, so that their brightnesses can be compared.
     """
-    low, high = np.percentile(images[0], 30), float(np.percentile(images[0], 99.95))
+    low = np.percentile(images[0], 30)
+    high = float(np.percentile(images[0], 99.95))
     tiles = []
     for image, caption in zip(images, captions, strict=True):
         gray = to_8bit(image, "square root", levels_dn=(low, high))

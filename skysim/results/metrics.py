@@ -26,11 +26,15 @@ from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
 WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the tracker's covariance allows
-OVERCONFIDENCE_PROBABILITY = 1e-8  # with which a correct covariance allows an error counted as overconfident
+OVERCONFIDENCE_PROBABILITY = (
+    1e-8  # with which a correct covariance allows an error counted as overconfident
+)
 OVERCONFIDENT_NEES = float(scipy.special.chdtri(3, OVERCONFIDENCE_PROBABILITY))
 
 
-def cross_and_roll_rad(cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation) -> tuple[float, float]:
+def cross_and_roll_rad(
+    cam_from_ref_estimate: Rotation, cam_from_ref_truth: Rotation
+) -> tuple[float, float]:
     """Cross-boresight (>= 0) and roll (signed) components of the attitude error, rad.
 
     The error is cam_from_ref_estimate * cam_from_ref_truth^-1 as a rotation vector in camera axes, with the boresight
@@ -67,7 +71,9 @@ def normalized_error_squared(
 
 CONFIDENCE = 0.95
 TAILS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # probabilities below the ends of an interval
-SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))  # half of the interval of a normal variable, in sigmas
+SIGMAS = float(
+    scipy.special.ndtri((1 + CONFIDENCE) / 2)
+)  # half of the interval of a normal variable, in sigmas
 RESAMPLES = 999
 MANY_VALUES = 2000  # beyond, the bootstrap is `bootstrap_of_many`
 EXTREMES = 50  # values that it draws one by one, at most
@@ -105,7 +111,8 @@ def proportion(hits: Any, total: Any) -> Summary:
         return NO_VALUE
     if hits in (0, total):
         return Summary(float(hits / total), *exact_bounds(int(hits), int(total)), int(total))
-    value, z2 = float(hits / total), SIGMAS**2
+    value = float(hits / total)
+    z2 = SIGMAS**2
     scale = 1 + z2 / total
     middle = (value + z2 / (2 * total)) / scale
     half = SIGMAS / scale * math.sqrt(value * (1 - value) / total + z2 / (4 * total**2))
@@ -156,7 +163,11 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
 def without_resampling(values: Floats, value: float) -> Summary:
     """The summary of fewer than two values, or of equal ones."""
     count = len(values)
-    return Summary(value, math.nan, math.nan, count, 2 - count) if count < 2 else Summary(value, value, value, count)
+    return (
+        Summary(value, math.nan, math.nan, count, 2 - count)
+        if count < 2
+        else Summary(value, value, value, count)
+    )
 
 
 def mean_of(values: Floats) -> Summary:
@@ -169,7 +180,9 @@ def rms_of(values: Floats) -> Summary:
     if len(values) <= MANY_VALUES:
         return bootstrap_of_few(np.square(values), np.sqrt)
     squares = bootstrap_of_many(np.square(values))
-    return Summary(math.sqrt(squares.value), math.sqrt(squares.low), math.sqrt(squares.high), squares.trials)
+    return Summary(
+        math.sqrt(squares.value), math.sqrt(squares.low), math.sqrt(squares.high), squares.trials
+    )
 
 
 def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
@@ -178,7 +191,8 @@ def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positiv
     A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
     the same for all samples of a size.
     """
-    count, value = len(values), float(function(np.mean(values)))
+    count = len(values)
+    value = float(function(np.mean(values)))
     if count < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
     low, high = np.quantile(function(values @ resampling_counts(count) / count), TAILS)
@@ -188,7 +202,10 @@ def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positiv
 @lru_cache(maxsize=64)
 def resampling_counts(count: int) -> NDArray[np.uint8]:
     """(count, RESAMPLES) how often each resample has drawn each value."""
-    drawn = random_stream(1).integers(0, count, (RESAMPLES, count)) + count * np.arange(RESAMPLES)[:, None]
+    drawn = (
+        random_stream(1).integers(0, count, (RESAMPLES, count))
+        + count * np.arange(RESAMPLES)[:, None]
+    )
     counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
     return np.ascontiguousarray(counts.reshape(RESAMPLES, count).T, dtype=np.uint8)
 
@@ -206,11 +223,14 @@ def bootstrap_of_many(values: Floats) -> Summary:
     Few wrong attitudes with errors of degrees among many of arcseconds thus have the skew interval of the bootstrap,
     which the normal interval of the mean misses.
     """
-    count, mean = len(values), float(np.mean(values))
+    count = len(values)
+    mean = float(np.mean(values))
     distance = np.abs(values - mean)
     inner = distance <= np.partition(distance, count - EXTREMES)[count - EXTREMES]
-    others, extremes = values[inner], values[~inner]
-    middle, spread = float(np.mean(others)), float(np.std(others))
+    others = values[inner]
+    extremes = values[~inner]
+    middle = float(np.mean(others))
+    spread = float(np.std(others))
     weights, normal = resampling_draws()
     weights = weights[:, : len(extremes)]
     left = np.maximum(count - weights.sum(axis=1), 0)
@@ -231,7 +251,8 @@ def quantile(values: Floats, probability: float) -> Summary:
 
     Too few values have no interval; `needs` is how many more it takes: 59 in all for the 95% quantile.
     """
-    count, value = len(values), float(np.quantile(values, probability))
+    count = len(values)
+    value = float(np.quantile(values, probability))
     ranks = quantile_ranks(count, probability)
     if ranks is None:
         return Summary(value, math.nan, math.nan, count, values_for_quantile(probability) - count)
@@ -250,10 +271,13 @@ def quantile_ranks(count: int, probability: float) -> tuple[int, int] | None:
     Of all pairs of sufficient confidence this is the one with the fewest values between them, and of these the one
     whose two tails differ least.
     """
-    middle, spread = count * probability, math.sqrt(count * probability * (1 - probability))
+    middle = count * probability
+    spread = math.sqrt(count * probability * (1 - probability))
     first = max(int(middle - RANK_SIGMAS * spread) - 1, 0)
     last = min(int(middle + RANK_SIGMAS * spread) + 2, count - 1)
-    below = scipy.stats.binom.cdf(np.arange(first, last + 1), count, probability)  # B(r - 1) of each rank r, from 1
+    below = scipy.stats.binom.cdf(
+        np.arange(first, last + 1), count, probability
+    )  # B(r - 1) of each rank r, from 1
     highs = np.searchsorted(below, below + (CONFIDENCE - 1e-12))
     lows = np.flatnonzero(highs < len(below))
     if not len(lows):
@@ -307,19 +331,36 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
 QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
-    "angle_arcsec": lambda c: np.sqrt(c["x_arcsec"] ** 2 + c["y_arcsec"] ** 2 + c["roll_arcsec"] ** 2),
+    "angle_arcsec": lambda c: np.sqrt(
+        c["x_arcsec"] ** 2 + c["y_arcsec"] ** 2 + c["roll_arcsec"] ** 2
+    ),
     **{
         name: lambda c, name=name: np.asarray(c[name])  # type: ignore[misc]
         for name in (
-            *("nees", "stars", "detected", "matched", "centroid_px", "streak_px", "availability"),
-            *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec", "pointing_arcsec", "pointing_worst_arcsec"),
+            "nees",
+            "stars",
+            "detected",
+            "matched",
+            "centroid_px",
+            "streak_px",
+            "availability",
+            "filter_arcsec",
+            "filter_worst_arcsec",
+            "drift_arcsec",
+            "pointing_arcsec",
+            "pointing_worst_arcsec",
             "time_ms",
         )
     },
 }
 
 
-MORE_IS_BETTER = ("stars", "detected", "matched", "availability")  # quantities; of others less is better
+MORE_IS_BETTER = (
+    "stars",
+    "detected",
+    "matched",
+    "availability",
+)  # quantities; of others less is better
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 
@@ -341,13 +382,15 @@ def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     as many independent samples as there are runs, widened if necessary to include the value.
     """
     known = np.isfinite(hits)  # an external tracker does not say which lights it identified
-    hits, frames = hits[known], frames[known]
+    hits = hits[known]
+    frames = frames[known]
     summary = proportion(np.sum(hits), np.sum(frames))
     if not len(frames) or np.max(frames) <= 1:
         return summary
     runs = int(np.sum(frames > 0))
     of_runs = proportion(round(summary.value * runs), runs)
-    low, high = min(of_runs.low, summary.value), max(of_runs.high, summary.value)
+    low = min(of_runs.low, summary.value)
+    high = max(of_runs.high, summary.value)
     return summary._replace(low=low, high=high, trials=runs)
 
 
@@ -357,10 +400,14 @@ def mismatched(c: Columns) -> Summary:
     Matches of one frame are not independent, so it has no interval.
     """
     known = np.isfinite(c["wrong_matches"]) & np.isfinite(c["matched"])
-    matches = np.sum(c["matched"][known] * c["frames"][known])  # `matched` is a mean over the frames of a flight
+    matches = np.sum(
+        c["matched"][known] * c["frames"][known]
+    )  # `matched` is a mean over the frames of a flight
     if not matches:
         return NO_VALUE
-    return Summary(float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches))
+    return Summary(
+        float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches)
+    )
 
 
 PROPORTIONS: dict[str, Response] = {
@@ -398,7 +445,9 @@ def response(name: str, where: str = "response") -> Response:
         return PROPORTIONS[name]
     if match := COVERAGE.match(name):
         least = int(match[1] or DEFAULT_COVERAGE)
-        return lambda c: proportion(np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0))
+        return lambda c: proportion(
+            np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0)
+        )
     quantity, statistic = split_name(name)
     if quantity not in QUANTITIES or statistic not in STATISTICS:
         raise InputError(
@@ -426,4 +475,6 @@ def split_name(name: str) -> tuple[str, str]:
 
 def is_proportion(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
-    return name in PROPORTIONS or bool(COVERAGE.match(name)) or split_name(name)[0] == "availability"
+    return (
+        name in PROPORTIONS or bool(COVERAGE.match(name)) or split_name(name)[0] == "availability"
+    )

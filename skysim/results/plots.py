@@ -11,10 +11,22 @@ DPI = 120
 INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
 MARKS = "osD^vP<X"
 LOOK: Any = {
-    **{"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888"},
-    **{"axes.grid": True, "grid.color": "#e8e8e8", "grid.linewidth": 0.6, "axes.axisbelow": True},
-    **{"xtick.color": "#444444", "ytick.color": "#444444", "legend.frameon": False, "lines.linewidth": 1.2},
-    **{"text.parse_math": False, "lines.markersize": 4.5, "hatch.color": "#b8b8b8", "hatch.linewidth": 0.7},
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "axes.grid": True,
+    "grid.color": "#e8e8e8",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "text.parse_math": False,
+    "lines.markersize": 4.5,
+    "hatch.color": "#b8b8b8",
+    "hatch.linewidth": 0.7,
 }
 
 
@@ -43,7 +55,12 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
     """
     from matplotlib.figure import Figure
 
-    width_in, left_in, right_in, top_in, bottom_in, gap_in = 10, 0.95, 0.15, 0.12, 0.55, 0.15
+    width_in = 10
+    left_in = 0.95
+    right_in = 0.15
+    top_in = 0.12
+    bottom_in = 0.55
+    gap_in = 0.15
     height_in = top_in + sum(heights_in) + gap_in * (len(heights_in) - 1) + bottom_in
     fig = Figure(figsize=(width_in, height_in))
     grid = fig.add_gridspec(

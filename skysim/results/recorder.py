@@ -58,7 +58,9 @@ class Recorder:
         write_frame(self.folder, frame, truth, self.camera.scene)
         path = self.folder / f"frame_{frame.index:04d}.fits"
         if preview:
-            write_image(path.with_suffix(".preview.png"), annotate_truth(frame.image_dn, truth.sources))
+            write_image(
+                path.with_suffix(".preview.png"), annotate_truth(frame.image_dn, truth.sources)
+            )
         return path
 
     def finish(
@@ -83,9 +85,15 @@ class Recorder:
         annotated = self.shown.annotated()
         page = self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
-        stages_ms = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()}
-        flight = telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
-        facts = [(name, [text]) for name, text in scene.summary] + [(fact.name, fact.lines) for fact in plan.facts]
+        stages_ms = {
+            stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
+        }
+        flight = (
+            telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
+        )
+        facts = [(name, [text]) for name, text in scene.summary] + [
+            (fact.name, fact.lines) for fact in plan.facts
+        ]
         motion = telemetry_report.summary(log)
         report = run_report.run_report(
             scene.title,

@@ -121,7 +121,8 @@ class FlightRecorder:
         if not self.recorders:
             cameras = self.flight.lab.cameras
             self.recorders = {
-                one.name: Recorder(folder, one) for one, folder in zip(cameras, self.folders, strict=True)
+                one.name: Recorder(folder, one)
+                for one, folder in zip(cameras, self.folders, strict=True)
             }
         return self.recorders[camera.name]
 
@@ -132,7 +133,10 @@ class FlightRecorder:
         return self.of(self.flight.lab.camera).rows
 
     def finish(
-        self, command: str, plan: Check, draw: Callable[[Lab, Telemetry, Path], Sequence[Path]] | None = None
+        self,
+        command: str,
+        plan: Check,
+        draw: Callable[[Lab, Telemetry, Path], Sequence[Path]] | None = None,
     ) -> list[tuple[dict[str, Any], Report]]:
         """Write tables, images and reports; return statistics and report of each camera.
 
@@ -141,9 +145,13 @@ class FlightRecorder:
         main = run_of(self.flight, [() for _ in self.recorders])
         pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
         finished = []
-        for run, recorder in zip((main, *main.heads.values()), self.recorders.values(), strict=True):
+        for run, recorder in zip(
+            (main, *main.heads.values()), self.recorders.values(), strict=True
+        ):
             is_main = run is main
             own_plan = plan if is_main else run.check()
             shown = pictures if is_main else ()
-            finished.append(recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown))
+            finished.append(
+                recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown)
+            )
         return finished

@@ -13,7 +13,19 @@ from numpy.typing import NDArray
 
 from skysim.core.types import FrameRow
 from skysim.results.plots import figure_png, stacked_axes
-from skysim.results.report import Cell, Column, Facts, Figure, Items, Report, Section, Table, Text, Tone, Verdict
+from skysim.results.report import (
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Report,
+    Section,
+    Table,
+    Text,
+    Tone,
+    Verdict,
+)
 
 MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
     "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
@@ -52,7 +64,9 @@ def run_report(
     A single frame has no plot against time.
     """
     frame = Figure(cv2.imencode(".png", annotated)[1].tobytes(), FRAME_CAPTION)
-    laboratory = [Figure(path.read_bytes(), "the laboratory in 3-D", path.suffix[1:]) for path in views]
+    laboratory = [
+        Figure(path.read_bytes(), "the laboratory in 3-D", path.suffix[1:]) for path in views
+    ]
     errors = [Figure(error_figure(rows), ERROR_CAPTION)] if len(rows) > 1 else []
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
@@ -120,9 +134,21 @@ def motion_lines(motion: Mapping[str, float]) -> list[str]:
 
 def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
     """One row per frame: truth, estimate, errors, lights and time. angles : names of the three"""
-    columns = [Column("frame"), Column("t", "s", ".3f"), Column("exp", "ms", ".5g"), Column("rate", "°/s", ".2f")]
-    columns += [Column(name, "°", ".5f") for name in (*(f"true {name}" for name in angles), *angles)]
-    columns += [Column("cross", "″", ".3f"), Column("roll", "″", "+.3f"), Column("detected"), Column("used")]
+    columns = [
+        Column("frame"),
+        Column("t", "s", ".3f"),
+        Column("exp", "ms", ".5g"),
+        Column("rate", "°/s", ".2f"),
+    ]
+    columns += [
+        Column(name, "°", ".5f") for name in (*(f"true {name}" for name in angles), *angles)
+    ]
+    columns += [
+        Column("cross", "″", ".3f"),
+        Column("roll", "″", "+.3f"),
+        Column("detected"),
+        Column("used"),
+    ]
     columns += [Column("time", "ms", ".1f"), Column("status", kind="text")]
     lines = []
     for row in rows:
@@ -138,7 +164,10 @@ def error_figure(rows: Sequence[FrameRow]) -> bytes:
     fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]
     t = [row.t_s for row in solved]
-    cross, roll = ([max(abs(getattr(row, f"{name}_arcsec")), 1e-6) for row in solved] for name in ("cross", "roll"))
+    cross, roll = (
+        [max(abs(getattr(row, f"{name}_arcsec")), 1e-6) for row in solved]
+        for name in ("cross", "roll")
+    )
     errors.plot(t, cross, ".-", label="cross-boresight")
     errors.plot(t, roll, ".-", label="roll")
     if solved and max(cross + roll) > 10 * min(cross + roll):

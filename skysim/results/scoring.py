@@ -26,7 +26,9 @@ from skysim.simulation.lab import StarCamera
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:
     """Names of the three angles of a row."""
-    return ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
+    return (
+        ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
+    )
 
 
 def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[float, float, float]:
@@ -39,7 +41,9 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
     return float(roll), float(pitch), float(yaw)
 
 
-def row(camera: StarCamera, frame: Frame, truth: Truth, report: Report, update_status: str = "") -> FrameRow:
+def row(
+    camera: StarCamera, frame: Frame, truth: Truth, report: Report, update_status: str = ""
+) -> FrameRow:
     """Truth, solution and errors of one frame; `update_status` is how the attitude filter used the solution.
 
     Errors and standard deviations are in arcseconds, NaN without a solution.
@@ -50,17 +54,20 @@ def row(camera: StarCamera, frame: Frame, truth: Truth, report: Report, update_s
     # With the mount of the calibration: one that has moved since makes an error of the vehicle's attitude.
     cam_from_lab = mount.cam_from_body * truth.lab_from_body.inv()
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
-    estimate, wrong = None, False
+    estimate = None
+    wrong = False
     if attitude.cam_from_ref is not None:
         cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, cam_from_lab)
         estimate = angles_deg(attitude.cam_from_ref, scene, mount)
-        covariance, nees = np.full((3, 3), np.nan), np.inf
+        covariance = np.full((3, 3), np.nan)
+        nees = np.inf
         if attitude.covariance_rad2 is not None:
             covariance = attitude.covariance_rad2
             nees = metrics.normalized_error_squared(attitude.cam_from_ref, cam_from_lab, covariance)
         wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
         variance = np.diag(covariance)
-        cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
+        cross_sigma = float(np.sqrt(variance[:2].sum()))
+        roll_sigma = float(np.sqrt(variance[2]))
         chance = attitude.match.log10_chance if attitude.match else chance
     rate_error, rate_sigma = rate_errors_deg_s(attitude.rate, truth)
     return FrameRow(
@@ -105,7 +112,8 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
 
     missing = (float("nan"),) * 3
     columns: dict[str, Any] = {
-        name: [getattr(row, name) for row in rows] for name in ("frame", "t_s", "rate_deg_s", "status")
+        name: [getattr(row, name) for row in rows]
+        for name in ("frame", "t_s", "rate_deg_s", "status")
     }
     for n, name in enumerate(names):
         columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
@@ -135,7 +143,9 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.u
     detected = report.centroids.xy_px if report else np.empty((0, 2))
     match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
-    return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px[visible(truth.sources)])
+    return annotate(
+        frame.image_dn, detected, matched, truth_px=truth.sources.xy_px[visible(truth.sources)]
+    )
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -46,7 +46,9 @@ def simulate(
 
     All frames are kept in memory; `skysim run` writes them one by one. Raises InputError.
     """
-    with open_flight(scene, controller=controller, tracker=tracker, profile=profile, programs=programs) as flight:
+    with open_flight(
+        scene, controller=controller, tracker=tracker, profile=profile, programs=programs
+    ) as flight:
         scores: dict[str, list[Score]] = {camera.name: [] for camera in flight.lab.cameras}
         for shot in flight.shots(progress=progress):
             scores[shot.camera.name].append(score(shot))
@@ -64,9 +66,13 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
         raise InputError("index", f"{index} is outside of the scene's frames", f"0 to {frames - 1}")
     needs_all = scene.filter is not None or scene.tracker.exposure_control is not None
     with open_flight(scene) as flight:
-        shots = flight.shots(solves=False, selects=None if needs_all else lambda number, _: number == index)
+        shots = flight.shots(
+            solves=False, selects=None if needs_all else lambda number, _: number == index
+        )
         return next(
-            (shot.frame, shot.truth) for shot in shots if shot.frame.index == index and shot.camera is flight.lab.camera
+            (shot.frame, shot.truth)
+            for shot in shots
+            if shot.frame.index == index and shot.camera is flight.lab.camera
         )
 
 
@@ -95,6 +101,10 @@ def render_at(
     rows = own.scene.camera.height_px
     window = timing.window_from(own.scene, 0.0)
     window = window._replace(open_s=t_s - window.middle_s(rows))
-    times_s = np.linspace(window.open_s - timing.MARGIN_S, window.close_s(rows) + timing.MARGIN_S, KNOTS)
+    times_s = np.linspace(
+        window.open_s - timing.MARGIN_S, window.close_s(rows) + timing.MARGIN_S, KNOTS
+    )
     rate = np.asarray(rate_body_rad_s, dtype=np.float64)
-    return render_frame(own, Trajectory.at_rate(lab_from_body, rate, t_s, times_s), index, None, window)
+    return render_frame(
+        own, Trajectory.at_rate(lab_from_body, rate, t_s, times_s), index, None, window
+    )

@@ -36,7 +36,9 @@ def display_levels(image: NDArray) -> tuple[float, float]:
     return float(low), max(float(high), float(low + 0.25 * (image.max() - low)))
 
 
-def to_8bit(image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+def to_8bit(
+    image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
     levels_dn : black and white levels, for example of another frame; by default those of `display_levels`
@@ -48,7 +50,9 @@ def to_8bit(image: NDArray, curve: str, levels_dn: tuple[float, float] | None = 
     if image.dtype != np.uint16:
         return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
     levels = np.arange(int(image.max()) + 1)
-    return (255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))).astype(np.uint8)[image]
+    return (255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))).astype(np.uint8)[
+        image
+    ]
 
 
 def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:

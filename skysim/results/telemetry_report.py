@@ -46,7 +46,9 @@ def summary(log: Telemetry) -> dict[str, float]:
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
-    controlled = log.lab_from_ref is not None  # a prescribed motion leaves wheels and gimbals as they were
+    controlled = (
+        log.lab_from_ref is not None
+    )  # a prescribed motion leaves wheels and gimbals as they were
     if controlled and (log.wheel_rad_s.size or log.gimbal_rad.size):
         statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
     if controlled and log.wheel_rad_s.size:
@@ -58,7 +60,10 @@ def summary(log: Telemetry) -> dict[str, float]:
         statistics["gyro_saturated_s"] = log.saturated.sum() * log.period_s
     if by_filter is not None and log.assumed_bias_rad_s is not None and log.bias_rad_s is not None:
         bias_error = per_hour(log.assumed_bias_rad_s - log.bias_rad_s)[-1]
-        statistics |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
+        statistics |= {
+            "filter_deg_worst": by_filter.max(),
+            "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG,
+        }
         statistics["filter_bias_deg_h_end"] = float(np.linalg.norm(bias_error))
     for name, mounting in log.mountings.items():
         error_rad = mounting.estimate_rad[-1] - mounting.true_rad[-1]
@@ -73,7 +78,9 @@ def table(log: Telemetry) -> Any:
     columns: dict[str, Any] = {"t_s": log.t_s}
 
     def add(name: str, values: Floats, components: tuple[str, ...], unit: str) -> None:
-        columns.update({f"{name}_{component}_{unit}": values[:, n] for n, component in enumerate(components)})
+        columns.update(
+            {f"{name}_{component}_{unit}": values[:, n] for n, component in enumerate(components)}
+        )
 
     for name, attitude in (
         ("true", log.lab_from_body),
@@ -89,7 +96,9 @@ def table(log: Telemetry) -> Any:
     add("torque", log.torque_nm, AXES, "nm")
     add("disturbance", log.disturbance_nm, AXES, "nm")
     add("momentum", log.momentum_nms, AXES, "nms")
-    numbers = tuple(str(n + 1) for n in range(max(log.wheel_rad_s.shape[1], log.gimbal_rad.shape[1])))
+    numbers = tuple(
+        str(n + 1) for n in range(max(log.wheel_rad_s.shape[1], log.gimbal_rad.shape[1]))
+    )
     add("wheel", log.wheel_rad_s / RPM_RAD_S, numbers[: log.wheel_rad_s.shape[1]], "rpm")
     add("gimbal", np.degrees(log.gimbal_rad), numbers[: log.gimbal_rad.shape[1]], "deg")
     if log.manipulability is not None:
@@ -106,7 +115,9 @@ def table(log: Telemetry) -> Any:
     if log.sigma_attitude_rad is not None:
         add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
     for name, mounting in log.mountings.items():
-        for prefix, values in zip(("mounting", "sigma_mounting", "true_mounting"), mounting, strict=True):
+        for prefix, values in zip(
+            ("mounting", "sigma_mounting", "true_mounting"), mounting, strict=True
+        ):
             add(f"{prefix}_{name}", values / ARCSEC_RAD, AXES, "arcsec")
     return Table(columns)
 
@@ -132,7 +143,9 @@ def attitude_panel(log: Telemetry, axes: Any) -> None:
     for n, name in enumerate(EULER):
         axes.plot(log.t_s, true_deg[:, n], color=f"C{n}", label=name)
         if log.lab_from_ref is not None:
-            axes.plot(log.t_s, euler_deg(log.lab_from_ref)[:, n], "--", color=f"C{n}", alpha=0.6, lw=1)
+            axes.plot(
+                log.t_s, euler_deg(log.lab_from_ref)[:, n], "--", color=f"C{n}", alpha=0.6, lw=1
+            )
     axes.set_ylabel("attitude [deg]\n(dashed: commanded)")
 
 
@@ -150,7 +163,9 @@ def attitude_error_panel(log: Telemetry, axes: Any) -> None:
         axes.semilogy(log.t_s, 3 * sigma_deg, ":", color="tab:green", label="filter 3σ")
     if log.saturated is not None and log.saturated.any():
         low, high = axes.get_ylim()
-        axes.fill_between(log.t_s, low, high, where=log.saturated, color="tab:red", alpha=0.25, lw=0)
+        axes.fill_between(
+            log.t_s, low, high, where=log.saturated, color="tab:red", alpha=0.25, lw=0
+        )
         axes.set_ylim(low, high)
     axes.set_ylabel("error [deg]")
 
@@ -159,7 +174,9 @@ def bias_panel(log: Telemetry, axes: Any) -> None:
     assert log.bias_rad_s is not None
     assert log.assumed_bias_rad_s is not None
     assert log.sigma_bias_rad_s is not None
-    true, estimate, sigma = map(per_hour, (log.bias_rad_s, log.assumed_bias_rad_s, log.sigma_bias_rad_s))
+    true, estimate, sigma = map(
+        per_hour, (log.bias_rad_s, log.assumed_bias_rad_s, log.sigma_bias_rad_s)
+    )
     for n, name in enumerate(AXES):
         axes.plot(log.t_s, true[:, n], "--", color=f"C{n}", lw=1)
         axes.plot(log.t_s, estimate[:, n], color=f"C{n}", label=name)
@@ -179,7 +196,11 @@ def mounting_panel(log: Telemetry, axes: Any) -> None:
             axes.plot(log.t_s, estimate[:, n], color=color, label=f"{name} {axis}")
             band = estimate[:, n] - 3 * sigma[:, n], estimate[:, n] + 3 * sigma[:, n]
             axes.fill_between(log.t_s, *band, color=color, alpha=0.12, lw=0)
-    late = [values[len(log.t_s) // 4 :] / ARCSEC_RAD for mounting in log.mountings.values() for values in mounting]
+    late = [
+        values[len(log.t_s) // 4 :] / ARCSEC_RAD
+        for mounting in log.mountings.values()
+        for values in mounting
+    ]
     limit = max(np.abs(values).max() for values in late) * 1.3
     axes.set_ylim(-limit, limit)
     axes.set_ylabel("mounting [arcsec]\n(dashed: true, band: 3σ)")

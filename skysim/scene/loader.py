@@ -20,7 +20,15 @@ from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, read_yaml, set_key, where_of
+from skysim.core.io.yaml_reader import (
+    Files,
+    check_version,
+    explain,
+    is_file,
+    read_yaml,
+    set_key,
+    where_of,
+)
 from skysim.core.paths import DATA, SCENES
 from skysim.core.units import ConfigModel, quantity
 from skysim.scene import unused
@@ -72,7 +80,9 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     for key in CALIBRATED_KEYS:
         if own.pop(key, None) is not None:
             raise InputError(
-                f"camera.{key}", "conflicts with camera.calibration", "one of the two (null removes a base's)"
+                f"camera.{key}",
+                "conflicts with camera.calibration",
+                "one of the two (null removes a base's)",
             )
     merged = merge(base, own)
     return tree | {"camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)}
@@ -157,16 +167,22 @@ def over_base(
 
     camera_of : the camera section of a preset. An unknown preset replaces nothing; `with_preset` reports it.
     """
-    camera, below = own.get("camera"), base.get("camera")
+    camera = own.get("camera")
+    below = base.get("camera")
     named = camera.get("preset") if isinstance(camera, dict) else None
     if named is not None and isinstance(below, dict):
         with contextlib.suppress(InputError):
             base = base | {"camera": undefined_keys(below, camera_of(named))}
-    motion, moving = own.get("motion"), base.get("motion")
+    motion = own.get("motion")
+    moving = base.get("motion")
     if isinstance(motion, dict) and isinstance(moving, dict):
         start = motion.get("start")
-        if getattr(start, "value", start) == "profile":  # in `provenance` a value has its origin beside it
-            base = base | {"motion": {key: value for key, value in moving.items() if key != "rate_deg_s"}}
+        if (
+            getattr(start, "value", start) == "profile"
+        ):  # in `provenance` a value has its origin beside it
+            base = base | {
+                "motion": {key: value for key, value in moving.items() if key != "rate_deg_s"}
+            }
     return merge(base, own)
 
 
@@ -180,7 +196,11 @@ def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str
         other = defined.get(key)
         if key not in defined:
             kept[key] = value
-        elif isinstance(value, dict) and isinstance(other, dict) and value.get("kind") in (None, other.get("kind")):
+        elif (
+            isinstance(value, dict)
+            and isinstance(other, dict)
+            and value.get("kind") in (None, other.get("kind"))
+        ):
             kept[key] = undefined_keys(value, other)
     return kept
 
@@ -196,23 +216,29 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, SCENES, "scene")
 
 
-def load(name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True) -> Scene:
+def load(
+    name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True
+) -> Scene:
     """Read, override (`path.to.key` -> YAML value) and validate a scene.
 
     refuses_unused : whether an option that has no effect is an error (scene/unused.py)
     Raises InputError with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
-    path, overrides = find(str(name)), overrides or {}
+    path = find(str(name))
+    overrides = overrides or {}
     layers = read_layers(path)
     scene = validate(layers, overrides)
     if refuses_unused:
-        unused.check(scene, layers[0].tree, overrides, locations(layers), lambda: validate(layers, {}))
+        unused.check(
+            scene, layers[0].tree, overrides, locations(layers), lambda: validate(layers, {})
+        )
     return scene
 
 
 def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
     """The scene of some layers and overrides. Raises InputError with one line."""
-    tree, files = with_overrides(merged(layers), overrides), locations(layers)
+    tree = with_overrides(merged(layers), overrides)
+    files = locations(layers)
     try:
         raw = apply_preset(tree, files, overrides)
         return Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
@@ -302,7 +328,9 @@ def read(path: Path) -> tuple[dict[str, Any], Files]:
     return merged(layers), locations(layers)
 
 
-def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
+def apply_preset(
+    tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
+) -> dict[str, Any]:
     """`with_preset` of the camera and of the heads, with file and line added to its errors."""
     try:
         return with_preset(with_heads(tree))
@@ -347,7 +375,11 @@ def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
     if not keys:
         return str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
     if keys[0] == "*":
-        return [resolve_file(folder, item, *keys[1:]) for item in tree] if isinstance(tree, list) else tree
+        return (
+            [resolve_file(folder, item, *keys[1:]) for item in tree]
+            if isinstance(tree, list)
+            else tree
+        )
     if not isinstance(tree, dict) or keys[0] not in tree:
         return tree
     return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
@@ -382,12 +414,16 @@ def load_camera(
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
-        return CameraFileConfig.model_validate(camera_tree(path, tree, files, overrides or {})).camera
+        return CameraFileConfig.model_validate(
+            camera_tree(path, tree, files, overrides or {})
+        ).camera
     except ValidationError as error:
         raise explain(error, CameraFileConfig, tree, files, overrides or {}) from None
 
 
-def camera_tree(path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
+def camera_tree(
+    path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
+) -> dict[str, Any]:
     """The raw section `camera` alone of a scene's tree, with its preset and calibration."""
     own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
     return apply_preset(own, files, overrides)

@@ -14,9 +14,8 @@ from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import StrictLoader, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
-MAX_ASPECT_ERROR = (
-    1e-3  # allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square
-)
+# Allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square.
+MAX_ASPECT_ERROR = 1e-3
 MAX_SIDE_PX = 20000  # a side of the chip, as in a scene's camera
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
@@ -40,7 +39,9 @@ class Calibration:
     def field_deg(self) -> tuple[float, float, float]:
         """Angles between the centers of opposite edges and corners: width, height, diagonal; without distortion."""
         sides_px = self.width_px, self.height_px, math.hypot(self.width_px, self.height_px)
-        width, height, diagonal = (2 * math.degrees(math.atan(px / 2 / self.focal_px)) for px in sides_px)
+        width, height, diagonal = (
+            2 * math.degrees(math.atan(px / 2 / self.focal_px)) for px in sides_px
+        )
         return width, height, diagonal
 
     @property
@@ -51,7 +52,9 @@ class Calibration:
     def field_text(self) -> str:
         """The field of view and the angle of a pixel in words."""
         width, height, diagonal = self.field_deg
-        return f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {self.arcsec_px:.4g}″ a pixel"
+        return (
+            f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {self.arcsec_px:.4g}″ a pixel"
+        )
 
 
 class Loader(StrictLoader):
@@ -60,7 +63,9 @@ class Loader(StrictLoader):
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
     if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(None, None, "a matrix that is not a mapping", node.start_mark)
+        raise yaml.constructor.ConstructorError(
+            None, None, "a matrix that is not a mapping", node.start_mark
+        )
     return loader.construct_mapping(node, deep=True)
 
 
@@ -74,7 +79,11 @@ def looks_like_calibration(path: Path) -> bool:
             head = file.read(MAX_BYTES)
     except OSError:
         return False
-    return head.startswith(b"%YAML") or b"\ncamera_matrix:" in head or head.startswith(b"camera_matrix:")
+    return (
+        head.startswith(b"%YAML")
+        or b"\ncamera_matrix:" in head
+        or head.startswith(b"camera_matrix:")
+    )
 
 
 def read(path: Path) -> Calibration:
@@ -86,11 +95,17 @@ def read(path: Path) -> Calibration:
     tree = parse_file(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
         if key in tree and tree[key] not in allowed:
-            raise InputError(path, f"{key}: {excerpt(repr(tree[key]))}", ", ".join(map(str, allowed)))
+            raise InputError(
+                path, f"{key}: {excerpt(repr(tree[key]))}", ", ".join(map(str, allowed))
+            )
     width, height = (image_side(path, tree, key) for key in ("image_width", "image_height"))
     fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
     if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
-        raise InputError(path, "camera_matrix: another form", "[fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0")
+        raise InputError(
+            path,
+            "camera_matrix: another form",
+            "[fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0",
+        )
     if abs(fx / fy - 1) > MAX_ASPECT_ERROR:
         raise InputError(
             path,
@@ -100,7 +115,9 @@ def read(path: Path) -> Calibration:
     shapes = tuple(shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1)))
     coefficients = matrix(path, tree, "distortion_coefficients", shapes)
     if any(coefficients[5:]):
-        raise InputError(path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS))
+        raise InputError(
+            path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS)
+        )
     k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
     return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
 
@@ -135,12 +152,15 @@ def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
     return value
 
 
-def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, int], ...]) -> list[float]:
+def matrix(
+    path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
+) -> list[float]:
     """The numbers of a matrix, row by row. Raises InputError."""
     node = tree.get(key)
     if not isinstance(node, dict):
         raise InputError(path, f"{key}: missing", "a matrix with rows, cols and data")
-    shape, data = (node.get("rows"), node.get("cols")), node.get("data")
+    shape = (node.get("rows"), node.get("cols"))
+    data = node.get("data")
     if shape not in shapes:
         raise InputError(
             path,
@@ -148,7 +168,11 @@ def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, 
             ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
-    if not isinstance(data, list) or len(data) != count or not all(is_number(value) for value in data):
+    if (
+        not isinstance(data, list)
+        or len(data) != count
+        or not all(is_number(value) for value in data)
+    ):
         raise InputError(path, f"{key}: other data", f"{count} finite numbers")
     return [float(value) for value in data]
 
@@ -160,7 +184,8 @@ def is_number(value: Any) -> bool:
 
 def text(calibration: Calibration) -> str:
     """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
-    fx, (cx, cy) = calibration.focal_px, calibration.center_px
+    fx = calibration.focal_px
+    (cx, cy) = calibration.center_px
     return (
         "%YAML:1.0\n---\n"
         f"image_width: {calibration.width_px}\nimage_height: {calibration.height_px}\n"

@@ -36,7 +36,8 @@ class Origin(NamedTuple):
         return f"{self.what}, line {self.line}" if self.line else self.what
 
 
-DEFAULT, OVERRIDE = Origin("default"), Origin("--set")
+DEFAULT = Origin("default")
+OVERRIDE = Origin("--set")
 
 
 class Entry(NamedTuple):
@@ -65,7 +66,9 @@ def effective(name: str | Path, overrides: Mapping[str, str] | None = None) -> l
     scene = loader.load(name, overrides)
     tree = located_tree(loader.read_layers(loader.find(str(name))), overrides)
     found = [entry for entry in entries(scene, tree) if entry.path != (NAME_ALIAS,)]
-    reasons = ("" if entry.value is None else unused.reason(".".join(entry.path), scene) for entry in found)
+    reasons = (
+        "" if entry.value is None else unused.reason(".".join(entry.path), scene) for entry in found
+    )
     return [entry._replace(no_effect=reason) for entry, reason in zip(found, reasons, strict=True)]
 
 
@@ -152,7 +155,8 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
     """The keys of a section, with those of its sections; tree: the located values of the section, or one for all."""
     for name, info in type(model).model_fields.items():
         key = info.alias or name
-        value, raw = getattr(model, name), tree.get(key) if isinstance(tree, dict) else None
+        value = getattr(model, name)
+        raw = tree.get(key) if isinstance(tree, dict) else None
         if isinstance(tree, Located) and tree.value == value:
             raw = tree  # a section in short: control: pid
         if isinstance(value, ConfigModel):
@@ -204,7 +208,10 @@ def tidy(value: float) -> float | int:
 def as_dicts(found: list[Entry]) -> list[dict[str, Any]]:
     """The entries for JSON: key, value, what, file, line, no_effect; dates as ISO 8601."""
     return [
-        {"key": ".".join(path), "value": value.isoformat() if isinstance(value, datetime.datetime) else value}
+        {
+            "key": ".".join(path),
+            "value": value.isoformat() if isinstance(value, datetime.datetime) else value,
+        }
         | origin._asdict()
         | {"no_effect": no_effect}
         for path, value, origin, no_effect in found
@@ -217,17 +224,23 @@ def text(found: list[Entry]) -> str:
     open_: tuple[str, ...] = ()
     for path, value, origin, no_effect in found:
         *parents, key = path
-        shared = next((n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]), len(open_))
+        shared = next(
+            (n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]),
+            len(open_),
+        )
         shared = min(shared, len(parents))
         lines += [(f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))]
-        open_, indent = tuple(parents), "  " * len(parents)
+        open_ = tuple(parents)
+        indent = "  " * len(parents)
         comment = f"{origin}; no effect" if no_effect else str(origin)
         if not (isinstance(value, list) and value and isinstance(value[0], dict)):
             lines.append((f"{indent}{key}: {flow(value)}", comment))
             continue
         lines.append((f"{indent}{key}:", comment))
         lines += [(f"{indent}  - {flow(item)}", "") for item in value]
-    return "".join(f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n" for line, note in lines)
+    return "".join(
+        f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n" for line, note in lines
+    )
 
 
 def flow(value: Any) -> str:

@@ -34,7 +34,9 @@ NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a fi
 
 EPHEMERIS_KEYS = "bodies", "satellites"  # of a light, whose places need the ephemeris
 BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
-MAX_FRAMES, MAX_DURATION_S = 1_000_000, DAY_S  # of a run, limited by memory
+# of a run, limited by memory
+MAX_FRAMES = 1_000_000
+MAX_DURATION_S = DAY_S
 
 
 class ExposureConfig(ConfigModel):
@@ -56,8 +58,13 @@ class ExposureConfig(ConfigModel):
     @model_validator(mode="after")
     def check_period(self) -> ExposureConfig:
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
-            jitter = f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
-            raise InputError("time", f"{self.time_s} s{jitter} is longer than the frame period {1 / self.rate_hz} s")
+            jitter = (
+                f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
+            )
+            raise InputError(
+                "time",
+                f"{self.time_s} s{jitter} is longer than the frame period {1 / self.rate_hz} s",
+            )
         duration_s = self.first_s + self.frames / self.rate_hz
         if self.frames > MAX_FRAMES or duration_s > MAX_DURATION_S:
             raise InputError(
@@ -93,7 +100,11 @@ class HeadConfig(ConfigModel):
 
 
 MAX_HEADS = 8
-HEAD_SECTIONS = ("camera", "tracker", "exposure")  # whose keys in a head are put over those of the main camera
+HEAD_SECTIONS = (
+    "camera",
+    "tracker",
+    "exposure",
+)  # whose keys in a head are put over those of the main camera
 
 
 class Scene(ConfigModel):
@@ -122,18 +133,28 @@ class Scene(ConfigModel):
     def check_light_source(self) -> Scene:
         """Check what depends on the kind of light source, and that the shutter reads all rows within a frame period."""
         # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise.
-        sky, tracker = self.light.kind == "stars", self.tracker
+        sky = self.light.kind == "stars"
+        tracker = self.tracker
         # Without LEDs the focal length alone is surveyed.
-        lens = {"focal_length_sigma_m": tracker.survey.focal_length_sigma_m, "seed": tracker.survey.seed}
-        lens_only = SurveyErrorsConfig().model_copy(update=lens if tracker.survey.focal_length_sigma_m else {})
+        lens = {
+            "focal_length_sigma_m": tracker.survey.focal_length_sigma_m,
+            "seed": tracker.survey.seed,
+        }
+        lens_only = SurveyErrorsConfig().model_copy(
+            update=lens if tracker.survey.focal_length_sigma_m else {}
+        )
         if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
-            raise InputError(f"tracker.{key}", f"light of kind {self.light.kind} has no LEDs to survey", "dome")
+            raise InputError(
+                f"tracker.{key}", f"light of kind {self.light.kind} has no LEDs to survey", "dome"
+            )
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise InputError("motion.start", f"light of kind {self.light.kind} requires {keys}")
         if not sky and any(glow.kind == "faint_stars" for glow in self.background):
-            raise InputError("background", f"faint_stars requires light of kind stars, not {self.light.kind}")
+            raise InputError(
+                "background", f"faint_stars requires light of kind stars, not {self.light.kind}"
+            )
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
             raise InputError(
@@ -150,12 +171,17 @@ class Scene(ConfigModel):
         points = layout.points if isinstance(layout, OnPoints) else layout
         if not isinstance(points, OptimizedConfig):
             return self
-        camera_m, chip = points.camera_m or self.vehicle.camera_m, (self.camera.width_px, self.camera.height_px)
+        camera_m = points.camera_m or self.vehicle.camera_m
+        chip = (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
             key = f"light.layout.{'points.' if nested else ''}camera"
             raise InputError(key, "missing", "that, or vehicle.camera")
-        field_deg = tuple(math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px)) for side_px in chip)
-        points = points.model_copy(update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg})
+        field_deg = tuple(
+            math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px)) for side_px in chip
+        )
+        points = points.model_copy(
+            update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
+        )
         layout = layout.model_copy(update={"points": points}) if nested and layout else points
         return self.model_copy(update={"light": self.light.model_copy(update={"layout": layout})})
 
@@ -177,7 +203,10 @@ class Scene(ConfigModel):
     def check_bodies(self) -> Scene:
         """Check that the ephemeris of the bodies holds at the scene's time."""
         first, last = BODIES_YEARS
-        sections = {"orbit": self.orbit, **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS}}
+        sections = {
+            "orbit": self.orbit,
+            **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS},
+        }
         for key, section in sections.items():
             if section and not first <= self.start_time.year <= last:
                 raise InputError(key, f"start_time {self.start_time} is outside {first} to {last}")
@@ -187,30 +216,44 @@ class Scene(ConfigModel):
     def check_orbit(self) -> Scene:
         """Check that an orbit is under the stars, and that satellites have a place from which they are seen."""
         if self.orbit and not isinstance(self.light, StarsConfig):
-            raise InputError("orbit", f"light of kind {self.light.kind} is in a laboratory", "stars")
+            raise InputError(
+                "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
+            )
         satellites = getattr(self.light, "satellites", None)
         if satellites and satellites.file and not self.orbit and self.site.longitude_deg is None:
-            raise InputError("light.satellites.file", "requires the section orbit, or a site.longitude_deg")
+            raise InputError(
+                "light.satellites.file", "requires the section orbit, or a site.longitude_deg"
+            )
         return self
 
     @model_validator(mode="after")
     def check_air(self) -> Scene:
         """Check that the air has a site, and that the ephemeris of the Sun and the Moon that light it holds."""
-        air, (first, last) = getattr(self.light, "air", None), BODIES_YEARS
+        air = getattr(self.light, "air", None)
+        (first, last) = BODIES_YEARS
         if air and self.orbit:
-            raise InputError("light.air", "the camera is in an orbit, above the air", "light.air or orbit")
+            raise InputError(
+                "light.air", "the camera is in an orbit, above the air", "light.air or orbit"
+            )
         if air and self.site.longitude_deg is None:
             raise InputError("light.air", "requires site.longitude_deg")
         if air and air.glow and not first <= self.start_time.year <= last:
-            raise InputError("light.air.glow", f"start_time {self.start_time} is outside {first} to {last}")
+            raise InputError(
+                "light.air.glow", f"start_time {self.start_time} is outside {first} to {last}"
+            )
         if air and air.glow and any(glow.kind in ("sky", "moon") for glow in self.background):
-            raise InputError("light.air.glow", "conflicts with a background of kind sky or moon", "one of the two")
+            raise InputError(
+                "light.air.glow",
+                "conflicts with a background of kind sky or moon",
+                "one of the two",
+            )
         return self
 
     @model_validator(mode="after")
     def check_exposure_limits(self) -> Scene:
         """Check that any exposure the exposure control may select ends before the next one begins."""
-        control, period_s = self.tracker.exposure_control, 1 / self.exposure.rate_hz
+        control = self.tracker.exposure_control
+        period_s = 1 / self.exposure.rate_hz
         if control is None:
             return self
         if control.longest_s + self.exposure.trigger_jitter_s > period_s:
@@ -239,13 +282,19 @@ class Scene(ConfigModel):
             return self
         commanded = getattr(self.vehicle, control.actuators, None)
         if commanded is None and control.actuators != "ideal":
-            raise InputError("motion.control.actuators", f"requires the section vehicle.{control.actuators}")
+            raise InputError(
+                "motion.control.actuators", f"requires the section vehicle.{control.actuators}"
+            )
         stores_momentum = commanded is not None and commanded.stores_momentum
         if control.desaturation and not (self.vehicle.fans and stores_momentum):
-            raise InputError("motion.control.desaturation", "requires vehicle.fans, and actuators wheels or cmgs")
+            raise InputError(
+                "motion.control.desaturation", "requires vehicle.fans, and actuators wheels or cmgs"
+            )
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"
-            raise InputError("motion.control.feedback", f"{control.feedback} requires the section {section}")
+            raise InputError(
+                "motion.control.feedback", f"{control.feedback} requires the section {section}"
+            )
         return self
 
     @model_validator(mode="after")
@@ -254,13 +303,18 @@ class Scene(ConfigModel):
         rate_hz = self.control_rate_hz
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
             raise InputError(
-                "motion.control.rate_hz", f"{rate_hz:g} Hz has a period that is not a whole number of milliseconds"
+                "motion.control.rate_hz",
+                f"{rate_hz:g} Hz has a period that is not a whole number of milliseconds",
             )
         imu = self.vehicle.imu
         if imu and self.filter and self.filter.bias_time_s < 10 / imu.rate_hz:
-            raise InputError("filter.bias_time", f"shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s")
+            raise InputError(
+                "filter.bias_time", f"shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s"
+            )
         sines_hz = [leg.frequency_hz for leg in self.motion.maneuver if leg.kind == "sine"]
-        chirps_hz = [max(leg.from_hz, leg.to_hz) for leg in self.motion.maneuver if leg.kind == "chirp"]
+        chirps_hz = [
+            max(leg.from_hz, leg.to_hz) for leg in self.motion.maneuver if leg.kind == "chirp"
+        ]
         fastest_hz = max((*sines_hz, *chirps_hz), default=0)
         if 2 * fastest_hz >= rate_hz:
             kind = "sine" if fastest_hz in sines_hz else "chirp"
@@ -270,7 +324,8 @@ class Scene(ConfigModel):
             )
         if imu and abs(imu.rate_hz / rate_hz - round(imu.rate_hz / rate_hz)) > 1e-9:
             raise InputError(
-                "vehicle.imu.rate_hz", f"{imu.rate_hz:g} Hz is not a multiple of motion.control.rate_hz {rate_hz:g} Hz"
+                "vehicle.imu.rate_hz",
+                f"{imu.rate_hz:g} Hz is not a multiple of motion.control.rate_hz {rate_hz:g} Hz",
             )
         return self
 
@@ -286,7 +341,10 @@ class Scene(ConfigModel):
             own = self.of_head(n)
             try:
                 Scene.model_validate(
-                    {field.alias or key: getattr(own, key) for key, field in Scene.model_fields.items()}
+                    {
+                        field.alias or key: getattr(own, key)
+                        for key, field in Scene.model_fields.items()
+                    }
                 )
             except ValidationError as error:
                 first = error.errors()[0]
@@ -296,12 +354,15 @@ class Scene(ConfigModel):
 
     def of_head(self, n: int) -> Scene:
         """The scene with head n as its only camera. Its noise and timing are drawn from a seed of its own."""
-        head, main = self.heads[n], self.camera
+        head = self.heads[n]
+        main = self.camera
         camera = head.camera or main
         if camera.detector.hardware_seed == main.detector.hardware_seed:
             unit = {"hardware_seed": main.detector.hardware_seed + n + 1}
             camera = camera.model_copy(update={"detector": camera.detector.model_copy(update=unit)})
-        thermal = self.thermal and self.thermal.model_copy(update={"mount_arcsec_k": head.mount_arcsec_k})
+        thermal = self.thermal and self.thermal.model_copy(
+            update={"mount_arcsec_k": head.mount_arcsec_k}
+        )
         if thermal and not thermal.has_effect:
             thermal = None
         sections = {
@@ -318,13 +379,21 @@ class Scene(ConfigModel):
     @property
     def summary(self) -> list[tuple[str, str]]:
         """What the scene has, one line a section, for tables."""
-        camera, exposure, control, tracker = self.camera, self.exposure, self.motion.control, self.tracker
+        camera = self.camera
+        exposure = self.exposure
+        control = self.motion.control
+        tracker = self.tracker
         dome = self.light if isinstance(self.light, DomeConfig) else None
-        stages = [getattr(tracker, stage) for stage in ("detector", "centroider", "identifier", "solver")]
+        stages = [
+            getattr(tracker, stage) for stage in ("detector", "centroider", "identifier", "solver")
+        ]
         focus = "infinity" if math.isinf(camera.focus_m) else f"{camera.focus_m:.4g} m"
         return [
             ("name", self.name),
-            ("light", f"dome: {dome.surface.kind}, {dome.layout.kind}" if dome else self.light.kind),
+            (
+                "light",
+                f"dome: {dome.surface.kind}, {dome.layout.kind}" if dome else self.light.kind,
+            ),
             ("vehicle", f"{self.vehicle.mount}, {control.law if control else 'no'} control"),
             (
                 "camera",
@@ -341,7 +410,9 @@ class Scene(ConfigModel):
 
     def _repr_html_(self) -> str:
         """For notebooks: what the scene has, one row a section."""
-        cells = "".join(f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>" for key, text in self.summary)
+        cells = "".join(
+            f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>" for key, text in self.summary
+        )
         return f"<h4>{html.escape(self.title)}</h4><table>{cells}</table>"
 
     @property

@@ -70,7 +70,9 @@ def equally_bright(scene: Scene) -> bool:
         levels = {level for board in points.boards or () for level in board.levels or (1.0,)}
         return len(levels or set(points.pwm_levels)) == 1
     return (
-        not isinstance(points, CelestialConfig) and not getattr(points, "file", None) and len(set(points.dimming)) == 1
+        not isinstance(points, CelestialConfig)
+        and not getattr(points, "file", None)
+        and len(set(points.dimming)) == 1
     )
 
 
@@ -99,7 +101,12 @@ def survey_draws_nothing(scene: Scene) -> bool:
     """Whether no survey error is drawn from `tracker.survey.seed`."""
     survey = scene.tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
-    drawn = (survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument)
+    drawn = (
+        survey.led_sigma_m,
+        survey.lever_sigma_m,
+        survey.focal_length_sigma_m,
+        survey.instrument,
+    )
     return not (any(drawn) or (surface_m and survey.surface_seed is None))
 
 
@@ -112,7 +119,8 @@ def dome_draws_nothing(scene: Scene) -> bool:
     """Whether LEDs, their brightness and their pulses are all without anything random."""
     if not isinstance(scene.light, DomeConfig) or not steady(scene):
         return False
-    led, layout = scene.light.led, scene.light.layout
+    led = scene.light.led
+    layout = scene.light.layout
     if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
         return False
     if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
@@ -137,7 +145,9 @@ def uniform_chip(detector: DetectorConfig) -> bool:
 
 def earth_unused(scene: Scene) -> bool:
     imu = scene.vehicle.imu
-    return not scene.vehicle.disturbances.earth_rotation and (imu is None or imu.earth_rate == "none")
+    return not scene.vehicle.disturbances.earth_rotation and (
+        imu is None or imu.earth_rate == "none"
+    )
 
 
 def flat_wall(scene: Scene) -> bool:
@@ -249,7 +259,12 @@ RULES = (
         "another tracker.detector, e.g. threshold",
     ),
     Rule(
-        ("tracker.survey.rotation_deg", "tracker.survey.seed", "tracker.survey.surface_seed", "light.surface.error"),
+        (
+            "tracker.survey.rotation_deg",
+            "tracker.survey.seed",
+            "tracker.survey.surface_seed",
+            "light.surface.error",
+        ),
         surface_unused,
         "tracker.map replaces the survey of the LEDs, and the solver does not use the surface",
         f"no tracker.map, or tracker.solver {' or '.join(SURFACE_SOLVERS)}",
@@ -268,7 +283,9 @@ RULES = (
     ),
     Rule(
         ("light.led.pwm_period",),
-        lambda scene: isinstance(scene.light, DomeConfig) and not isinstance(scene.light.led.drive, PwmConfig),
+        lambda scene: (
+            isinstance(scene.light, DomeConfig) and not isinstance(scene.light.led.drive, PwmConfig)
+        ),
         "it is the period of the drive pwm",
         "light.led.drive: {kind: pwm}",
     ),
@@ -297,7 +314,12 @@ RULES = (
         "light.reflection.floor, or another light.surface",
     ),
     Rule(
-        ("light.layout.spacing", "light.layout.spread", "light.layout.lit", "light.layout.pwm_levels"),
+        (
+            "light.layout.spacing",
+            "light.layout.spread",
+            "light.layout.lit",
+            "light.layout.pwm_levels",
+        ),
         listed_boards,
         "light.layout.boards lists the boards",
         "no light.layout.boards",
@@ -339,7 +361,11 @@ RULES = (
         "camera.detector.temperature_c",
     ),
     Rule(
-        ("camera.detector.temperature_c", "camera.detector.dark_temperature_c", "camera.detector.dark_doubling_c"),
+        (
+            "camera.detector.temperature_c",
+            "camera.detector.dark_temperature_c",
+            "camera.detector.dark_doubling_c",
+        ),
         lambda scene: cold(scene.camera.detector),
         "the chip has no dark current",
         "camera.detector.dark_e_s above 0",
@@ -486,7 +512,9 @@ def check(
 def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
     """Raise InputError for the first key of a head of the scene's own file that has no effect in that head's scene."""
     for n, head in enumerate(own.get("heads") or ()):
-        for key in set_keys({section: head[section] for section in HEAD_SECTIONS if section in head}):
+        for key in set_keys(
+            {section: head[section] for section in HEAD_SECTIONS if section in head}
+        ):
             if broken := find(RULES, [key], scene.of_head(n)):
                 error = no_effect(*broken).under(f"heads.{n}")
                 raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
@@ -510,10 +538,14 @@ def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
 
 def no_effect(key: str, rule: Rule) -> InputError:
     """The error of a key that has no effect: why, and what is allowed."""
-    return InputError(key, f"has no effect: {rule.reason}", f"{rule.allowed}, or no {key.rpartition('.')[2]}")
+    return InputError(
+        key, f"has no effect: {rule.reason}", f"{rule.allowed}, or no {key.rpartition('.')[2]}"
+    )
 
 
-def find(rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subject: Any) -> tuple[str, Rule] | None:
+def find(
+    rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subject: Any
+) -> tuple[str, Rule] | None:
     """The first of the dotted keys whose value in the model is not the default and has no effect, and its rule.
 
     subject : arguments of the rules; the model if left out
@@ -521,7 +553,11 @@ def find(rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subjec
     for key in keys:
         for rule in rules:
             section = section_of(key, rule)
-            if section and differs(model, section.split(".")) and rule.applies(*(subject or (model,))):
+            if (
+                section
+                and differs(model, section.split("."))
+                and rule.applies(*(subject or (model,)))
+            ):
                 return key, rule
     return None
 
@@ -543,9 +579,12 @@ def differs(model: Any, path: list[str]) -> bool:
         name = field_names(type(model)).get(key) if isinstance(model, ConfigModel) else None
         if name is None:
             return False
-        field, model = type(model).model_fields[name], getattr(model, name)
+        field = type(model).model_fields[name]
+        model = getattr(model, name)
         if depth == len(path) - 1:
-            return field.is_required() or bool(model != field.get_default(call_default_factory=True))
+            return field.is_required() or bool(
+                model != field.get_default(call_default_factory=True)
+            )
     return False
 
 

@@ -48,7 +48,9 @@ class TrackerCompilation(event.Listener):
         module = compilation.data["dispatcher"].py_func.__module__
         if self.process is None and module.startswith("skysim."):
             silent = subprocess.DEVNULL
-            self.process = subprocess.Popen(self.command, stdin=silent, stdout=silent, stderr=silent)
+            self.process = subprocess.Popen(
+                self.command, stdin=silent, stdout=silent, stderr=silent
+            )
         elif self.process is not None and module.startswith("estimator."):
             self.process.wait()
 
@@ -98,12 +100,19 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
     xy_px = assumed.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[assumed.contains(xy_px)][:MAX_SPOTS]
     full_dn = saturation_dn(camera.scene.camera.detector)
-    image_dn = random_stream(0).normal(0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px))
-    x, y = np.arange(assumed.width_px), np.arange(assumed.height_px)
+    image_dn = random_stream(0).normal(
+        0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px)
+    )
+    x = np.arange(assumed.width_px)
+    y = np.arange(assumed.height_px)
     for x_px, y_px in xy_px:
-        along, down = (np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px)))
+        along, down = (
+            np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px))
+        )
         image_dn += 0.5 * full_dn * np.outer(down, along)
-    return Frame(0, np.clip(image_dn, 0, full_dn).astype(np.uint16), when.open_s, when.exposure_s, full_dn)
+    return Frame(
+        0, np.clip(image_dn, 0, full_dn).astype(np.uint16), when.open_s, when.exposure_s, full_dn
+    )
 
 
 if __name__ == "__main__":

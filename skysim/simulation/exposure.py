@@ -27,7 +27,13 @@ from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
-from skysim.simulation.timing import MARGIN_S, exposure_window, frame_end_s, time_tag_error_s, window_from
+from skysim.simulation.timing import (
+    MARGIN_S,
+    exposure_window,
+    frame_end_s,
+    time_tag_error_s,
+    window_from,
+)
 
 KNOTS = 5  # of the motion in an exposure of constant rate
 
@@ -46,7 +52,8 @@ def render_frame(
     added : gets the masks of smear and particles
     """
     clock = clock or Clock()
-    scene, detector = camera.scene, camera.detector
+    scene = camera.scene
+    detector = camera.detector
     window = window or exposure_window(scene, index)
     exposure = exposure_of(camera, trajectory, index, window, camera.seeds)
     beam = beam_of(camera.lights, exposure)
@@ -58,16 +65,22 @@ def render_frame(
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, detector)
     clock.lap("render")
-    image = expose(light_e, window.exposure_s, detector, random_stream(scene.seed, DETECTOR, index), added)
+    image = expose(
+        light_e, window.exposure_s, detector, random_stream(scene.seed, DETECTOR, index), added
+    )
     clock.lap("detector")
     tagged_s = exposure.t_s + time_tag_error_s(scene, index)
     frame = Frame(index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector))
     return frame, truth_of(beam, exposure, sources)
 
 
-def render_at_rest(camera: StarCamera, lab_from_body: Rotation, index: int = 0) -> tuple[Frame, Truth]:
+def render_at_rest(
+    camera: StarCamera, lab_from_body: Rotation, index: int = 0
+) -> tuple[Frame, Truth]:
     """Render one frame of a vehicle that is at rest at an attitude."""
-    return render_frame(camera, Trajectory.at_rest(lab_from_body, frame_end_s(camera.scene, index)), index)
+    return render_frame(
+        camera, Trajectory.at_rest(lab_from_body, frame_end_s(camera.scene, index)), index
+    )
 
 
 def exposure_of(
@@ -77,17 +90,31 @@ def exposure_of(
 
     seeds : None for the expectation, see `Exposure`
     """
-    mount, optics, scene = camera.mount, camera.optics, camera.scene
+    mount = camera.mount
+    optics = camera.optics
+    scene = camera.scene
     middle_s = window.middle_s(scene.camera.height_px)
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
         mount, optics = thermal.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
-    return Exposure(index, window, trajectory, lab_from_body, mount, optics, camera.band, camera.viewpoint, seeds)
+    return Exposure(
+        index,
+        window,
+        trajectory,
+        lab_from_body,
+        mount,
+        optics,
+        camera.band,
+        camera.viewpoint,
+        seeds,
+    )
 
 
-def expected_exposure(camera: StarCamera, lab_from_body: Rotation, rate_body_rad_s: Floats, t_s: float) -> Exposure:
+def expected_exposure(
+    camera: StarCamera, lab_from_body: Rotation, rate_body_rad_s: Floats, t_s: float
+) -> Exposure:
     """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
 
     t_s : middle of the first row's exposure; NaN for that of the first frame
@@ -98,7 +125,9 @@ def expected_exposure(camera: StarCamera, lab_from_body: Rotation, rate_body_rad
     rows = camera.scene.camera.height_px
     after_s = np.linspace(-1, 1, KNOTS) * (window.close_s(rows) - window.open_s + MARGIN_S)
     attitudes = lab_from_body * Rotation.from_rotvec(np.outer(after_s, rate_body_rad_s))
-    trajectory = Trajectory(window.middle_s(rows) + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1)))
+    trajectory = Trajectory(
+        window.middle_s(rows) + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1))
+    )
     return exposure_of(camera, trajectory, 0, window, None)
 
 

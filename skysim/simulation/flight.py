@@ -31,7 +31,9 @@ from skysim.simulation.user_parts import NO_PARTS, UserParts, with_parts
 from skysim.tracking import factory, gyro
 from skysim.tracking.exposure_control import ExposureController
 
-FIRST_OBSERVATION = 1_000_000  # index of the first frame beside the schedule; it selects the frame's noise
+FIRST_OBSERVATION = (
+    1_000_000  # index of the first frame beside the schedule; it selects the frame's noise
+)
 
 Progress = Callable[[float, float], None]
 FrameSelector = Callable[[int, float], bool]
@@ -95,7 +97,9 @@ class Schedule:
     @property
     def window(self) -> Window:
         """Of the next frame."""
-        return timing.exposure_window(self.camera.scene, self.index, self.exposure_control.exposure_s)
+        return timing.exposure_window(
+            self.camera.scene, self.index, self.exposure_control.exposure_s
+        )
 
     @property
     def close_s(self) -> float:
@@ -124,14 +128,21 @@ class Flight:
     """
 
     def __init__(
-        self, lab: Lab, parts: UserParts = NO_PARTS, *, endless: bool = False, keeps_history: bool = True
+        self,
+        lab: Lab,
+        parts: UserParts = NO_PARTS,
+        *,
+        endless: bool = False,
+        keeps_history: bool = True,
     ) -> None:
         if endless and keeps_history:
             raise InputError("endless", "the history would have no end", "keeps_history=False")
         self.lab = lab
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
-        self.motion = Motion(lab, parts.controllers, self.duration_s, None if keeps_history else history_s(lab))
+        self.motion = Motion(
+            lab, parts.controllers, self.duration_s, None if keeps_history else history_s(lab)
+        )
         self.schedules = [
             Schedule(camera, number, math.inf if endless else camera.scene.exposure.frames)
             for number, camera in enumerate(lab.cameras)
@@ -186,9 +197,13 @@ class Flight:
         """
         self.refuse_in_shots("step")
         if self.is_over:
-            raise InputError("step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless")
+            raise InputError(
+                "step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless"
+            )
         if torque_nm is not None and self.lab.scene.motion.is_prescribed:
-            raise InputError("step", "a prescribed motion takes no torque", "another motion.control.law")
+            raise InputError(
+                "step", "a prescribed motion takes no torque", "another motion.control.law"
+            )
         try:
             torque = None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,))
         except ValueError as error:
@@ -199,7 +214,9 @@ class Flight:
     def refuse_in_shots(self, name: str) -> None:
         """Raise InputError inside a loop over `shots`."""
         if self.is_in_shots:
-            raise InputError(name, "inside a loop over shots, which steps by itself", "observe, or after it")
+            raise InputError(
+                name, "inside a loop over shots, which steps by itself", "observe, or after it"
+            )
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
         """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
@@ -301,12 +318,17 @@ class Flight:
             self.is_in_shots = False
 
     def capture_due(
-        self, schedules: Sequence[Schedule], solves: bool = False, selects: FrameSelector | None = None
+        self,
+        schedules: Sequence[Schedule],
+        solves: bool = False,
+        selects: FrameSelector | None = None,
     ) -> Iterator[Shot]:
         """Yield the exposures that are due and not yet rendered, in order; with a filter they update it."""
         has_filter = bool(self.filter_schedules)
         while due := [one for one in schedules if not one.is_over and one.due_s <= self.now_s]:
-            yield from self.capture_next(earliest(due), solves or has_filter, selects, updates_filter=has_filter)
+            yield from self.capture_next(
+                earliest(due), solves or has_filter, selects, updates_filter=has_filter
+            )
 
     def capture_late(
         self, schedules: Sequence[Schedule], solves: bool, selects: FrameSelector | None
@@ -330,7 +352,9 @@ class Flight:
         schedule.exposure_control.update(shot.frame)
         yield shot
 
-    def capture(self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool) -> Shot:
+    def capture(
+        self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool
+    ) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution.
 
         Raises InputError for an exposure that began before the states that the flight keeps.
@@ -338,7 +362,9 @@ class Flight:
         camera = schedule.camera
         simulation = self.motion.simulation
         if simulation.first_step and simulation.first_step * simulation.step_s > window.open_s:
-            raise InputError("shots", f"the flight has forgotten frame {index}", "keeps_history=True")
+            raise InputError(
+                "shots", f"the flight has forgotten frame {index}", "keeps_history=True"
+            )
         clock = Clock()
         trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
         frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
@@ -350,7 +376,9 @@ class Flight:
         update_status = ""
         if updates_filter and report and self.motion.navigation:
             # The filter takes the solution at its mid-exposure time, although it arrives later.
-            update_status = self.motion.navigation.update_filter(frame.t_mid_s, report.attitude, schedule.number)
+            update_status = self.motion.navigation.update_filter(
+                frame.t_mid_s, report.attitude, schedule.number
+            )
         return Shot(camera, frame, truth, report, rate, update_status, clock.seconds)
 
     def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
@@ -386,10 +414,16 @@ class Flight:
         scene = schedule.camera.scene
         exposure_s = schedule.exposures_s.get(index)
         if exposure_s is None and scene.tracker.exposure_control:
-            raise InputError("render", f"frame {index} has no exposure time yet", "after it came from shots")
+            raise InputError(
+                "render", f"frame {index} has no exposure time yet", "after it came from shots"
+            )
         window = timing.exposure_window(scene, index, exposure_s)
-        if not (0 <= index < schedule.frames and window.close_s(scene.camera.height_px) <= self.now_s):
-            raise InputError("render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is")
+        if not (
+            0 <= index < schedule.frames and window.close_s(scene.camera.height_px) <= self.now_s
+        ):
+            raise InputError(
+                "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"
+            )
         return render_frame(schedule.camera, self.trajectory(), index, None, window)
 
     def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:

@@ -122,7 +122,9 @@ class Lab:
 
     def with_light(self, light: Light) -> Lab:
         """The lab with a light in place of that of the same class, before its main camera."""
-        return self.with_camera(lights=tuple(light if type(one) is type(light) else one for one in self.camera.lights))
+        return self.with_camera(
+            lights=tuple(light if type(one) is type(light) else one for one in self.camera.lights)
+        )
 
     def with_sources(self, sources: Sources) -> Lab:
         """The lab with other stars or LEDs before its main camera."""
@@ -136,7 +138,9 @@ class Lab:
     def with_scene(self, scene: Scene) -> Lab:
         """The same hardware for another scene, of which it would be built alike: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
-        cameras = tuple(replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True))
+        cameras = tuple(
+            replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True)
+        )
         return replace(self, scene=scene, cameras=cameras)
 
     def export_mjcf(self) -> str:
@@ -167,8 +171,12 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     profiles = load_profiles(scene, mount, parts.profile)
     shown = light_catalog(scene)
     main = build_camera(scene, vehicle, mount, shown)
-    heads = [build_head(scene, n, vehicle, main, shown, parts.programs) for n in range(len(scene.heads))]
-    return Lab(scene, vehicle, (main, *heads), lab_from_body_start(scene, mount, profiles), tuple(profiles))
+    heads = [
+        build_head(scene, n, vehicle, main, shown, parts.programs) for n in range(len(scene.heads))
+    ]
+    return Lab(
+        scene, vehicle, (main, *heads), lab_from_body_start(scene, mount, profiles), tuple(profiles)
+    )
 
 
 def build_camera(
@@ -244,11 +252,16 @@ def build_head(
     )
 
 
-def lab_from_body_start(scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
+def lab_from_body_start(
+    scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()
+) -> Rotation:
     """The attitude at t = 0. For a star scene the lab frame is the ICRS."""
     start = scene.motion.start
     if isinstance(start, PointingConfig):
-        return stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv() * mount.cam_from_body
+        return (
+            stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv()
+            * mount.cam_from_body
+        )
     return guidance.start_attitude(scene.motion, profiles)
 
 
@@ -259,7 +272,9 @@ def light_catalog(scene: Scene) -> catalog.Catalog | None:
     return catalog.read_for("light.catalog", scene.light.catalog)
 
 
-def build_tracker(camera: StarCamera, programs: Mapping[str, str] = factory.NO_PROGRAMS) -> factory.Estimator:
+def build_tracker(
+    camera: StarCamera, programs: Mapping[str, str] = factory.NO_PROGRAMS
+) -> factory.Estimator:
     """The star tracker of a camera, with the hardware parameters that it assumes (see tracking/factory.py).
 
     programs : commands of external trackers by name

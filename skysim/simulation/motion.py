@@ -29,13 +29,22 @@ class Motion:
     Raises InputError for a maneuver that the vehicle cannot follow, and for too fast vibration.
     """
 
-    def __init__(self, lab: Lab, controllers: ControllerSource, duration_s: float, kept_s: float | None = None) -> None:
-        scene, vehicle = lab.scene, lab.vehicle
+    def __init__(
+        self,
+        lab: Lab,
+        controllers: ControllerSource,
+        duration_s: float,
+        kept_s: float | None = None,
+    ) -> None:
+        scene = lab.scene
+        vehicle = lab.vehicle
         self.lab = lab
         self.reference = guidance.plan(scene.motion, lab.start, lab.profiles)
         check_reference(self.reference, scene, vehicle, duration_s)
         self.simulation = build_simulation(lab, self.reference, duration_s, kept_s)
-        self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), self.reference)
+        self.vibration = Vibration.draw(
+            scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
+        )
         if kept_s is None:
             # Raises InputError before any long work.
             self.vibration.subdivisions(self.simulation.times_s(0, self.simulation.last_step + 1))
@@ -51,7 +60,9 @@ class Motion:
         )
         self.recorder = None
         if kept_s is None:
-            self.recorder = TelemetryRecorder(self.simulation, self.flight_computer, self.navigation)
+            self.recorder = TelemetryRecorder(
+                self.simulation, self.flight_computer, self.navigation
+            )
 
     def close(self) -> None:
         """End the process of an external controller."""
@@ -75,19 +86,27 @@ class Motion:
 
         torque_nm : (3,) in body axes, in place of the controller's
         """
-        simulation, flight_computer, navigation = self.simulation, self.flight_computer, self.navigation
-        t_s, angles, speeds = simulation.now_s, simulation.angles_rad, simulation.speeds_rad_s
-        attitude, rate = simulation.lab_from_body_wxyz, simulation.rate_body_rad_s
+        simulation = self.simulation
+        flight_computer = self.flight_computer
+        navigation = self.navigation
+        t_s = simulation.now_s
+        angles = simulation.angles_rad
+        speeds = simulation.speeds_rad_s
+        attitude = simulation.lab_from_body_wxyz
+        rate = simulation.rate_body_rad_s
         momentum = flight_computer.momentum_nms(angles, speeds)
         # The controller sees the truth or, with feedback imu or filter, the navigation's estimates.
-        measured_attitude, measured_rate = attitude, rate
+        measured_attitude = attitude
+        measured_rate = rate
         feedback = flight_computer.config.feedback if flight_computer.config else "truth"
         if feedback != "truth" and navigation:
             measured_attitude = navigation.attitude_wxyz(feedback)
             measured_rate = navigation.body_rate_rad_s(feedback)
         inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
         control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
-        control[:] = flight_computer.compute_controls(inputs, measured_attitude, momentum, torque_nm)
+        control[:] = flight_computer.compute_controls(
+            inputs, measured_attitude, momentum, torque_nm
+        )
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):
             times_s = simulation.times_s(simulation.step, simulation.step + len(control) + 1)
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
@@ -114,7 +133,11 @@ class Motion:
         if not self.vibration.components:
             return simulation.knots(begin)
         trajectory = self.vibration.add_to(simulation.trajectory(begin))
-        return trajectory.t_s, trajectory.lab_from_body.as_quat(scalar_first=True), trajectory.rate_body_rad_s
+        return (
+            trajectory.t_s,
+            trajectory.lab_from_body.as_quat(scalar_first=True),
+            trajectory.rate_body_rad_s,
+        )
 
 
 def history_s(lab: Lab) -> float:
@@ -128,7 +151,9 @@ def build_simulation(
     """The simulation of the motion at its start: by dynamics, or along the reference if the motion is prescribed."""
     motion = lab.scene.motion
     if motion.is_prescribed:
-        return multibody.PrescribedMotion(lab.vehicle, lambda t_s: reference.state_at(t_s)[:2], duration_s, kept_s)
+        return multibody.PrescribedMotion(
+            lab.vehicle, lambda t_s: reference.state_at(t_s)[:2], duration_s, kept_s
+        )
     rate = guidance.start_rate_rad_s(motion, lab.profiles)
     return multibody.Simulation(lab.vehicle, lab.start, rate, duration_s, kept_s)
 
@@ -140,4 +165,6 @@ def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:
     position_m = multibody.imu_position_m(lab.vehicle)
     stream = random_stream(lab.scene.seed, IMU, 0)
     mounts = tuple(camera.mount for camera in lab.cameras)
-    return Navigation(lab.scene, mounts, lab.start, position_m, lab.vehicle.gravity_m_s2, stream, kept_s)
+    return Navigation(
+        lab.scene, mounts, lab.start, position_m, lab.vehicle.gravity_m_s2, stream, kept_s
+    )

@@ -91,7 +91,9 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
         )
 
 
-def check_torque(key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig) -> None:
+def check_torque(
+    key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig
+) -> None:
     """Raise InputError for a torque (K, 3) that the actuators cannot give. used : (K,) times what they can"""
     n = int(used.argmax())
     if used[n] > 1 + ROUNDING:

@@ -23,21 +23,31 @@ class TelemetryRecorder:
     Quantities in the simulation's states are read from them at the end; only the others are recorded on the way.
     """
 
-    def __init__(self, simulation: Simulation, flight_computer: FlightComputer, navigation: Navigation | None) -> None:
-        self.simulation, self.flight_computer, self.navigation = simulation, flight_computer, navigation
+    def __init__(
+        self, simulation: Simulation, flight_computer: FlightComputer, navigation: Navigation | None
+    ) -> None:
+        self.simulation = simulation
+        self.flight_computer = flight_computer
+        self.navigation = navigation
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
         self.steps_per_tick = steps
         rows = len(self.at_step)
         self.recorded = np.zeros(rows, dtype=bool)
-        self.torque_nm, self.disturbance_nm = np.zeros((rows, 3)), np.zeros((rows, 3))
+        self.torque_nm = np.zeros((rows, 3))
+        self.disturbance_nm = np.zeros((rows, 3))
         self.momentum_nms = np.zeros((rows, 3))
-        self.imu_wxyz, self.filter_wxyz = np.zeros((rows, 4)), np.zeros((rows, 4))
+        self.imu_wxyz = np.zeros((rows, 4))
+        self.filter_wxyz = np.zeros((rows, 4))
         self.saturated = np.zeros(rows, dtype=bool)
         self.bias_rad_s = np.zeros((rows, 3))
-        self.filter_estimates = np.zeros((rows, 3, 3))  # filter: sigma of the attitude, bias, its sigma
+        self.filter_estimates = np.zeros(
+            (rows, 3, 3)
+        )  # filter: sigma of the attitude, bias, its sigma
         mounted = mounting_states(navigation)
-        self.mountings = np.zeros((len(mounted), 2, rows, 3))  # filter: estimate and sigma of each mounting
+        self.mountings = np.zeros(
+            (len(mounted), 2, rows, 3)
+        )  # filter: estimate and sigma of each mounting
 
     @property
     def row(self) -> int:
@@ -52,7 +62,10 @@ class TelemetryRecorder:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
         self.recorded[k] = True
-        self.torque_nm[k], self.momentum_nms[k] = self.flight_computer.control_torque_nm, momentum_nms
+        self.torque_nm[k], self.momentum_nms[k] = (
+            self.flight_computer.control_torque_nm,
+            momentum_nms,
+        )
         if self.navigation:
             self.record_estimates(k, self.navigation)
 
@@ -66,21 +79,31 @@ class TelemetryRecorder:
         if navigation.filter:
             state = navigation.filter.state
             self.filter_wxyz[k] = navigation.attitude_wxyz("filter")
-            self.filter_estimates[k] = state.sigma_attitude_rad, state.bias_rad_s, state.sigma_bias_rad_s
+            self.filter_estimates[k] = (
+                state.sigma_attitude_rad,
+                state.bias_rad_s,
+                state.sigma_bias_rad_s,
+            )
             for n, name in enumerate(mounting_states(navigation)):
                 self.mountings[n, :, k] = state.others[name], state.sigma(name)
 
     def telemetry(self, reference: Reference | None, cameras: Sequence[StarCamera]) -> Telemetry:
         """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
-        simulation, vehicle = self.simulation, self.simulation.vehicle
+        simulation = self.simulation
+        vehicle = self.simulation.vehicle
         steps = self.at_step[self.at_step < simulation.step]
-        states, nq = simulation.states[steps], simulation.model.nq
+        states = simulation.states[steps]
+        nq = simulation.model.nq
         # Several control periods of a free motion are integrated at once, and only the first is recorded.
         for k in np.flatnonzero(~self.recorded[: len(steps)]):
-            self.momentum_nms[k] = self.flight_computer.momentum_nms(states[k, 1 : 1 + nq], states[k, 1 + nq :])
+            self.momentum_nms[k] = self.flight_computer.momentum_nms(
+                states[k, 1 : 1 + nq], states[k, 1 + nq :]
+            )
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
-        gimbals, rotors = states[:, 1 + vehicle.gimbals.qpos], states[:, 1 + nq + vehicle.rotors.dof]
-        t_s, navigation = steps * np.float64(simulation.step_s), self.navigation
+        gimbals = states[:, 1 + vehicle.gimbals.qpos]
+        rotors = states[:, 1 + nq + vehicle.rotors.dof]
+        t_s = steps * np.float64(simulation.step_s)
+        navigation = self.navigation
         rows = slice(len(steps))
         has_imu = navigation is not None
         has_filter = navigation is not None and navigation.filter is not None
@@ -107,7 +130,9 @@ class TelemetryRecorder:
             self.mountings_by_camera(t_s, cameras),
         )
 
-    def mountings_by_camera(self, t_s: Floats, cameras: Sequence[StarCamera]) -> dict[str, Mounting]:
+    def mountings_by_camera(
+        self, t_s: Floats, cameras: Sequence[StarCamera]
+    ) -> dict[str, Mounting]:
         """The filter's mounting states, and what they are in truth."""
         if not len(self.mountings):
             return {}
@@ -116,7 +141,9 @@ class TelemetryRecorder:
         relative_rad = [true_rad[0], *(head - true_rad[0] for head in true_rad[1:])]
         return {
             name: Mounting(estimate[: len(t_s)], sigma[: len(t_s)], true)
-            for name, (estimate, sigma), true in zip(names, self.mountings, relative_rad, strict=True)
+            for name, (estimate, sigma), true in zip(
+                names, self.mountings, relative_rad, strict=True
+            )
         }
 
 

@@ -57,7 +57,9 @@ def with_parts(
 
     Raises InputError for a part of another type.
     """
-    motion, law, estimator = scene.motion, None, None
+    motion = scene.motion
+    law = None
+    estimator = None
     if controller is not None:
         motion, law = with_controller(motion, controller)
     if profile is not None:
@@ -73,7 +75,9 @@ def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig
     """The motion with a controller, and the factory of one that is not given by name."""
     config = motion.control or ControlConfig()
     if not (isinstance(controller, str) or callable(controller)):
-        raise InputError("controller", type(controller).__name__, "a name, or a callable that takes a set-up")
+        raise InputError(
+            "controller", type(controller).__name__, "a name, or a callable that takes a set-up"
+        )
     law = controller if isinstance(controller, str) else name_of(controller)
     changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
     return changed, None if isinstance(controller, str) else controller
@@ -103,8 +107,12 @@ def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator |
     elif callable(tracker) and not isinstance(tracker, type):
         estimator = FunctionTracker(name_of(tracker), tracker)
     elif not isinstance(tracker, str):
-        what = f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
-        raise InputError("tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker")
+        what = (
+            f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
+        )
+        raise InputError(
+            "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
+        )
     name = tracker if isinstance(tracker, str) else name_of(tracker)
     config = scene.tracker.model_copy(update={"name": name})
     return scene.model_copy(update={"tracker": config}), estimator

@@ -95,13 +95,18 @@ class Catalog:
 
 
 def write(
-    path: Path, columns: Iterable[Column], rows: list[dict[str, Any]], meta: dict[str, Any], extra: tuple[str, ...] = ()
+    path: Path,
+    columns: Iterable[Column],
+    rows: list[dict[str, Any]],
+    meta: dict[str, Any],
+    extra: tuple[str, ...] = (),
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
     rows : a dict per star, of the columns, source and the `extra` text columns
     """
-    columns, text_columns = tuple(columns), ("source", *extra)
+    columns = tuple(columns)
+    text_columns = ("source", *extra)
     datatype = [
         {"name": c.name}
         | ({"unit": c.unit} if c.unit else {})
@@ -111,12 +116,19 @@ def write(
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
-    with files.atomic_file(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as out:
-        out.writelines(f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA])
+    with (
+        files.atomic_file(path) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="") as out,
+    ):
+        out.writelines(
+            f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA]
+        )
         table = csv.writer(out, lineterminator="\n")
         table.writerow([*(c.name for c in columns), *text_columns])
         for row in rows:
-            table.writerow([format(row[c.name], c.format) for c in columns] + [row[t] for t in text_columns])
+            table.writerow(
+                [format(row[c.name], c.format) for c in columns] + [row[t] for t in text_columns]
+            )
 
 
 def package_file(package: str) -> str:
@@ -125,7 +137,9 @@ def package_file(package: str) -> str:
         module = import_module(package)
     except ImportError as error:
         name = package.replace("_", "-")
-        raise InputError("", f"package {name} is not installed", "after pip install 'skysim[catalog]'") from error
+        raise InputError(
+            "", f"package {name} is not installed", "after pip install 'skysim[catalog]'"
+        ) from error
     return str(module.catalog_path())
 
 
@@ -145,7 +159,9 @@ def read(name_or_path: str | Path) -> Catalog:
     header = lines[0].split(",")
     names = [*NUMBERS, SCATTER.name] if SCATTER.name in header else NUMBERS
     try:
-        table = np.loadtxt(lines[1:], delimiter=",", usecols=[header.index(name) for name in names], ndmin=2)
+        table = np.loadtxt(
+            lines[1:], delimiter=",", usecols=[header.index(name) for name in names], ndmin=2
+        )
     except ValueError as error:
         raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
     if len(table) != meta["rows"]:
@@ -177,13 +193,17 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     try:
         meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
-        epoch_jyear, _rows = meta["epoch_jyear"], meta["rows"]
+        epoch_jyear = meta["epoch_jyear"]
+        _rows = meta["rows"]
         valid = {*NUMBERS, "source"} <= set(lines[header].split(","))
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise catalog_error(path, "not the header of a skysim catalog") from error
     if not valid:
         raise catalog_error(path, "not the header of a skysim catalog")
-    if not isinstance(epoch_jyear, int | float) or not EPOCHS_JYEAR[0] <= epoch_jyear <= EPOCHS_JYEAR[1]:
+    if (
+        not isinstance(epoch_jyear, int | float)
+        or not EPOCHS_JYEAR[0] <= epoch_jyear <= EPOCHS_JYEAR[1]
+    ):
         allowed = "a Julian year of {} to {}".format(*EPOCHS_JYEAR)
         raise InputError(path, f"epoch_jyear {excerpt(repr(epoch_jyear))}", allowed)
     return meta, lines[header:]

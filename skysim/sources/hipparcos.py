@@ -18,7 +18,11 @@ EPOCH_JYEAR = 1991.25
 SUPPLEMENT = CATALOGS / "supplement.ecsv"
 HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henry Draper number
 
-COLUMNS = (*catalog.star_columns(".2f")[:6], Column("hp_mag", "mag", ".4f"), *catalog.star_columns(".2f")[6:])
+COLUMNS = (
+    *catalog.star_columns(".2f")[:6],
+    Column("hp_mag", "mag", ".4f"),
+    *catalog.star_columns(".2f")[6:],
+)
 
 # Characters of these columns in a line of hip2.dat.
 HIP2 = {
@@ -32,7 +36,9 @@ HIP2 = {
     "b_v": slice(152, 158),
     "v_i": slice(165, 171),
 }
-HIP2_SCATTER, HIP2_VARIABLE = slice(143, 149), slice(149, 151)  # of Hp; 0 if not in the Variability Annex
+# of Hp; 0 if not in the Variability Annex
+HIP2_SCATTER = slice(143, 149)
+HIP2_VARIABLE = slice(149, 151)
 
 # For these entries hip2 gives the magnitude of a brighter neighbor (Hipparcos' detector was 30" wide), so that its
 # light would be counted twice. Gaia's and Hipparcos-1's magnitudes show it.
@@ -45,7 +51,11 @@ DOUBLE_COUNTED = {
 }
 
 # Johnson V where Hp does not give it: too bright, or a neighbor's light. Bright Star Catalogue, 5th ed.
-JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
+JOHNSON_V = {
+    32349: -1.46,
+    91262: 0.03,
+    71681: 1.33,
+}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
 
 META: dict[str, Any] = {
     "title": "Star catalog of skysim",

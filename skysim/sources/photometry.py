@@ -88,7 +88,9 @@ class Band:
 
     def response_at(self, wavelength_m: Floats | float) -> Floats:
         """The response at any wavelengths, linearly interpolated."""
-        return np.asarray(np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0))
+        return np.asarray(
+            np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0)
+        )
 
     def grid_m(self) -> Floats:
         """Wavelengths in steps of a nanometer, and the curve's own samples, because it has kinks there."""
@@ -123,9 +125,16 @@ def _through(band: Band, chromatic: ChromaticConfig) -> Band:
 @lru_cache(maxsize=64)
 def _product(first: Band, second: Band) -> Band:
     """The product of two curves where both reach, sampled every nanometer and at the samples of both."""
-    low_m, high_m = (choose(first.wavelength_m[end], second.wavelength_m[end]) for choose, end in ((max, 0), (min, -1)))
+    low_m, high_m = (
+        choose(first.wavelength_m[end], second.wavelength_m[end])
+        for choose, end in ((max, 0), (min, -1))
+    )
     if not low_m < high_m:
-        raise InputError("camera.transmission", "lets nothing through where the chip has a response", "an overlap")
+        raise InputError(
+            "camera.transmission",
+            "lets nothing through where the chip has a response",
+            "an overlap",
+        )
     grid = np.union1d(first.grid_m(), second.grid_m())
     grid = grid[(grid >= low_m) & (grid <= high_m)]
     return Band(grid, first.response_at(grid) * second.response_at(grid))
@@ -138,12 +147,18 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
     _changed_ns is the file's modification time: a changed file has another key in the cache.
     """
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        lines = [
+            line
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if not line.startswith("#")
+        ]
         if len(lines) < 3:
             raise ValueError("fewer than two rows")
         wavelength_nm, response = np.loadtxt(lines[1:], delimiter=",", ndmin=2).T
     except (OSError, ValueError) as error:
-        raise InputError(path, f"not a response curve ({error})", "two columns, wavelength_nm and response") from None
+        raise InputError(
+            path, f"not a response curve ({error})", "two columns, wavelength_nm and response"
+        ) from None
     rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
     within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
     if not (rising and within and np.any(response)):
@@ -229,10 +244,14 @@ def _black_bodies(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
     range_k = stellar_sequence().temperature_k[[0, -1]]
     inverse_k = np.linspace(1 / range_k[0], 1 / range_k[1], 256)
-    return inverse_k, np.log10(band.integral(lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)))
+    return inverse_k, np.log10(
+        band.integral(lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k))
+    )
 
 
-def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:
+def star_flux_e_s_m2(
+    v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band
+) -> Floats:
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
     v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
@@ -252,7 +271,9 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
 def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures and (256, 4) `chromatic_moments`."""
     inverse_k, _ = _black_bodies(band)
-    return inverse_k, chromatic_moments(band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k))
+    return inverse_k, chromatic_moments(
+        band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)
+    )
 
 
 def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
@@ -269,7 +290,11 @@ def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -
     if not isinstance(spectrum, str) and fwhm_m is None:
         focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
         return np.array([focus_m, 0.0, corner_px, 0.0])
-    power = measured(spectrum).response_at if isinstance(spectrum, str) else colored(spectrum, fwhm_m or 0.0)
+    power = (
+        measured(spectrum).response_at
+        if isinstance(spectrum, str)
+        else colored(spectrum, fwhm_m or 0.0)
+    )
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
@@ -283,7 +308,10 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
 
     def mean_of(power: int, column: int, origin: Floats) -> Floats:
         def weighted(wavelength_m: Floats) -> Floats:
-            return photons(wavelength_m) * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
+            return (
+                photons(wavelength_m)
+                * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
+            )
 
         return np.asarray(band.integral(weighted) / total)
 
@@ -301,7 +329,9 @@ def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
     return np.array([np.interp(wavelength_m, config.wavelength_m, column) for column in columns])
 
 
-def synthetic_mag(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:
+def synthetic_mag(
+    v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band
+) -> Floats:
     """Instrumental magnitude of a star in this band, equal to V for a G2 star.
 
     m = -2.5 log10(e- of the star / e- of a G2 star of V = 0). Shapes as in `star_flux_e_s_m2`.
@@ -339,13 +369,17 @@ def radiant_strength_e_s_sr(
     """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
     if isinstance(spectrum, str):
         power = measured(spectrum)
-        electrons = band.integral(lambda wavelength_m: power.response_at(wavelength_m) * wavelength_m / HC_J_M)
+        electrons = band.integral(
+            lambda wavelength_m: power.response_at(wavelength_m) * wavelength_m / HC_J_M
+        )
         electrons_per_joule = electrons / power.integral(np.ones_like)
     elif fwhm_m is None:
         electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
     else:
         gaussian = colored(spectrum, fwhm_m)
-        electrons_per_joule = band.integral(lambda wavelength_m: gaussian(wavelength_m) * wavelength_m / HC_J_M)
+        electrons_per_joule = band.integral(
+            lambda wavelength_m: gaussian(wavelength_m) * wavelength_m / HC_J_M
+        )
     return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
 
 
@@ -374,7 +408,11 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
         power = measured(spectrum)
         seen = float(photopic.integral(power.response_at))
         if not seen:
-            raise InputError("light.led.spectrum", f"{spectrum} is invisible and has no candelas", "radiant_intensity")
+            raise InputError(
+                "light.led.spectrum",
+                f"{spectrum} is invisible and has no candelas",
+                "radiant_intensity",
+            )
         return LUMINOUS_EFFICACY_LM_W * seen / float(power.integral(np.ones_like))
     if not photopic.response_at(spectrum):
         allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))

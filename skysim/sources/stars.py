@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.constants import ARCSEC_RAD, JULIAN_YEAR_DAY, SPEED_OF_LIGHT_AU_DAY, SPEED_OF_LIGHT_M_S
+from skysim.core.constants import (
+    ARCSEC_RAD,
+    JULIAN_YEAR_DAY,
+    SPEED_OF_LIGHT_AU_DAY,
+    SPEED_OF_LIGHT_M_S,
+)
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
 from skysim.core.types import Floats, Sources, StarSources
@@ -22,7 +27,9 @@ AT_REST = (0.0, 0.0, 0.0)
 
 
 def apparent(
-    catalog: Catalog, time: datetime.datetime, observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST
+    catalog: Catalog,
+    time: datetime.datetime,
+    observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST,
 ) -> Floats:
     """Apparent directions of stars: proper motion, annual parallax, light deflection and aberration.
 
@@ -43,7 +50,8 @@ def apparent(
     geometric = erfa.pmpx(
         catalog.ra_rad,
         catalog.dec_rad,
-        catalog.pm_ra_rad_yr / np.cos(catalog.dec_rad),  # SOFA takes the rate of right ascension itself
+        catalog.pm_ra_rad_yr
+        / np.cos(catalog.dec_rad),  # SOFA takes the rate of right ascension itself
         catalog.pm_dec_rad_yr,
         catalog.parallax_rad / ARCSEC_RAD,
         0.0,
@@ -55,7 +63,9 @@ def apparent(
     own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True))
+    return np.asarray(
+        apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True)
+    )
 
 
 def varied(stars: Catalog, seed: int) -> Catalog:
@@ -76,7 +86,10 @@ def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Float
     The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
     """
     direction = apparent_direction
-    for beta in (-np.asarray(from_m_s) / SPEED_OF_LIGHT_M_S, np.asarray(to_m_s) / SPEED_OF_LIGHT_M_S):
+    for beta in (
+        -np.asarray(from_m_s) / SPEED_OF_LIGHT_M_S,
+        np.asarray(to_m_s) / SPEED_OF_LIGHT_M_S,
+    ):
         direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
     return np.asarray(direction)
 
@@ -107,14 +120,19 @@ def sources(
 
 
 def steady_points(
-    ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats, chromatic: Floats | None = None
+    ids: NDArray[np.int64],
+    direction: Floats,
+    flux_e_s_m2: Floats,
+    magnitude: Floats,
+    chromatic: Floats | None = None,
 ) -> StarSources:
     """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes.
 
     chromatic : (N, 4) as in `Sources`
     """
     count = len(ids)
-    zeros, ones = np.zeros(count), np.ones(count)
+    zeros = np.zeros(count)
+    ones = np.ones(count)
     return StarSources(
         id=ids,
         place=np.ascontiguousarray(np.column_stack([direction, zeros])),  # rows are taken from it
@@ -130,7 +148,9 @@ def steady_points(
     )
 
 
-def cam_from_icrs(ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats) -> Rotation:
+def cam_from_icrs(
+    ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats
+) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
     ra_deg, dec_deg : ICRS direction of the boresight, a number or (N,) each

@@ -45,8 +45,15 @@ MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
 
 # Keys in the header of a dome map, and how many numbers each holds.
 MAP_META = {
-    **{"size_px": 2, "focal_px": 1, "focal_sigma_px": 1, "center_px": 2, "center_sigma_px": 2},
-    **{"distortion": 5, "distortion_sigma": 5, "camera_body_m": 3, "lever_sigma_m": 1},
+    "size_px": 2,
+    "focal_px": 1,
+    "focal_sigma_px": 1,
+    "center_px": 2,
+    "center_sigma_px": 2,
+    "distortion": 5,
+    "distortion_sigma": 5,
+    "camera_body_m": 3,
+    "lever_sigma_m": 1,
 }
 
 
@@ -76,7 +83,9 @@ def read_dome_map(path: Path) -> DomeMap:
         fault = f"no column {missing[0]}" if missing else "no LED"
         raise InputError(path, fault, "a map written by a survey")
     try:
-        numbers = np.column_stack([np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS])
+        numbers = np.column_stack(
+            [np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS]
+        )
     except (TypeError, ValueError):
         raise InputError(path, "", f"numbers in the columns {', '.join(MAP_COLUMNS)}") from None
     invalid = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
@@ -86,7 +95,14 @@ def read_dome_map(path: Path) -> DomeMap:
     if count.max() > 1:
         raise InputError(path, f"LED {id_[count > 1][0]} occurs {count.max()} times", "once")
     meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
-    fields: dict[str, Any] = {key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()}
+    fields: dict[str, Any] = {
+        key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()
+    }
     fields["size_px"] = tuple(round(side) for side in meta["size_px"])
     fields["camera_body_m"] = np.array(meta["camera_body_m"])
-    return DomeMap(id=numbers[:, 0].astype(np.int64), position_m=numbers[:, 1:4], sigma_m=numbers[:, 4], **fields)
+    return DomeMap(
+        id=numbers[:, 0].astype(np.int64),
+        position_m=numbers[:, 1:4],
+        sigma_m=numbers[:, 4],
+        **fields,
+    )

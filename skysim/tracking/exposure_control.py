@@ -21,14 +21,17 @@ class ExposureController:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.control, self.settings = control_settings(scene), assumed_settings(scene)
+        self.control = control_settings(scene)
+        self.settings = assumed_settings(scene)
         self.exposure_s = scene.exposure.time_s
 
     def update(self, frame: Frame) -> None:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             state = Exposure(frame.exposure_s)
-            self.exposure_s = step(state, observe_frame(self.settings, self.control, frame), self.control).time_s
+            self.exposure_s = step(
+                state, observe_frame(self.settings, self.control, frame), self.control
+            ).time_s
 
 
 def control_settings(scene: Scene) -> Control | None:

@@ -44,21 +44,27 @@ Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
 NO_PROGRAMS: Mapping[str, str] = {}
 
 
-def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS) -> Estimator:
+def build_tracker(
+    scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
+) -> Estimator:
     """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
     else the true ones.
 
     programs : commands of external trackers by name, for `tracker.name`
     Raises InputError for a dome or a catalog that the tracker cannot use.
     """
-    camera, settings = assumed_camera(scene), assumed_settings(scene)
+    camera = assumed_camera(scene)
+    settings = assumed_settings(scene)
     if isinstance(scene.light, DomeConfig):
-        leds, lever = assumed_dome(scene, scene.light, sources), assumed_lever(scene, mount)
+        leds = assumed_dome(scene, scene.light, sources)
+        lever = assumed_lever(scene, mount)
         if scene.tracker.map:
             camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
         leds = with_brightness(scene, scene.light, leds, lever)
         if scene.tracker.name != OWN:
-            return ExternalTracker.start(scene, camera, settings, adapter.led_map(leds, lever), programs)
+            return ExternalTracker.start(
+                scene, camera, settings, adapter.led_map(leds, lever), programs
+            )
         try:
             if scene.tracker.decoder is None:
                 return DomeTracker(camera, leds, lever, settings)
@@ -67,14 +73,18 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
             return CodedTracker(camera, leds, lever, settings, code, decoder)
         except ImageError as error:
             raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
-    stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
+    stars = catalog.brighter_than(
+        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
+    )
     orbit = assumed_orbit(scene)
     directions = catalog.apparent(stars, assumed_observer(scene, orbit))
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
-        return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
+        return ExternalTracker.start(
+            scene, camera, settings, adapter.star_map(stars, directions), programs
+        )
     if orbit:
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
     return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
@@ -97,7 +107,9 @@ def solve_frame(
         if isinstance(estimator, StarTracker):
             return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
         if isinstance(estimator, CodedTracker):
-            return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index)
+            return estimator.solve(
+                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index
+            )
         return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

@@ -21,7 +21,8 @@ def rate_of_frame(
 
     window, rows : exposure of a sensor of so many rows, to the end of its last row
     """
-    begin_s, end_s = window.open_s, window.close_s(rows)
+    begin_s = window.open_s
+    end_s = window.close_s(rows)
     during = (samples.t_s > begin_s) & (samples.t_s - samples.step_s < end_s)
     if not during.any() or samples.saturated[during].any():
         return None

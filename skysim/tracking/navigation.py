@@ -47,7 +47,8 @@ class Navigation:
         config = scene.vehicle.imu
         assert config is not None
         self.imu = imu.Imu.from_config(config, rng)
-        self.position_body_m, self.gravity_m_s2 = position_body_m, gravity_m_s2
+        self.position_body_m = position_body_m
+        self.gravity_m_s2 = gravity_m_s2
         self.body_from_cam = [mount.cam_from_body.inv() for mount in mounts]
         self.step_s = 1 / config.rate_hz
         self.samples = 0
@@ -55,14 +56,19 @@ class Navigation:
         self.earth_sensed_rad_s = earth * (config.earth_rate != "none")
         self.earth_compensated_rad_s = earth * (config.earth_rate == "compensated")
         assumed = zeroed_attitude(lab_from_body, config.home_error_deg)
-        self.navigator = imu.Navigator(assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s)
+        self.navigator = imu.Navigator(
+            assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s
+        )
         self.filter = build_filter(scene.filter, assumed, len(mounts)) if scene.filter else None
         self.time_tag_sigma_s = scene.filter.time_tag_sigma_s if scene.filter else 0.0
-        self.kept_s, self.measured = kept_s, list[imu.Increments]()
+        self.kept_s = kept_s
+        self.measured = list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
 
-    def sample_imu(self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> None:
+    def sample_imu(
+        self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats
+    ) -> None:
         """Take the IMU samples due up to now_s; update navigator and filter with them.
 
         t_s (K,), lab_from_body_wxyz (K, 4), rate_body_rad_s (K, 3) : knots of the motion since the last call
@@ -93,18 +99,25 @@ class Navigation:
         if self.filter:
             # The filter's reference is the lab, so the Earth rate is removed at its own attitude estimate.
             compensation = self.earth_body_rad_s(self.attitude_wxyz("filter"))
-            self.filter.propagate(ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated)
+            self.filter.propagate(
+                ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated
+            )
 
     def imu_samples(self, since_s: float = -math.inf) -> imu.Increments:
         """The kept IMU samples from about this time on: whole control periods."""
         if not self.measured:
             none = np.zeros((0, 3))
-            return imu.Increments(np.zeros(0), self.step_s, none, none, np.zeros(0, bool), np.zeros(0, bool))
+            return imu.Increments(
+                np.zeros(0), self.step_s, none, none, np.zeros(0, bool), np.zeros(0, bool)
+            )
         first = len(self.measured) - 1
         while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
             first -= 1
         columns = zip(
-            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured[first:]),
+            *(
+                (m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded)
+                for m in self.measured[first:]
+            ),
             strict=True,
         )
         t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)
@@ -118,11 +131,18 @@ class Navigation:
         """
         uncompensated = self.earth_sensed_rad_s - self.earth_compensated_rad_s
         earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), uncompensated)
-        return self.imu.gyro_bias_rad_s + self.imu.gyro.matrix @ rate_body_rad_s - rate_body_rad_s + earth
+        return (
+            self.imu.gyro_bias_rad_s
+            + self.imu.gyro.matrix @ rate_body_rad_s
+            - rate_body_rad_s
+            + earth
+        )
 
     def earth_body_rad_s(self, lab_from_body_wxyz: Floats) -> Floats:
         """(3,) Earth rate to subtract, in body axes; zeros if it is not compensated."""
-        return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_compensated_rad_s)
+        return quaternion.apply(
+            quaternion.inverse(lab_from_body_wxyz), self.earth_compensated_rad_s
+        )
 
     def update_filter(self, t_s: float, solution: Attitude, camera: int = 0) -> str:
         """Update the filter with a camera's attitude at mid-exposure t_s; return the status of the update.
@@ -151,7 +171,9 @@ class Navigation:
 
     def body_rate_rad_s(self, feedback: str) -> Floats:
         """(3,) body rate in the lab from the same source: the mean over the last control period for the IMU."""
-        return self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
+        return (
+            self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
+        )
 
 
 def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:

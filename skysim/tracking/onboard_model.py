@@ -37,7 +37,8 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     matching radius of the identification, which must not exceed that of the final match (`DomeTracker.solve_match`): an
     LED that only the first one admits makes the tracker refuse the frame.
     """
-    inside, survey = surface.build_surface(light.surface), scene.tracker.survey
+    inside = surface.build_surface(light.surface)
+    survey = scene.tracker.survey
     position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
     board = registry.board_of(light.layout, sources.id)
     ellipsoid = survey_errors.assumed_ellipsoid(inside, survey)
@@ -56,28 +57,41 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     """
     if scene.tracker.brightness_sigma is None:
         return leds
-    nominal = led_list.design_leds(light, surface.build_surface(light.surface), Band.from_camera(scene.camera))
+    nominal = led_list.design_leds(
+        light, surface.build_surface(light.surface), Band.from_camera(scene.camera)
+    )
     order = np.argsort(nominal.id)
     nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
     distance_m = np.linalg.norm(leds.position_m, axis=1) - np.linalg.norm(lever.camera_body_m)
     strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
-    light_e_s_m2 = irradiance_e_s_m2(strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m)
-    flux_s = light_e_s_m2 * Optics.from_camera(scene.camera).collecting_m2 / scene.camera.detector.gain_e_dn
+    light_e_s_m2 = irradiance_e_s_m2(
+        strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m
+    )
+    flux_s = (
+        light_e_s_m2
+        * Optics.from_camera(scene.camera).collecting_m2
+        / scene.camera.detector.gain_e_dn
+    )
     return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
 
 
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
     """The words of the LEDs of the tracker's map, as the dome has them."""
     assert light.led.code is not None
-    code, row = light.led.code, np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
+    code = light.led.code
+    row = np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
     levels = light_levels(code, codebook(code, len(sources))[np.argsort(sources.id)[row]])
     return LedCode(levels, None if code.bit_time_s == "frame" else code.bit_time_s)
 
 
 def assumed_air(scene: Scene) -> SiteAir | None:
     """The air that the tracker undoes with `tracker.refraction`: the site, the date and the weather as they are."""
-    light, site = scene.light, scene.site
-    if not (scene.tracker.refraction and isinstance(light, StarsConfig) and light.air) or site.longitude_deg is None:
+    light = scene.light
+    site = scene.site
+    if (
+        not (scene.tracker.refraction and isinstance(light, StarsConfig) and light.air)
+        or site.longitude_deg is None
+    ):
         return None
     band = Band.from_camera(scene.camera)
     weather = weather_of(light.air, site, band)
@@ -97,7 +111,9 @@ def assumed_lever(scene: Scene, mount: Mount) -> Lever:
     return Lever(np.array(lever_m), mount.cam_from_body, float(survey.lever_sigma_m))
 
 
-def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[Camera, LedMap, Lever]:
+def surveyed_dome(
+    scene: Scene, path: str, leds: LedMap, lever: Lever
+) -> tuple[Camera, LedMap, Lever]:
     """Camera, LEDs and lever arm from a survey's file; surface and boards stay those of the given LedMap.
 
     One sigma serves for all LEDs, the median of the file's. Raises InputError for a file of another dome or camera.
@@ -105,12 +121,20 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
     dome_map = dome_map_file.read_dome_map(Path(path))
     size_px = (scene.camera.width_px, scene.camera.height_px)
     if dome_map.size_px != size_px:
-        raise InputError("tracker.map", f"{path}: surveyed with a camera of {dome_map.size_px} px", f"{size_px} px")
+        raise InputError(
+            "tracker.map",
+            f"{path}: surveyed with a camera of {dome_map.size_px} px",
+            f"{size_px} px",
+        )
     order = np.argsort(leds.id)
     row = order[np.minimum(np.searchsorted(leds.id, dome_map.id, sorter=order), len(order) - 1)]
     unknown = dome_map.id[leds.id[row] != dome_map.id]
     if len(unknown):
-        raise InputError("tracker.map", f"{path}: unknown LED {unknown[0]}", f"the {len(order)} LEDs of this dome")
+        raise InputError(
+            "tracker.map",
+            f"{path}: unknown LED {unknown[0]}",
+            f"the {len(order)} LEDs of this dome",
+        )
     board = None if leds.board is None else leds.board[row]
     surveyed = replace(
         leds,
@@ -127,26 +151,40 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
         center_px=dome_map.center_px,
         distortion=dome_map.distortion,
     )
-    return camera, surveyed, Lever(dome_map.camera_body_m, lever.cam_from_body, dome_map.lever_sigma_m)
+    return (
+        camera,
+        surveyed,
+        Lever(dome_map.camera_body_m, lever.cam_from_body, dome_map.lever_sigma_m),
+    )
 
 
 def assumed_camera(scene: Scene) -> Camera:
     """The camera calibration that the tracker uses."""
-    config, camera = scene.tracker, calibration(scene.camera)
+    config = scene.tracker
+    camera = calibration(scene.camera)
     if config.assumed_distortion is not None:
         camera = replace(camera, distortion=config.assumed_distortion)
     if config.assumed_row_time_s is not None:
         camera = replace(camera, row_time_s=config.assumed_row_time_s)
     focal_m = scene.camera.focal_length_m
-    assumed_m = config.assumed_focal_length_m or survey_errors.assumed_focal_length_m(focal_m, config.survey)
-    return replace(camera.zoomed(assumed_m / focal_m), focal_sigma=float(config.survey.focal_length_sigma_m) / focal_m)
+    assumed_m = config.assumed_focal_length_m or survey_errors.assumed_focal_length_m(
+        focal_m, config.survey
+    )
+    return replace(
+        camera.zoomed(assumed_m / focal_m),
+        focal_sigma=float(config.survey.focal_length_sigma_m) / focal_m,
+    )
 
 
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
-    row_time_s = camera.shutter.row_time_s if isinstance(camera.shutter, RollingShutterConfig) else 0.0
+    row_time_s = (
+        camera.shutter.row_time_s if isinstance(camera.shutter, RollingShutterConfig) else 0.0
+    )
     size_px = camera.width_px, camera.height_px
-    return Camera(*size_px, camera.focal_px, camera.center_px, camera.distortion, row_time_s=row_time_s)
+    return Camera(
+        *size_px, camera.focal_px, camera.center_px, camera.distortion, row_time_s=row_time_s
+    )
 
 
 def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:

@@ -29,7 +29,12 @@ class OrbitStarTracker(StarTracker):
     """
 
     def __init__(
-        self, camera: Camera, stars: catalog.StarCatalog, vectors: Floats, settings: Settings, orbit: CameraOrbit
+        self,
+        camera: Camera,
+        stars: catalog.StarCatalog,
+        vectors: Floats,
+        settings: Settings,
+        orbit: CameraOrbit,
     ) -> None:
         super().__init__(camera, stars, vectors, settings)
         self.orbit = orbit
@@ -52,7 +57,9 @@ class OrbitStarTracker(StarTracker):
         if attitude.cam_from_ref is None:
             return attitude
         boresight = attitude.cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        changed = (state_at(self.orbit, t_s).velocity_m_s - self.start_m_s) / catalog.SPEED_OF_LIGHT_M_S
+        changed = (
+            state_at(self.orbit, t_s).velocity_m_s - self.start_m_s
+        ) / catalog.SPEED_OF_LIGHT_M_S
         now_from_start = Rotation.from_rotvec(np.cross(boresight, changed))
         return replace(attitude, cam_from_ref=attitude.cam_from_ref * now_from_start.inv())
 

@@ -36,10 +36,13 @@ def assumed_settings(scene: Scene) -> Settings:
 
     Defaults depend on the light: a dome uses the local detector, centers of gravity and LED pairs.
     """
-    config, default = scene.tracker, Settings()
+    config = scene.tracker
+    default = Settings()
     usual = DOME_ALGORITHMS if isinstance(scene.light, DomeConfig) else {}
     chosen: dict[str, Any] = {
-        stage: require_algorithm(stage, getattr(config, stage) or usual.get(stage, "default"), table)
+        stage: require_algorithm(
+            stage, getattr(config, stage) or usual.get(stage, "default"), table
+        )
         for stage, table in algorithm_tables(scene).items()
     }
     return Settings(

@@ -36,7 +36,9 @@ def blurred(drawn: tuple[NDArray, Rotation]) -> NDArray:
 
 
 @pytest.mark.slow
-def test_a_picture_out_of_focus_is_solved_binned_and_says_so(drawn: tuple[NDArray, Rotation]) -> None:
+def test_a_picture_out_of_focus_is_solved_binned_and_says_so(
+    drawn: tuple[NDArray, Rotation],
+) -> None:
     blurred, truth = drawn
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
     alone, _ = plate_solver.solve_array(blurred, solver, None)
@@ -51,7 +53,8 @@ def test_a_picture_out_of_focus_is_solved_binned_and_says_so(drawn: tuple[NDArra
 
 def test_places_are_those_of_the_picture() -> None:
     """Centers of disks to a small part of a disk, for both parities of the squares' corner."""
-    rng, image = np.random.default_rng(2), np.zeros((1700, 2100), np.uint8)
+    rng = np.random.default_rng(2)
+    image = np.zeros((1700, 2100), np.uint8)
     places = np.array([(x, y) for x in (200, 700, 1200, 1703) for y in (201, 702, 1203)])
     for x, y in places:
         cv2.circle(image, (int(x), int(y)), 20, 60, -1)
@@ -66,7 +69,8 @@ def test_places_are_those_of_the_picture() -> None:
 
 
 def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
-    rng, light = np.random.default_rng(4), np.zeros((1000, 1300))
+    rng = np.random.default_rng(4)
+    light = np.zeros((1000, 1300))
     light[rng.integers(0, 1000, 60), rng.integers(0, 1300, 60)] = rng.uniform(1000, 30_000, 60)
     sharp = 300 + 20 * rng.standard_normal(light.shape) + cv2.GaussianBlur(light, (0, 0), 1.2)
     assert list(binned.large_lights(sharp.astype(np.uint16), Settings())) == []
@@ -75,7 +79,9 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
     assert list(binned.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
 
 
-def test_a_binned_picture_needs_more_evidence(monkeypatch: pytest.MonkeyPatch, blurred: NDArray) -> None:
+def test_a_binned_picture_needs_more_evidence(
+    monkeypatch: pytest.MonkeyPatch, blurred: NDArray
+) -> None:
     """No chance of a false match is added: a thousand times less than by the picture itself."""
     tries = []
 
@@ -84,7 +90,9 @@ def test_a_binned_picture_needs_more_evidence(monkeypatch: pytest.MonkeyPatch, b
         return Report(Attitude("no"), Centroids.empty()), None
 
     monkeypatch.setattr(plate_picture, "solve_array", never)
-    plate_solver.solve_picture(images.Picture(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None)
+    plate_solver.solve_picture(
+        images.Picture(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
+    )
     assert tries[0] == 1
     assert set(tries[1:]) == {1000}
     tries.clear()

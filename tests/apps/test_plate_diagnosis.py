@@ -46,8 +46,12 @@ def spread(kernel: NDArray) -> Change:
     """Enlarge a picture twice and spread every star by a kernel, with noise as before."""
 
     def change(image: NDArray) -> NDArray:
-        large = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR).astype(np.float32)
-        light = cv2.filter2D(20 * (large - np.median(large)), -1, (kernel / kernel.sum()).astype(np.float32))
+        large = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR).astype(
+            np.float32
+        )
+        light = cv2.filter2D(
+            20 * (large - np.median(large)), -1, (kernel / kernel.sum()).astype(np.float32)
+        )
         noise = np.random.default_rng(0).normal(300, 3, large.shape)
         return np.clip(light + noise, 0, 65535).astype(np.uint16)
 
@@ -62,7 +66,9 @@ def disk(radius_px: int) -> NDArray:
 
 def trail(length_px: int) -> NDArray:
     """The trail of a star, at a slope of one half."""
-    return cv2.line(np.zeros((length_px, length_px), np.float32), (0, 0), (length_px - 1, length_px // 2), 1)
+    return cv2.line(
+        np.zeros((length_px, length_px), np.float32), (0, 0), (length_px - 1, length_px // 2), 1
+    )
 
 
 def mirror(image: NDArray) -> NDArray:
@@ -85,7 +91,9 @@ def dots(image: NDArray) -> NDArray:
     """Stars that fell anywhere: no sky."""
     rng = np.random.default_rng(3)
     picture = rng.normal(100, 5, (480, 640))
-    for x, y, light in zip(rng.integers(10, 630, 40), rng.integers(10, 470, 40), rng.uniform(10, 200, 40), strict=True):
+    for x, y, light in zip(
+        rng.integers(10, 630, 40), rng.integers(10, 470, 40), rng.uniform(10, 200, 40), strict=True
+    ):
         picture[y - 1 : y + 2, x - 1 : x + 2] += light * np.outer([1, 2, 1], [1, 2, 1])
     return picture.astype(np.uint16)
 
@@ -96,7 +104,9 @@ make_solver = cache(plate_solver.make_solver)  # it keeps its trackers
 def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None) -> str:
     """What the refusal of a picture says; "" for a solution."""
     picture = images.Picture(image)
-    outcome = plate_solver.solve_picture(picture, make_solver(fov_deg, None, catalog=catalog_name), None)
+    outcome = plate_solver.solve_picture(
+        picture, make_solver(fov_deg, None, catalog=catalog_name), None
+    )
     return str(plate_solver.outcome_fields(outcome, None)["hint"])
 
 
@@ -113,13 +123,21 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
             *(np.array, 11.1, r"another field of view: it solves with a field of 14\.8°$"),
             marks=pytest.mark.slow,
         ),
-        pytest.param(spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$", marks=pytest.mark.slow),
+        pytest.param(
+            spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$", marks=pytest.mark.slow
+        ),
         # sqrt(400^2 + 200^2) = 447, and the width of a star
-        pytest.param(spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: ", marks=pytest.mark.slow),
+        pytest.param(
+            spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: ", marks=pytest.mark.slow
+        ),
         (bleach, FOV_DEG, r"^overexposed: 80% of the pixels are at 255; "),
         (noise, 20.0, r"^too few lights \(0\): "),
         pytest.param(
-            *(dots, 20.0, r"^no cause found: no field of 2° to 100° fits, nor the mirrored picture; [^-]*$"),
+            *(
+                dots,
+                20.0,
+                r"^no cause found: no field of 2° to 100° fits, nor the mirrored picture; [^-]*$",
+            ),
             marks=pytest.mark.slow,
         ),
     ],
@@ -132,12 +150,21 @@ def test_each_cause_is_named(change: Change, fov_deg: float, says: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("length_px", [60, 90])  # at 100, one noise in ten leaves too few; at 150, two in three
+@pytest.mark.parametrize(
+    "length_px", [60, 90]
+)  # at 100, one noise in ten leaves too few; at 150, two in three
 def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
-    centered = trail(length_px)[: length_px // 2 + 1]  # the whole kernel would move the stars by a quarter of its side
-    report, _ = plate_solver.solve_array(spread(centered)(photograph()), make_solver(FOV_DEG, None), None)
+    centered = trail(length_px)[
+        : length_px // 2 + 1
+    ]  # the whole kernel would move the stars by a quarter of its side
+    report, _ = plate_solver.solve_array(
+        spread(centered)(photograph()), make_solver(FOV_DEG, None), None
+    )
     pointing = plate_solver.solution_fields(report)
-    ours, truth = (stars.cam_from_icrs(*angles) for angles in ([pointing[k] for k in ANGLES], (83.0, 2.0, 20.0)))
+    ours, truth = (
+        stars.cam_from_icrs(*angles)
+        for angles in ([pointing[k] for k in ANGLES], (83.0, 2.0, 20.0))
+    )
     assert math.degrees((ours * truth.inv()).magnitude()) < 0.05
 
 
@@ -168,7 +195,9 @@ def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
 @pytest.mark.parametrize(
     ("focal", "expected"), [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)]
 )
-def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(focal: str, expected: str) -> None:
+def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(
+    focal: str, expected: str
+) -> None:
     """Near the galactic pole. The expectation by hand: 7996 stars on 41,253 deg^2, times the field's."""
     fov_deg = math.degrees(2 * math.atan(658 * 9.9e-3 / 2 / float(focal.removesuffix(" mm"))))
     by_hand = 7996 / 41_253 * fov_deg**2 * 493 / 659
@@ -181,7 +210,10 @@ def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(focal: s
     deep = plate_solver.make_solver(fov_deg, None, catalog=str(CATALOGS / "gaia_v8.0.ecsv"))
     report, _ = plate_solver.solve_array(image, deep, None)
     pointing = plate_solver.solution_fields(report)
-    ours, truth = (stars.cam_from_icrs(*angles) for angles in ([pointing[k] for k in ANGLES], (195.0, 25.0, 20.0)))
+    ours, truth = (
+        stars.cam_from_icrs(*angles)
+        for angles in ([pointing[k] for k in ANGLES], (195.0, 25.0, 20.0))
+    )
     assert math.degrees((ours * truth.inv()).magnitude()) < 0.05
 
 
@@ -193,7 +225,11 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
     [
         (5.0, 6.7, "the catalog gaia_v8.0"),
         (3.5, 6.7, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
-        (5.0, 8.0, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),  # that one was taken
+        (
+            5.0,
+            8.0,
+            "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`",
+        ),  # that one was taken
         (3.5, 8.0, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
         (1.9, 6.7, "the catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`"),
         (1.0, 6.7, "a wider picture: the deepest catalog, to V 10, has too few as well"),
@@ -216,14 +252,22 @@ def test_the_numbers_of_stars_are_the_catalog_s() -> None:
     shipped = catalog.read(CATALOGS / "gaia_v8.0.ecsv").v_mag
     assert np.count_nonzero(shipped < 8) == diagnosis.GAIA_STARS
     for limit, count in ((9, 130_337), (10, 357_037)):
-        assert diagnosis.GAIA_STARS * 10 ** (diagnosis.GAIA_DEX_PER_MAG * (limit - 8)) == pytest.approx(count, rel=0.03)
+        assert diagnosis.GAIA_STARS * 10 ** (
+            diagnosis.GAIA_DEX_PER_MAG * (limit - 8)
+        ) == pytest.approx(count, rel=0.03)
 
 
-@pytest.mark.parametrize(("size_px", "fov_deg"), [((640, 480), 10.0), ((300, 900), 60.0), ((500, 500), 90.0)])
-def test_a_field_s_share_of_the_sphere_is_that_of_random_directions(size_px: tuple[int, int], fov_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("size_px", "fov_deg"), [((640, 480), 10.0), ((300, 900), 60.0), ((500, 500), 90.0)]
+)
+def test_a_field_s_share_of_the_sphere_is_that_of_random_directions(
+    size_px: tuple[int, int], fov_deg: float
+) -> None:
     camera = Camera.from_fov(*size_px, math.radians(fov_deg))
     vectors = np.random.default_rng(0).normal(size=(400_000, 3))
-    inside = camera.contains(camera.pixels(vectors / np.linalg.norm(vectors, axis=1, keepdims=True)))
+    inside = camera.contains(
+        camera.pixels(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    )
     share = diagnosis.sphere_share(size_px, fov_deg)
     assert abs(inside.mean() - share) < 4 * math.sqrt(share / len(vectors))
 
@@ -234,28 +278,44 @@ def test_a_field_s_share_of_the_sphere_is_that_of_random_directions(size_px: tup
 def test_reversed_centroids_are_those_of_the_reversed_image() -> None:
     """Streaks have covariances of their own, whose x and y are correlated."""
     image = spread(trail(20))(photograph())
-    camera, settings = Camera.from_fov(*image.shape[::-1], math.radians(FOV_DEG)), Settings()
-    seen, reversed_ = (detect_and_centroid(one, camera, settings, Clock()) for one in (image, mirror(image)))
+    camera = Camera.from_fov(*image.shape[::-1], math.radians(FOV_DEG))
+    settings = Settings()
+    seen, reversed_ = (
+        detect_and_centroid(one, camera, settings, Clock()) for one in (image, mirror(image))
+    )
     ours = diagnosis.reversed_columns(seen, image.shape[1])
     nearest = np.linalg.norm(ours.xy_px[:20, None] - reversed_.xy_px, axis=2).argmin(axis=1)
     np.testing.assert_allclose(ours.xy_px[:20], reversed_.xy_px[nearest], atol=0.05)
     assert ours.covariance_px2 is not None
     assert reversed_.covariance_px2 is not None
-    np.testing.assert_allclose(ours.covariance_px2[:20], reversed_.covariance_px2[nearest], rtol=0.1, atol=1e-4)
+    np.testing.assert_allclose(
+        ours.covariance_px2[:20], reversed_.covariance_px2[nearest], rtol=0.1, atol=1e-4
+    )
     assert np.abs(seen.covariance_px2[:20, 0, 1] + ours.covariance_px2[:20, 0, 1]).max() == 0
 
 
 def test_few_lights_are_not_tried_any_further(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(diagnosis, "solve_centroids", lambda *_: pytest.fail("it was tried"))
-    nothing = diagnosis.Refusal(photograph(), Centroids.empty(), (plate_solver.make_solver(3.0, None),))
-    assert diagnosis.mirrored(nothing) == diagnosis.other_field(nothing) == diagnosis.shallow_catalog(nothing) == ""
+    nothing = diagnosis.Refusal(
+        photograph(), Centroids.empty(), (plate_solver.make_solver(3.0, None),)
+    )
+    assert (
+        diagnosis.mirrored(nothing)
+        == diagnosis.other_field(nothing)
+        == diagnosis.shallow_catalog(nothing)
+        == ""
+    )
 
 
 @pytest.mark.slow
-def test_a_refusal_is_printed_with_what_was_seen_and_tried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_refusal_is_printed_with_what_was_seen_and_tried(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     image = mirror(photograph())
     cv2.imwrite(str(tmp_path / "x.png"), image)
-    found = plate_solver.solve_file(tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None), None)
+    found = plate_solver.solve_file(
+        tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None), None
+    )
     terminal.print_solutions([found], tmp_path)
     told = capsys.readouterr().out.splitlines()
     assert told[-5:-1] == [

@@ -32,13 +32,24 @@ from skysim.scene.scene import Scene
 from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars
 
-PIXEL_UM, WIDTH_PX, HEIGHT_PX = 9.9, 659, 493  # of the SHEFEX-2 camera
+# of the SHEFEX-2 camera
+PIXEL_UM = 9.9
+WIDTH_PX = 659
+HEIGHT_PX = 493
 FOV_DEG = math.degrees(2 * math.atan((WIDTH_PX - 1) * PIXEL_UM / 2 / 25_000))
-ORIENTATION, EXIF, FOCAL_35MM = 0x0112, 0x8769, 0xA405
+ORIENTATION = 0x0112
+EXIF = 0x8769
+FOCAL_35MM = 0xA405
 # How each orientation stores the picture that is seen (Exif 2.32, Orientation).
 STORED = {
-    **{1: lambda seen: seen, 2: np.fliplr, 3: lambda seen: np.rot90(seen, 2), 4: np.flipud},
-    **{5: np.transpose, 6: np.rot90, 7: lambda seen: np.rot90(seen, 2).T, 8: lambda seen: np.rot90(seen, -1)},
+    1: lambda seen: seen,
+    2: np.fliplr,
+    3: lambda seen: np.rot90(seen, 2),
+    4: np.flipud,
+    5: np.transpose,
+    6: np.rot90,
+    7: lambda seen: np.rot90(seen, 2).T,
+    8: lambda seen: np.rot90(seen, -1),
 }
 
 
@@ -64,7 +75,9 @@ def to_8_bits(image_dn: NDArray) -> NDArray[np.uint8]:
     return np.clip((image_dn.astype(float) - 60) / 4, 0, 255).astype(np.uint8)
 
 
-def with_exif(path: Path, image: NDArray, orientation: int = 1, focal_35mm: int | None = None) -> Path:
+def with_exif(
+    path: Path, image: NDArray, orientation: int = 1, focal_35mm: int | None = None
+) -> Path:
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
     if focal_35mm is not None:
@@ -76,7 +89,9 @@ def with_exif(path: Path, image: NDArray, orientation: int = 1, focal_35mm: int 
 make_solver = functools.lru_cache(maxsize=8)(plate_solver.make_solver)  # it keeps its trackers
 
 
-def answer(path: Path, fov_deg: float | None = FOV_DEG, annotated: Path | None = None) -> dict[str, Any]:
+def answer(
+    path: Path, fov_deg: float | None = FOV_DEG, annotated: Path | None = None
+) -> dict[str, Any]:
     return plate_solver.solve_file(path, make_solver(fov_deg, None), annotated)
 
 
@@ -105,11 +120,20 @@ def test_the_answer_is_that_of_the_viewed_picture(
 
 @pytest.mark.parametrize(("orientation", "turned_deg"), [(3, 180), (6, -90), (8, 90)])
 def test_without_its_tag_the_same_file_is_another_picture(
-    sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, orientation: int, turned_deg: float
+    sky: tuple[Scene, Frame, Truth],
+    gray: NDArray,
+    tmp_path: Path,
+    orientation: int,
+    turned_deg: float,
 ) -> None:
     """The tests above would hold for a solver that ignores the tag and the turn."""
-    tall = math.degrees(2 * math.atan(math.tan(math.radians(FOV_DEG / 2)) * (HEIGHT_PX - 1) / (WIDTH_PX - 1)))
-    found = answer(with_exif(tmp_path / "x.png", STORED[orientation](gray)), FOV_DEG if orientation == 3 else tall)
+    tall = math.degrees(
+        2 * math.atan(math.tan(math.radians(FOV_DEG / 2)) * (HEIGHT_PX - 1) / (WIDTH_PX - 1))
+    )
+    found = answer(
+        with_exif(tmp_path / "x.png", STORED[orientation](gray)),
+        FOV_DEG if orientation == 3 else tall,
+    )
     turn = Rotation.from_euler("z", turned_deg, degrees=True)
     ours = stars.cam_from_icrs(found["ra_deg"], found["dec_deg"], found["roll_deg"])
     assert math.degrees((ours * (turn * sky[2].cam_from_lab).inv()).magnitude()) < 0.05
@@ -118,7 +142,9 @@ def test_without_its_tag_the_same_file_is_another_picture(
 # Focal length
 
 
-def test_exif_tells_the_field_by_the_diagonal(sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path) -> None:
+def test_exif_tells_the_field_by_the_diagonal(
+    sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
+) -> None:
     """43.27 mm over the chip's 8.15 mm: the 25 mm lens is one of 133 mm."""
     focal_35mm = round(25 * math.hypot(36, 24) / math.hypot(WIDTH_PX, HEIGHT_PX) / PIXEL_UM * 1000)
     found = answer(with_exif(tmp_path / "x.jpg", gray, 1, focal_35mm), None)
@@ -127,7 +153,9 @@ def test_exif_tells_the_field_by_the_diagonal(sky: tuple[Scene, Frame, Truth], g
     assert focal_35mm == 133
     assert search[0] < 3 < 99 < search[1]
     assert narrow < 0.93 * FOV_DEG < 1.07 * FOV_DEG < wide
-    assert math.sqrt(narrow * wide) == pytest.approx(FOV_DEG, rel=0.01)  # the longer side would be 4 % off
+    assert math.sqrt(narrow * wide) == pytest.approx(
+        FOV_DEG, rel=0.01
+    )  # the longer side would be 4 % off
 
 
 @pytest.mark.parametrize("focal_35mm", [133, 138])
@@ -142,12 +170,17 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     assert outcome.report.attitude.solved
     assert outcome.hypothesis.solver.fov_deg is not None
     assert [one.solver.hypotheses for one in outcome.tried] == [2, 2]
-    assert plate_picture.hypotheses(seen, plate_solver.make_solver(20.0, None))[0].solver.fov_deg == 20.0
+    assert (
+        plate_picture.hypotheses(seen, plate_solver.make_solver(20.0, None))[0].solver.fov_deg
+        == 20.0
+    )
 
 
 def test_the_tracker_of_one_uncertainty_is_not_taken_for_another(gray: NDArray) -> None:
     told = plate_solver.make_solver(20.0, None)
-    by_exif = solver.replace(told, fov_uncertainty=0.1)  # of the same picture: they share their trackers' cache
+    by_exif = solver.replace(
+        told, fov_uncertainty=0.1
+    )  # of the same picture: they share their trackers' cache
     first, second, again = (next(one.trackers(640, 480, None)) for one in (told, by_exif, told))
     assert (first.focal_uncertainty, second.focal_uncertainty) == (solver.FOV_UNCERTAINTY, 0.1)
     assert first is again
@@ -161,7 +194,9 @@ def test_a_phone_s_wide_field_is_solved_by_its_focal_length(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_wrong_focal_length_is_given_up(sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path) -> None:
+def test_a_wrong_focal_length_is_given_up(
+    sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
+) -> None:
     """A crop, or a lens without contacts; 0 and absurd ones are not even tried."""
     check_right(answer(with_exif(tmp_path / "x.jpg", gray, 1, 50), None), sky[2])
     for absurd in (1, 65_000):
@@ -176,8 +211,11 @@ class FixedTracker:
     efforts = 1
 
     def __init__(self, log10_chance: float) -> None:
-        nothing, where = np.zeros(0, np.int64), Rotation.identity()
-        self.answer = Attitude("solved", where, np.eye(3), StarMatch(nothing, nothing, where, log10_chance))
+        nothing = np.zeros(0, np.int64)
+        where = Rotation.identity()
+        self.answer = Attitude(
+            "solved", where, np.eye(3), StarMatch(nothing, nothing, where, log10_chance)
+        )
 
     def solve_centroids(self, *_: object) -> Attitude:
         return self.answer
@@ -203,7 +241,8 @@ def test_every_hypothesis_takes_its_share_of_chance(
 
 
 @pytest.mark.parametrize(
-    "order", ["TOP-DOWN", *(pytest.param(order, marks=pytest.mark.slow) for order in ("BOTTOM-UP", None))]
+    "order",
+    ["TOP-DOWN", *(pytest.param(order, marks=pytest.mark.slow) for order in ("BOTTOM-UP", None))],
 )
 @pytest.mark.parametrize("highest_first", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_fits_picture_is_the_same_sky_in_either_row_order(
@@ -223,8 +262,12 @@ def test_a_fits_picture_is_the_same_sky_in_either_row_order(
 
 
 @pytest.mark.slow
-def test_a_mirrored_fits_picture_of_known_order_is_refused(sky: tuple[Scene, Frame, Truth], tmp_path: Path) -> None:
-    fits.PrimaryHDU(sky[1].image_dn[:, ::-1], fits.Header([("ROWORDER", "TOP-DOWN")])).writeto(tmp_path / "x.fits")
+def test_a_mirrored_fits_picture_of_known_order_is_refused(
+    sky: tuple[Scene, Frame, Truth], tmp_path: Path
+) -> None:
+    fits.PrimaryHDU(sky[1].image_dn[:, ::-1], fits.Header([("ROWORDER", "TOP-DOWN")])).writeto(
+        tmp_path / "x.fits"
+    )
     found = answer(tmp_path / "x.fits")
     assert found["ra_deg"] is None
     assert "perhaps mirrored: it solves when flipped left to right" in found["hint"]
@@ -255,23 +298,37 @@ def test_a_folder_is_a_list_of_its_pictures(tmp_path: Path) -> None:
     listed = plate_solver.pictures_in([other, inner])
     assert listed == [other, inner / "a.fits.gz", inner / "b.JPG", inner / "d.tiff"]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"empty: a folder without images; allowed: \.fits, .*\.bmp$"):
+    with pytest.raises(
+        InputError, match=r"empty: a folder without images; allowed: \.fits, .*\.bmp$"
+    ):
         plate_solver.pictures_in([tmp_path / "empty"])
 
 
 def test_annotated_pictures_have_the_pictures_names() -> None:
     def names(*paths: str) -> list[str]:
-        return [path.as_posix() for path in plate_solver.annotated_paths(Path("out"), [Path(path) for path in paths])]
+        return [
+            path.as_posix()
+            for path in plate_solver.annotated_paths(Path("out"), [Path(path) for path in paths])
+        ]
 
-    assert names("my_sky.jpg", "a/m31.fits.gz") == ["out/my_sky.annotated.png", "out/m31.annotated.png"]
+    assert names("my_sky.jpg", "a/m31.fits.gz") == [
+        "out/my_sky.annotated.png",
+        "out/m31.annotated.png",
+    ]
     assert names("x.jpg", "x.fits") == ["out/x.jpg.annotated.png", "out/x.fits.annotated.png"]
     assert names("a/x.jpg", "b/x.jpg", "y.png") == [
-        *("out/x.jpg.annotated.png", "out/x.jpg-2.annotated.png", "out/y.annotated.png")
+        "out/x.jpg.annotated.png",
+        "out/x.jpg-2.annotated.png",
+        "out/y.annotated.png",
     ]
 
 
 def test_stars_are_named_by_their_catalog() -> None:
-    assert [solution.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == ["HIP 71683", "HD 48915", "Gaia 345678"]
+    assert [solution.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
+        "HIP 71683",
+        "HD 48915",
+        "Gaia 345678",
+    ]
 
 
 # What users call
@@ -281,24 +338,48 @@ def test_stars_are_named_by_their_catalog() -> None:
 def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> None:
     path = with_exif(tmp_path / "x.png", gray, 2)  # as stored it is upright: seen, it is mirrored
     found = package.solve(path, fov_deg=FOV_DEG)
-    assert (found.status, found.ra_deg, found.matches) == ("no identification beyond chance", None, 0)
+    assert (found.status, found.ra_deg, found.matches) == (
+        "no identification beyond chance",
+        None,
+        0,
+    )
     assert "mirrored" in found.hint
     assert found.lights > 20
     assert (found.brightest_dn, found.background_dn) == (gray.max(), np.median(gray))
     ((narrow, wide),) = found.tried_fov_deg
     assert (narrow, wide) == pytest.approx((0.948 * FOV_DEG, 1.058 * FOV_DEG), rel=2e-3)
     assert found.catalog_limit_mag == 8.0
-    assert package.solve(with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0").catalog_limit_mag == 8.0
-    with pytest.raises(InputError, match=r"solve.catalog: unknown catalog 'deep'; allowed: gaia_v8.0, hipparcos_hp6.5"):
+    assert (
+        package.solve(with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0").catalog_limit_mag
+        == 8.0
+    )
+    with pytest.raises(
+        InputError,
+        match=r"solve.catalog: unknown catalog 'deep'; allowed: gaia_v8.0, hipparcos_hp6.5",
+    ):
         package.solve(path, catalog="deep")
 
 
 def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
     found = answer(with_exif(tmp_path / "x.png", gray))
     assert list(json.loads(json.dumps(found))) == [
-        *("file", "status", "ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec"),
-        *("lights", "brightest_dn", "background_dn", "tried_fov_deg", "catalog_limit_mag", "hint"),
-        *("time_ms", "warning", "bad_input"),
+        "file",
+        "status",
+        "ra_deg",
+        "dec_deg",
+        "roll_deg",
+        "fov_deg",
+        "matches",
+        "rms_arcsec",
+        "lights",
+        "brightest_dn",
+        "background_dn",
+        "tried_fov_deg",
+        "catalog_limit_mag",
+        "hint",
+        "time_ms",
+        "warning",
+        "bad_input",
     ]
     assert found["hint"] == ""
 
@@ -318,5 +399,7 @@ def test_the_browser_s_panel_sees_the_same_picture(
     photo, pixels = photo_from_file(name, data, FOV_DEG)
     assert (photo.size_px, pixels.shape) == ((WIDTH_PX, HEIGHT_PX), (HEIGHT_PX, WIDTH_PX))
     check_right({"status": photo.result.status, **photo.solution}, sky[2])
-    refused, _ = photo_from_file("x.png", with_exif(tmp_path / "y.png", gray, 2).read_bytes(), FOV_DEG)
+    refused, _ = photo_from_file(
+        "x.png", with_exif(tmp_path / "y.png", gray, 2).read_bytes(), FOV_DEG
+    )
     assert "mirrored" in refused.hint

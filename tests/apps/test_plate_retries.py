@@ -40,7 +40,10 @@ def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
     assert not plate_solver.solve_array(image, solver, None)[0].attitude.solved
     outcome = plate_solver.solve_picture(images.Picture(image), solver, None)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
-    assert plate_solver.outcome_fields(outcome, None)["hint"] == "its stars were found in its upper half alone"
+    assert (
+        plate_solver.outcome_fields(outcome, None)["hint"]
+        == "its stars were found in its upper half alone"
+    )
     assert (outcome.report.centroids.xy_px[:, 1] < 480).all()
 
 
@@ -104,7 +107,8 @@ def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int
     solver = plate_solver.make_solver(shot.fov_deg, None)
     report, _ = plate_solver.solve_array(image, solver, None)
     assert not report.attitude.solved
-    first, most = right(report.centroids), max(map(right, retries.trails(image, Settings())))
+    first = right(report.centroids)
+    most = max(map(right, retries.trails(image, Settings())))
     assert most > 2 * first
     outcome = plate_solver.solve_picture(images.Picture(image), solver, None)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
@@ -118,7 +122,9 @@ def test_round_stars_are_no_trails() -> None:
 def test_an_upper_half_is_solved_in_its_own_field() -> None:
     """The trackers' field is the upper half; attitude and camera are those of the whole picture."""
     image, truth = drawn(replace(SHOT, fov_deg=36.0, limit_mag=5.6), 7)
-    centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None), None)[0].centroids
+    centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None), None)[
+        0
+    ].centroids
     upper = centroids.take(centroids.xy_px[:, 1] < 479.5)
     solver = replace(plate_solver.make_solver(None, None), upper_half=True)
     report, tracker = plate_solver.solve_array(image, solver, None, upper)
@@ -129,7 +135,9 @@ def test_an_upper_half_is_solved_in_its_own_field() -> None:
 
 def test_halves_are_complete_and_not_tried_with_few_lights() -> None:
     rng = np.random.default_rng(5)
-    xy_px = np.concatenate([rng.uniform([0, 0], [99, 49], (30, 2)), rng.uniform([0, 51], [99, 99], (9, 2))])
+    xy_px = np.concatenate(
+        [rng.uniform([0, 0], [99, 49], (30, 2)), rng.uniform([0, 51], [99, 99], (9, 2))]
+    )
     lights = Centroids(xy_px, np.full(39, 0.1), np.ones(39))
     found = list(retries.halves(np.zeros((100, 100)), lights, ""))
     parts = {one.note: (one.efforts, one.centroids) for one in found}
@@ -137,7 +145,10 @@ def test_halves_are_complete_and_not_tried_with_few_lights() -> None:
     assert set(parts) == {retries.HALF.format(side) for side in ("upper", "left", "right")}
     efforts, upper = parts[retries.HALF.format("upper")]
     assert (efforts, len(upper)) == (retries.MORE_EFFORTS, 30)
-    assert len(parts[retries.HALF.format("left")][1]) + len(parts[retries.HALF.format("right")][1]) == 39
+    assert (
+        len(parts[retries.HALF.format("left")][1]) + len(parts[retries.HALF.format("right")][1])
+        == 39
+    )
 
 
 @pytest.mark.slow
@@ -145,4 +156,6 @@ def test_lights_at_random_are_refused_in_every_part() -> None:
     blind = plate_solver.make_solver(None, None)
     for seed in range(10):
         image, _ = drawn(replace(SHOT, starless=True, spoil=photographs.trees), seed)
-        assert not plate_solver.solve_picture(images.Picture(image), blind, None).report.attitude.solved
+        assert not plate_solver.solve_picture(
+            images.Picture(image), blind, None
+        ).report.attitude.solved

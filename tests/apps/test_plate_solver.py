@@ -33,25 +33,33 @@ OTHER_ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.4])
 
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(1024, 768), (600, 900), (3000, 500)])
-def test_every_field_from_two_to_a_hundred_degrees_is_some_tracker_s(width_px: int, height_px: int) -> None:
+def test_every_field_from_two_to_a_hundred_degrees_is_some_tracker_s(
+    width_px: int, height_px: int
+) -> None:
     cameras = plate_solver.FIELD_SEARCH.cameras(width_px, height_px)
     assert len(cameras) < 20
     for fov_deg in np.geomspace(2, 100, 400):
         focal_px = (width_px - 1) / 2 / np.tan(np.radians(fov_deg / 2))
-        assert any(abs(focal_px / camera.focal_px - 1) <= uncertainty for camera, uncertainty in cameras), fov_deg
+        assert any(
+            abs(focal_px / camera.focal_px - 1) <= uncertainty for camera, uncertainty in cameras
+        ), fov_deg
 
 
 def test_a_field_that_is_told_is_the_only_one_tried() -> None:
     ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(640, 480)
     assert np.degrees(camera.fov_rad) == pytest.approx(12.0, abs=1e-9)
     assert 0.05 < uncertainty < 0.06
-    ((known, none),) = plate_solver.make_solver(None, SCENES / "shefex2.yaml").candidate_cameras(659, 493)
+    ((known, none),) = plate_solver.make_solver(None, SCENES / "shefex2.yaml").candidate_cameras(
+        659, 493
+    )
     assert (known.focal_px, none) == (pytest.approx(25 / 9.9e-3, rel=1e-12), 0.0)
 
 
 def test_trackers_are_kept_for_images_of_one_size_and_time() -> None:
     solver = plate_solver.make_solver(20.0, None)
-    first, again, other = (next(solver.trackers(*size, None)) for size in ((640, 480), (640, 480), (640, 400)))
+    first, again, other = (
+        next(solver.trackers(*size, None)) for size in ((640, 480), (640, 480), (640, 400))
+    )
     assert first is again
     assert other is not first
     assert len(solver.tracker_cache) == 1  # one size at a time: an index is megabytes
@@ -94,10 +102,14 @@ def test_a_decisive_answer_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_answers_are_taken_in_the_order_of_the_trackers(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_are_taken_in_the_order_of_the_trackers(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """However many threads there are: the first decisive one is taken, not the quickest."""
     monkeypatch.setattr(searching, "THREADS", threads)
-    for decisive in itertools.permutations([answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0)]):
+    for decisive in itertools.permutations(
+        [answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0)]
+    ):
         attitude, _ = outcome(REFUSED, *decisive, REFUSED)
         assert attitude.cam_from_ref is decisive[0].cam_from_ref
 
@@ -111,9 +123,13 @@ def test_as_many_tries_are_allowed_as_much_chance_as_one() -> None:
 
 
 def test_of_two_answers_neither_is_taken_unless_it_is_far_better() -> None:
-    for one, other in itertools.permutations([answer(ATTITUDE, -9.0), answer(OTHER_ATTITUDE, -7.0)]):
+    for one, other in itertools.permutations(
+        [answer(ATTITUDE, -9.0), answer(OTHER_ATTITUDE, -7.0)]
+    ):
         assert not outcome(one, other)[0].solved
-    for one, other in itertools.permutations([answer(ATTITUDE, -9.8), answer(OTHER_ATTITUDE, -6.0)]):
+    for one, other in itertools.permutations(
+        [answer(ATTITUDE, -9.8), answer(OTHER_ATTITUDE, -6.0)]
+    ):
         assert outcome(one, other)[0].cam_from_ref is ATTITUDE
     # One that is not beyond chance itself speaks against another all the same.
     assert not outcome(answer(ATTITUDE, -6.0), answer(OTHER_ATTITUDE, -4.5))[0].solved
@@ -144,8 +160,12 @@ def photographed(focal: str) -> tuple[Frame, Truth]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)])
-def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver, focal: str, fov_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)]
+)
+def test_a_rendered_field_is_solved_with_nothing_told(
+    blind: plate_solver.Solver, focal: str, fov_deg: float
+) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
     frame, truth = photographed(focal)
     found, _ = plate_solver.solve_array(frame.image_dn, blind, None)
@@ -164,11 +184,15 @@ def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
     camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml")
     for n in (5, 15):
         frame, truth = flight.render(n)
-        found = plate_solver.solve_array(frame.image_dn, camera, flight.lab.scene.start_time)[0].attitude
+        found = plate_solver.solve_array(frame.image_dn, camera, flight.lab.scene.start_time)[
+            0
+        ].attitude
         assert found.cam_from_ref is not None
         error_rad = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
         assert np.abs(error_rad).max() < 100 * ARCSEC_RAD
-        assert error_rad @ np.linalg.solve(found.covariance_rad2, error_rad) < stats.chi2.ppf(0.999, 3)
+        assert error_rad @ np.linalg.solve(found.covariance_rad2, error_rad) < stats.chi2.ppf(
+            0.999, 3
+        )
 
 
 @pytest.mark.long
@@ -185,13 +209,21 @@ def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
 
 @pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
 def test_a_stage_s_wrong_name_is_answered_with_the_allowed_ones(stage: str) -> None:
-    with pytest.raises(InputError, match=rf"^solve.{stage}: unknown {stage} 'magic'; allowed: \w+, \w+"):
+    with pytest.raises(
+        InputError, match=rf"^solve.{stage}: unknown {stage} 'magic'; allowed: \w+, \w+"
+    ):
         plate_solver.make_solver(None, None, stages={stage: "magic"})
 
 
 def test_names_stand_above_what_a_camera_tells() -> None:
     camera = SCENES / "shefex2.yaml"
     defaults = plate_solver.make_solver(None, camera).settings
-    settings = plate_solver.make_solver(None, camera, stages={"centroider": "cog", "solver": "quest"}).settings
+    settings = plate_solver.make_solver(
+        None, camera, stages={"centroider": "cog", "solver": "quest"}
+    ).settings
     assert (defaults.centroider, defaults.solver) == ("default", "default")
-    assert (settings.centroider, settings.solver, settings.gain_e_dn) == ("cog", "quest", defaults.gain_e_dn)
+    assert (settings.centroider, settings.solver, settings.gain_e_dn) == (
+        "cog",
+        "quest",
+        defaults.gain_e_dn,
+    )

@@ -6,7 +6,13 @@ import os
 
 # Before numpy is imported: sums of BLAS threads depend on their number, and a forked process inherits no threads.
 os.environ.update(
-    {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100", "NO_COLOR": "1"}
+    {
+        "OPENBLAS_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "COLUMNS": "100",
+        "NO_COLOR": "1",
+    }
 )
 
 import argparse
@@ -39,7 +45,11 @@ def measured(area: str, cases: dict[str, Case]) -> dict[str, str]:
             except Exception as error:  # the others are compared all the same
                 entries[f"{name} | {FAILED}"] = f"{type(error).__name__}: {error}"
         seconds = time.perf_counter() - began
-        print(f"{area} {number}/{len(cases)} {seconds:5.1f} s  {name[:90]}", file=sys.stderr, flush=True)
+        print(
+            f"{area} {number}/{len(cases)} {seconds:5.1f} s  {name[:90]}",
+            file=sys.stderr,
+            flush=True,
+        )
     return entries
 
 
@@ -48,28 +58,45 @@ def chosen(area: str, names: list[str], every: bool) -> dict[str, Case]:
     cases = AREAS[area]()
     if not names or area in names:
         return {name: case for name, case in cases.items() if every or not name.startswith(LONG)}
-    return {case: made for case, made in cases.items() if any(fnmatch.fnmatch(f"{area}/{case}", n) for n in names)}
+    return {
+        case: made
+        for case, made in cases.items()
+        if any(fnmatch.fnmatch(f"{area}/{case}", n) for n in names)
+    }
 
 
 def read(area: str) -> dict[str, dict[str, str]]:
     """The machine and the entries of an area as they were recorded; empty if they were not."""
     path = DIGESTS / f"{area}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"machine": {}, "entries": {}}
+    return (
+        json.loads(path.read_text(encoding="utf-8"))
+        if path.exists()
+        else {"machine": {}, "entries": {}}
+    )
 
 
 def recorded(area: str, cases: dict[str, Case]) -> dict[str, str]:
     """The recorded entries of some cases of an area, and of cases that are gone."""
     others = AREAS[area]().keys() - cases
-    return {key: value for key, value in read(area)["entries"].items() if key.partition(" | ")[0] not in others}
+    return {
+        key: value
+        for key, value in read(area)["entries"].items()
+        if key.partition(" | ")[0] not in others
+    }
 
 
 def record(area: str, cases: dict[str, Case]) -> bool:
     """Write the entries of some cases beside those of the others, but for those of cases that failed."""
-    now, before = measured(area, cases), recorded(area, cases)
+    now = measured(area, cases)
+    before = recorded(area, cases)
     failed = {key: value for key, value in now.items() if key.endswith(f" | {FAILED}")}
     others = {key: value for key, value in read(area)["entries"].items() if key not in before}
     entries = {key: value for key, value in (others | now).items() if key not in failed}
-    text = json.dumps({"machine": machine(), "entries": dict(sorted(entries.items()))}, indent=1, ensure_ascii=False)
+    text = json.dumps(
+        {"machine": machine(), "entries": dict(sorted(entries.items()))},
+        indent=1,
+        ensure_ascii=False,
+    )
     DIGESTS.mkdir(exist_ok=True)
     (DIGESTS / f"{area}.json").write_text(f"{text}\n", encoding="utf-8")
     lines = [f"  {key}: {value}" for key, value in failed.items()]
@@ -79,24 +106,38 @@ def record(area: str, cases: dict[str, Case]) -> bool:
 
 def compare(area: str, cases: dict[str, Case]) -> bool:
     """Print how many entries are the same as recorded, and list the others. Returns whether all are the same."""
-    now, before = measured(area, cases), recorded(area, cases)
-    lines = [f"  {line}; numbers may differ for that" for line in differences(read(area)["machine"])]
+    now = measured(area, cases)
+    before = recorded(area, cases)
+    lines = [
+        f"  {line}; numbers may differ for that" for line in differences(read(area)["machine"])
+    ]
     lines += [f"  gone     {key}: {before[key]}" for key in before if key not in now]
     lines += [f"  new      {key}: {now[key]}" for key in now if key not in before]
     for key in before.keys() & now.keys():
         if now[key] != before[key]:
             lines.append(f"  differs  {key}\n    - {before[key]}\n    + {now[key]}")
     same = sum(now.get(key) == value for key, value in before.items())
-    print(f"{area}: {same} of {len(before)} entries are the same", *sorted(lines), sep="\n", flush=True)
+    print(
+        f"{area}: {same} of {len(before)} entries are the same",
+        *sorted(lines),
+        sep="\n",
+        flush=True,
+    )
     return now == before
 
 
 def main() -> int:
     """Returns 0 if everything is the same or was recorded, else 1."""
     parser = argparse.ArgumentParser(prog="python -m tests.baseline", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(AREAS)}, or AREA/CASE with * and ?")
-    parser.add_argument("--record", action="store_true", help="write the digests instead of comparing with them")
-    parser.add_argument("--all", action="store_true", help=f"also the cases {LONG}..., which take minutes")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"{', '.join(AREAS)}, or AREA/CASE with * and ?"
+    )
+    parser.add_argument(
+        "--record", action="store_true", help="write the digests instead of comparing with them"
+    )
+    parser.add_argument(
+        "--all", action="store_true", help=f"also the cases {LONG}..., which take minutes"
+    )
     asked = parser.parse_args()
     unknown = [name for name in asked.names if name.partition("/")[0] not in AREAS]
     if unknown:

@@ -20,7 +20,10 @@ from tests.baseline.command import ROOT, forked, run, succeed
 from tests.baseline.digest import Entries
 
 Case = Callable[[Path], Entries]
-CASES = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path in Path(__file__).parent.glob("cases/*")}
+CASES = {
+    path.stem: yaml.safe_load(path.read_text(encoding="utf-8"))
+    for path in Path(__file__).parent.glob("cases/*")
+}
 
 
 def write_files(folder: Path, files: dict[str, str]) -> None:
@@ -44,10 +47,13 @@ def scene_cases() -> dict[str, Case]:
     """Every shipped scene and every variant, by the command `run`; and runs from Python."""
     given = CASES["scenes"]
     cases: dict[str, Case] = {
-        name: partial(run_scene, name, given["shipped"].get(name, given["frames"])) for name in shipped("scenes")
+        name: partial(run_scene, name, given["shipped"].get(name, given["frames"]))
+        for name in shipped("scenes")
     }
     cases |= {name: partial(run_variant, name, keys) for name, keys in given["variants"].items()}
-    return cases | {f"python {name}": partial(run_python, text) for name, text in given["python"].items()}
+    return cases | {
+        f"python {name}": partial(run_python, text) for name, text in given["python"].items()
+    }
 
 
 def run_variant(name: str, keys: dict[str, Any], folder: Path) -> Entries:
@@ -59,11 +65,21 @@ def run_variant(name: str, keys: dict[str, Any], folder: Path) -> Entries:
 
 def run_scene(scene: str, frames: int | None, folder: Path) -> Entries:
     """Messages, JSON and files of `skysim run`, and what `skysim check` foresees. frames : the scene's if None"""
-    ran = succeed(folder, "run", scene, "--json", "--out", "out", *(["--frames", str(frames)] if frames else []))
+    ran = succeed(
+        folder,
+        "run",
+        scene,
+        "--json",
+        "--out",
+        "out",
+        *(["--frames", str(frames)] if frames else []),
+    )
     yield "messages", ran.err
     yield from prefixed("json", digest.values(json.loads(ran.out)))
     yield from result_files(folder / "out")
-    yield from prefixed("check", digest.values(json.loads(succeed(folder, "check", scene, "--json").out)))
+    yield from prefixed(
+        "check", digest.values(json.loads(succeed(folder, "check", scene, "--json").out))
+    )
 
 
 def run_python(text: str, folder: Path) -> Entries:
@@ -108,14 +124,18 @@ def study_cases() -> dict[str, Case]:
     for name in shipped("scenes/studies"):  # one without a line in the file of cases is a KeyError
         keys = dict(given[name])
         prefix = "long " if keys.pop("long", False) else ""
-        cases[prefix + name] = partial(run_study, name, "optimize" if keys.pop("search", False) else "run", keys)
+        cases[prefix + name] = partial(
+            run_study, name, "optimize" if keys.pop("search", False) else "run", keys
+        )
     return cases
 
 
 def run_study(name: str, verb: str, keys: dict[str, Any], folder: Path) -> Entries:
     """The table of a study, and the rows of each of its points without times."""
     overrides = [word for key, value in keys.items() for word in ("--set", f"{key}={value}")]
-    ran = succeed(folder, "study", verb, name, "--engine", "serial", "--json", "--out", "out", *overrides)
+    ran = succeed(
+        folder, "study", verb, name, "--engine", "serial", "--json", "--out", "out", *overrides
+    )
     report = json.loads(ran.out)
     yield from prefixed("table", digest.values(report.pop("points")))
     yield from prefixed("json", digest.values(report))
@@ -158,7 +178,11 @@ def run_stream(scene: str, folder: Path) -> Entries:
         content = path.read_bytes()
         yield (
             path.name,
-            digest.sha(json.dumps(digest.steady(json.loads(content))) if path.suffix == ".json" else content),
+            digest.sha(
+                json.dumps(digest.steady(json.loads(content)))
+                if path.suffix == ".json"
+                else content
+            ),
         )
 
 
@@ -175,7 +199,9 @@ def run_survey(words: str, folder: Path) -> Entries:
 def message_cases() -> dict[str, Case]:
     """What a person reads after a mistake: of the command line, and of Python."""
     given = CASES["messages"]
-    cases: dict[str, Case] = {f"skysim {line}": partial(refused, line) for line in given["commands"].splitlines()}
+    cases: dict[str, Case] = {
+        f"skysim {line}": partial(refused, line) for line in given["commands"].splitlines()
+    }
     return cases | {text: partial(raised, text) for text in given["python"].splitlines()}
 
 
@@ -196,8 +222,14 @@ def raised(text: str, folder: Path) -> Entries:
 AREAS: dict[str, Callable[[], dict[str, Case]]] = {
     "scenes": scene_cases,
     "studies": study_cases,
-    "contracts": lambda: {name: partial(run_session, lines) for name, lines in CASES["contracts"]["sessions"].items()},
-    "streams": lambda: {scene: partial(run_stream, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")},
-    "surveys": lambda: {name: partial(run_survey, words) for name, words in CASES["surveys"].items()},
+    "contracts": lambda: {
+        name: partial(run_session, lines) for name, lines in CASES["contracts"]["sessions"].items()
+    },
+    "streams": lambda: {
+        scene: partial(run_stream, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")
+    },
+    "surveys": lambda: {
+        name: partial(run_survey, words) for name, words in CASES["surveys"].items()
+    },
     "messages": message_cases,
 }

@@ -32,7 +32,13 @@ def preload() -> None:
     package = importlib.import_module("skysim")
     for name in package.__all__:
         getattr(package, name)
-    for name in ("astropy.io.fits", "astropy.table", "astropy.io.ascii", "matplotlib.pyplot", "jinja2"):
+    for name in (
+        "astropy.io.fits",
+        "astropy.table",
+        "astropy.io.ascii",
+        "matplotlib.pyplot",
+        "jinja2",
+    ):
         importlib.import_module(name)
     numba.njit(lambda: 0)()  # numba's own tables; no thread is started, for a fork would lose it
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
@@ -63,7 +69,8 @@ def command(*words: str) -> None:
 
 def forked(folder: Path, action: Callable[[], object]) -> Ran:
     """Call a function in a forked process whose working directory is `folder`."""
-    out, err = folder.with_suffix(".out"), folder.with_suffix(".err")
+    out = folder.with_suffix(".out")
+    err = folder.with_suffix(".err")
     sys.stdout.flush()
     sys.stderr.flush()
     process = os.fork()

@@ -52,7 +52,9 @@ def steady(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: steady(inner) for key, inner in value.items() if not CHANGING.fullmatch(key)}
     if isinstance(value, list):  # without sentences about times
-        return [steady(inner) for inner in value if not (isinstance(inner, str) and "time_ms" in inner)]
+        return [
+            steady(inner) for inner in value if not (isinstance(inner, str) and "time_ms" in inner)
+        ]
     return value
 
 

@@ -7,7 +7,17 @@ from importlib.metadata import version
 
 import numpy as np
 
-LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "astropy", "pyerfa", "pydantic", "typer", "opencv-python-headless")
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "mujoco",
+    "astropy",
+    "pyerfa",
+    "pydantic",
+    "typer",
+    "opencv-python-headless",
+)
 
 
 def machine() -> dict[str, str]:

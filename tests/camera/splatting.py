@@ -7,7 +7,9 @@ from skysim.camera.psf.kernel import Kernel
 from skysim.core.types import Floats
 
 
-def add_kernel(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, image: Kernel) -> None:
+def add_kernel(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, image: Kernel
+) -> None:
     """Add `electrons` spread as the kernel's image about (x, y) to the rows row0 <= j < row1."""
     if len(image.grid):
         splat.add_grid(patch, row0, row1, x, y, electrons, image.grid)

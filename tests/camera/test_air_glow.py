@@ -22,7 +22,9 @@ SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 
 def lab_of(time: str, **glow: str) -> Lab:
     keys = {"start_time": time, "site": SITE, "light.air.glow.twilight": "true"}
-    return build_lab(load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()}))
+    return build_lab(
+        load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()})
+    )
 
 
 def mag_arcsec2(nanolamberts: float) -> float:
@@ -32,7 +34,8 @@ def mag_arcsec2(nanolamberts: float) -> float:
 def test_airglow_grows_as_the_path_through_its_shell() -> None:
     """The path through a thin shell 131 km above a sphere, by the geometry of two spheres."""
     zenith = np.radians(np.linspace(0, 85, 50))
-    inner, outer = 6371.0, 6371.0 / np.sqrt(0.96)
+    inner = 6371.0
+    outer = 6371.0 / np.sqrt(0.96)
 
     def path_km(z: np.ndarray, r: float) -> np.ndarray:
         return np.sqrt(r**2 - (inner * np.sin(z)) ** 2) - inner * np.cos(z)
@@ -54,7 +57,9 @@ def test_twilight_at_the_zenith_is_that_of_paranal() -> None:
     for depression, tolerance_mag in ((5.0, 1.2), (6.0, 0.8), (8.0, 0.2), (10.0, 0.1), (12.0, 0.4)):
         x = depression - 5
         measured = 11.84 + 1.518 * x - 0.057 * x**2
-        ours = mag_arcsec2(float(sunlight_nl(np.array([90 + depression]), -depression, np.zeros(1), 0.13)[0]))
+        ours = mag_arcsec2(
+            float(sunlight_nl(np.array([90 + depression]), -depression, np.zeros(1), 0.13)[0])
+        )
         assert ours == pytest.approx(measured, abs=tolerance_mag)
 
 
@@ -65,13 +70,17 @@ def test_daylight_is_as_bright_as_the_day() -> None:
     luminance = 10.8e4 * 10 ** (-0.4 * np.array([mag_arcsec2(one) for one in day]))
     assert 3000 < luminance[0] < 9000
     assert 1000 < luminance[2] < 3000
-    falling = [float(sunlight_nl(np.array([90.0]), h, np.array([45.0]), 0.172)[0]) for h in (5, 0, -3, -6, -12, -18)]
+    falling = [
+        float(sunlight_nl(np.array([90.0]), h, np.array([45.0]), 0.172)[0])
+        for h in (5, 0, -3, -6, -12, -18)
+    ]
     assert (np.diff(falling) < 0).all()
 
 
 @pytest.mark.slow
 def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
-    full_up, full_down = "2012-06-03T23:00:00", "2012-06-04T10:00:00"
+    full_up = "2012-06-03T23:00:00"
+    full_down = "2012-06-04T10:00:00"
     mean = {}
     for name, time in (("up", full_up), ("down", full_down)):
         for moonlight in ("true", "false"):

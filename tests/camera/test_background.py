@@ -84,7 +84,9 @@ def drawn(config: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarr
 
 def test_every_kind_of_the_schema_is_known() -> None:
     union = typing.get_args(typing.get_args(light.Glow)[0])
-    assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(BACKGROUNDS)
+    assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(
+        BACKGROUNDS
+    )
 
 
 @pytest.mark.parametrize("camera", [{}, BENT, {"distortion": (0.1, 0.0, 0.0, 0.01, 0.05)}])
@@ -113,7 +115,9 @@ def test_a_pixel_gets_the_light_of_a_star_for_every_square_arcsecond() -> None:
     lens = optics()
     pixel_arcsec = np.degrees(1 / lens.camera.focal_px) * 3600
     star = star_flux_e_s_m2(21.0, *SUN, BAND) * np.pi / 4 * (8e-3 / 1.4) ** 2 * 0.8
-    assert drawn(glow(**SKY), lens, 3.0)[300, 400] == pytest.approx(3 * star * pixel_arcsec**2, rel=1e-3)
+    assert drawn(glow(**SKY), lens, 3.0)[300, 400] == pytest.approx(
+        3 * star * pixel_arcsec**2, rel=1e-3
+    )
 
 
 @pytest.mark.long
@@ -123,7 +127,8 @@ def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None
     lens = optics(**camera)
     x, y = np.meshgrid(np.arange(801.0), np.arange(601.0))
     pixels = pixel_directions(np.column_stack([x.ravel(), y.ravel()]), lens)[1].sum()
-    along_x, along_y = np.linspace(-0.5, 800.5, 1602), np.linspace(-0.5, 600.5, 1202)
+    along_x = np.linspace(-0.5, 800.5, 1602)
+    along_y = np.linspace(-0.5, 600.5, 1202)
     edge = np.concatenate(
         [
             np.column_stack([along_x, np.full(1602, -0.5)]),
@@ -133,16 +138,20 @@ def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None
         ]
     )
     a = unproject(edge, lens)
-    b, middle = np.roll(a, -1, axis=0), np.array([0.0, 0.0, 1.0])
+    b = np.roll(a, -1, axis=0)
+    middle = np.array([0.0, 0.0, 1.0])
     # Triangles from the boresight to each piece of edge: tan(E / 2) = triple product / (1 + the three cosines).
-    halves = np.arctan2(np.cross(a, b) @ middle, 1 + np.sum(a * b, axis=1) + a @ middle + b @ middle)
+    halves = np.arctan2(
+        np.cross(a, b) @ middle, 1 + np.sum(a * b, axis=1) + a @ middle + b @ middle
+    )
     assert pixels == pytest.approx(2 * halves.sum(), rel=2e-5)
 
 
 @pytest.mark.slow
 def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
     table = {"kind": "table", "angle_deg": (0, 10, 30), "transmission": (1, 0.7, 0.1)}
-    clear, dim = optics(), optics(vignetting=table)
+    clear = optics()
+    dim = optics(vignetting=table)
     edge_deg = np.degrees(np.arctan(400 / clear.camera.focal_px))
     ratio = drawn(glow(**SKY), dim)[300] / drawn(glow(**SKY), clear)[300]
     # The cusp on the axis is rounded off: half a node of 30 px, 0.6 degrees, costs 1.8 % there and less elsewhere.
@@ -155,7 +164,9 @@ def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
 @pytest.mark.slow
 def test_the_sky_s_slope_is_relative_and_a_degree() -> None:
     lens = optics()
-    flat, sloped = (drawn(glow(**SKY | {"gradient_per_deg": g}), lens) for g in ((0, 0), (0.02, -0.01)))
+    flat, sloped = (
+        drawn(glow(**SKY | {"gradient_per_deg": g}), lens) for g in ((0, 0), (0.02, -0.01))
+    )
     right_deg = np.degrees(np.arctan(300 / lens.camera.focal_px))
     down_deg = np.degrees(np.arctan(200 / lens.camera.focal_px))
     assert sloped[300, 700] / flat[300, 700] == pytest.approx(1 + 0.02 * right_deg, rel=1e-3)
@@ -190,8 +201,12 @@ def test_moonlight_falls_off_to_a_right_angle_and_is_none_without_air() -> None:
     rho = np.linspace(0.3, 90, 2000)
     assert (np.diff(moonlight_nl(rho, 10.0, 0.172, 45.0, 30.0)) < 0).all()
     assert not moonlight_nl(rho, 10.0, 0.0, 45.0, 30.0).any()
-    assert np.abs(np.diff(np.log(scattering(rho)))[rho[1:] > 5]).max() < 0.02  # no step where the laws change
-    assert scattering(2.0) / scattering(4.0) == pytest.approx(4, rel=0.1)  # 1 / rho^2 and a little Rayleigh
+    assert (
+        np.abs(np.diff(np.log(scattering(rho)))[rho[1:] > 5]).max() < 0.02
+    )  # no step where the laws change
+    assert scattering(2.0) / scattering(4.0) == pytest.approx(
+        4, rel=0.1
+    )  # 1 / rho^2 and a little Rayleigh
     assert scattering(0.0) == scattering(0.26)
 
 
@@ -201,12 +216,15 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
     lens = optics()
     moon_cam = np.array([np.sin(np.radians(25.0)), 0, np.cos(np.radians(25.0))])
     place = dict(zip(("ra_deg", "dec_deg"), lab_place(25.0), strict=True))
-    lit, even = drawn(glow(**MOON | place), lens), drawn(glow(**SKY), lens)
+    lit = drawn(glow(**MOON | place), lens)
+    even = drawn(glow(**SKY), lens)
     ratio = lit / even
     column = np.array([100, 400, 700])
     toward = np.column_stack([(column - 400) / lens.camera.focal_px, np.zeros(3), np.ones(3)])
     separation = np.degrees(np.arccos(toward @ moon_cam / np.linalg.norm(toward, axis=1)))
-    wanted = moonlight_nl(separation, 20.0, 0.172, 50.0, 20.0) / (NANOLAMBERT_V0 * 10 ** (-0.4 * 21.0))
+    wanted = moonlight_nl(separation, 20.0, 0.172, 50.0, 20.0) / (
+        NANOLAMBERT_V0 * 10 ** (-0.4 * 21.0)
+    )
     np.testing.assert_allclose(ratio[300, column], wanted, rtol=1e-3)
     assert ratio[300, 700] > 1.2 * ratio[300, 100]
 
@@ -216,7 +234,9 @@ def test_stray_light_of_the_sun() -> None:
     ra_deg, dec_deg = lab_place(110.0)
     sun = glow(kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12))
     wavelength = np.linspace(400e-9, 1000e-9, 6001)
-    photons = 2 * 299792458.0 / wavelength**4 / np.expm1(0.01438777 / (wavelength * 5772.0)) * 6.794e-5
+    photons = (
+        2 * 299792458.0 / wavelength**4 / np.expm1(0.01438777 / (wavelength * 5772.0)) * 6.794e-5
+    )
     wanted = 0.5 * np.trapezoid(photons, wavelength) * 1e-8 * (5.5e-6) ** 2
     levels = glow_map((sun,), optics(), POINTING, BAND)
     assert levels.shape == (1, 1)
@@ -224,7 +244,8 @@ def test_stray_light_of_the_sun() -> None:
 
 
 def test_transmittance_is_straight_in_decades_and_level_beyond_its_ends() -> None:
-    angle_deg, pst = (10.0, 30.0, 50.0), (1e-2, 1e-6, 0.0)
+    angle_deg = (10.0, 30.0, 50.0)
+    pst = (1e-2, 1e-6, 0.0)
     assert transmittance(20.0, angle_deg, pst) == pytest.approx(1e-4, rel=1e-9)
     assert transmittance(5.0, angle_deg, pst) == pytest.approx(1e-2, rel=1e-9)
     assert transmittance(120.0, angle_deg, pst) < 1e-29
@@ -247,9 +268,13 @@ FAR_MOON = MOON | dict(zip(("ra_deg", "dec_deg"), lab_place(60.0), strict=True))
 @pytest.mark.slow
 @pytest.mark.parametrize("part", [SLOPED, FAR_MOON])
 @pytest.mark.parametrize("camera", [{}, BENT, {"focal_length": "3 mm"}])
-def test_frames_drawn_between_nodes_are_within_a_thousandth(part: dict[str, object], camera: dict[str, object]) -> None:
+def test_frames_drawn_between_nodes_are_within_a_thousandth(
+    part: dict[str, object], camera: dict[str, object]
+) -> None:
     lens = optics(**camera)
-    np.testing.assert_allclose(drawn(glow(**part), lens)[::3, ::3], whole_map(glow(**part), lens), rtol=1e-3)
+    np.testing.assert_allclose(
+        drawn(glow(**part), lens)[::3, ::3], whole_map(glow(**part), lens), rtol=1e-3
+    )
 
 
 @pytest.mark.slow
@@ -263,14 +288,20 @@ def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-@pytest.mark.parametrize(("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))])
-def test_fill_is_bilinear_interpolation(kind: type, shape: tuple[int, int], nodes: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))]
+)
+def test_fill_is_bilinear_interpolation(
+    kind: type, shape: tuple[int, int], nodes: tuple[int, int]
+) -> None:
     coarse = np.random.default_rng(1).uniform(1, 2, nodes)
     image = np.full(shape, np.nan, kind)
     fill(image, coarse, 0.25)
     axes = [np.linspace(0, size - 1, count) for size, count in zip(shape, nodes, strict=True)]
     places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    wanted = 0.25 * RegularGridInterpolator(axes, coarse, bounds_error=False, fill_value=None)(places)
+    wanted = 0.25 * RegularGridInterpolator(axes, coarse, bounds_error=False, fill_value=None)(
+        places
+    )
     np.testing.assert_allclose(image, wanted, rtol=1e-6 if kind is np.float32 else 1e-12)
 
 

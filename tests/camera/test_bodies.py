@@ -30,7 +30,9 @@ REST = (0.0, 0.0, 0.0)
 
 def camera(focal_px: float, psf: dict[str, object]) -> CameraConfig:
     """A small chip whose lens has this focal length."""
-    base = loader.load("shefex2", {"camera.width_px": str(SIZE), "camera.height_px": str(SIZE)}).camera
+    base = loader.load(
+        "shefex2", {"camera.width_px": str(SIZE), "camera.height_px": str(SIZE)}
+    ).camera
     kind = type(base.psf).model_validate(psf) if psf["kind"] == base.psf.kind else base.psf
     return base.model_copy(update={"focal_length_m": focal_px * base.pixel_m, "psf": kind})
 
@@ -42,7 +44,11 @@ def toward(direction: Floats, off_px: tuple[float, float], optics: Optics) -> Ro
     x /= np.linalg.norm(x)
     centered = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
     tilt = np.array(off_px) / optics.camera.focal_px
-    return centered * Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]) * Rotation.from_rotvec([0.0, 0.0, 0.4])
+    return (
+        centered
+        * Rotation.from_rotvec([tilt[1], -tilt[0], 0.0])
+        * Rotation.from_rotvec([0.0, 0.0, 0.4])
+    )
 
 
 def exposed_at(
@@ -52,7 +58,9 @@ def exposed_at(
     t_s = np.linspace(0.0, 1.0, 101)
     turn = Rotation.from_rotvec(rate * (t_s - 0.5)[:, None])
     motion = Trajectory(t_s, attitude * turn, np.tile(rate, (len(t_s), 1)))
-    return Exposed(optics, motion, Mount(np.zeros(3), Rotation.identity()), Window(0.48, 0.04, row_s))
+    return Exposed(
+        optics, motion, Mount(np.zeros(3), Rotation.identity()), Window(0.48, 0.04, row_s)
+    )
 
 
 def light(name: str, date: datetime.datetime = DATE) -> BodyLight:
@@ -90,7 +98,8 @@ CASES = {
 def test_a_disc_is_its_points(name: str, case: str) -> None:
     """Within a few thousandths of the brightest pixel; the Moon's limb is a cusp, which needs many points."""
     focal_px, psf, rate, row_s = CASES[case]
-    optics, body = Optics.from_camera(camera(focal_px, psf)), light(name)
+    optics = Optics.from_camera(camera(focal_px, psf))
+    body = light(name)
     exposed = exposed_at(optics, body.place.direction, (0.3, -0.45), rate, row_s)
     image = np.zeros((SIZE, SIZE))
     (truth,) = drawing.render_bodies(image, [body], exposed)
@@ -117,7 +126,8 @@ def test_a_small_disc_and_a_point_have_the_light_and_center_of_theirs() -> None:
 
 def test_the_electrons_are_those_of_the_magnitude() -> None:
     """A disc gives what a star of its flux gives through the same lens."""
-    optics, body = Optics.from_camera(camera(2500.0, GAUSS)), light("moon")
+    optics = Optics.from_camera(camera(2500.0, GAUSS))
+    body = light("moon")
     exposed = exposed_at(optics, body.place.direction, (0.0, 0.0), np.zeros(3))
     image = np.zeros((SIZE, SIZE))
     drawing.render_bodies(image, [body], exposed)
@@ -125,7 +135,8 @@ def test_the_electrons_are_those_of_the_magnitude() -> None:
 
 
 def test_a_disc_half_off_the_chip_is_the_part_on_it() -> None:
-    optics, body = Optics.from_camera(camera(2500.0, GAUSS)), light("sun")
+    optics = Optics.from_camera(camera(2500.0, GAUSS))
+    body = light("sun")
     exposed = exposed_at(optics, body.place.direction, (SIZE / 2, 0.0), np.zeros(3))
     image = np.zeros((SIZE, SIZE))
     (truth,) = drawing.render_bodies(image, [body], exposed)
@@ -143,8 +154,12 @@ def test_the_moon_eclipses_the_sun() -> None:
     optics = Optics.from_camera(camera(2500.0, GAUSS))
     left = []
     for minute in (0, 10, 18, 21.5):
-        seen = observe_from(datetime.datetime(2017, 8, 21, 18) + datetime.timedelta(minutes=minute), site)
-        sun, moon = (body_light(name, place(name, seen), seen.tt_jd, BAND) for name in ("sun", "moon"))
+        seen = observe_from(
+            datetime.datetime(2017, 8, 21, 18) + datetime.timedelta(minutes=minute), site
+        )
+        sun, moon = (
+            body_light(name, place(name, seen), seen.tt_jd, BAND) for name in ("sun", "moon")
+        )
         exposed = exposed_at(optics, sun.place.direction, (0.0, 0.0), np.zeros(3))
         image = np.zeros((SIZE, SIZE))
         drawing.render_bodies(image, [sun, moon], exposed)
@@ -169,8 +184,10 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
 
 def test_a_disc_takes_no_light_from_the_pixels_around_it() -> None:
     """Rounding of the transforms is far below zero beside a bright disc; sums of such pixels alone were negative."""
-    light, patches = np.zeros((40, 40)), np.zeros((2, 2, 9, 9))
-    light[10:30, 10:30], patches[:, :, 4, 4] = 1e12, 1.0
+    light = np.zeros((40, 40))
+    patches = np.zeros((2, 2, 9, 9))
+    light[10:30, 10:30] = 1e12
+    patches[:, :, 4, 4] = 1.0
     image = convolved(light, patches)
     assert image.min() == 0.0
     assert image.sum() == pytest.approx(light.sum(), rel=1e-12)

@@ -50,11 +50,14 @@ def test_blooming_keeps_the_charge_and_its_center() -> None:
     rng = np.random.default_rng(2)
     image = rng.uniform(0, 0.5 * WELL, (400, 30)).astype(np.float32)
     image[150:250:30, ::3] += np.float32(20 * WELL)
-    before, rows = image.astype(float), np.arange(400)
+    before = image.astype(float)
+    rows = np.arange(400)
     bloom(image, WELL)
     assert image.max() == WELL
     # Roundings to float32, 6e-5 e each, for 400 pixels; for the moment each at up to row 400.
-    np.testing.assert_allclose(image.sum(axis=0, dtype=float), before.sum(axis=0), rtol=0, atol=0.03)
+    np.testing.assert_allclose(
+        image.sum(axis=0, dtype=float), before.sum(axis=0), rtol=0, atol=0.03
+    )
     np.testing.assert_allclose(rows @ image.astype(float), rows @ before, rtol=0, atol=10.0)
 
 
@@ -77,7 +80,9 @@ def test_the_last_electrons_go_in_halves_to_both_ends() -> None:
     column[5] = 3.5 * WELL
     image = frame(column)
     bloom(image, WELL)
-    np.testing.assert_allclose(image[2:9, 1], WELL * np.array([0, 0.25, 1, 1, 1, 0.25, 0]), rtol=1e-6)
+    np.testing.assert_allclose(
+        image[2:9, 1], WELL * np.array([0, 0.25, 1, 1, 1, 0.25, 0]), rtol=1e-6
+    )
 
 
 def test_two_equal_sources_make_one_symmetric_streak() -> None:
@@ -92,7 +97,8 @@ def test_two_equal_sources_make_one_symmetric_streak() -> None:
 def test_anti_blooming_drains_its_share_of_the_excess() -> None:
     column = np.zeros(101)
     column[50] = 11 * WELL
-    drained, dry = frame(column), frame(column)
+    drained = frame(column)
+    dry = frame(column)
     bloom(drained, WELL, anti_blooming=0.6)
     bloom(dry, WELL, anti_blooming=1.0)
     assert drained.sum(dtype=float) == pytest.approx(WELL * (1 + 0.4 * 10), rel=1e-6)
@@ -124,7 +130,8 @@ def test_columns_that_hold_their_charge_stay_bit_by_bit() -> None:
 
 def clocked_out(line_e: np.ndarray, cti: float, clocks: int) -> np.ndarray:
     """A register moved place by place: each clock all charge but the fraction cti goes on towards place 0 and out."""
-    charge, out = line_e.astype(float), np.zeros(clocks)
+    charge = line_e.astype(float)
+    out = np.zeros(clocks)
     for clock in range(clocks):
         moved = (1 - cti) * charge
         charge -= moved
@@ -138,7 +145,8 @@ def test_transfer_loss_is_that_of_packets_moved_place_by_place(cti: float) -> No
     rng = np.random.default_rng(4)
     line = rng.uniform(0, 1e4, 150)
     wanted = clocked_out(line, cti, 150)
-    down, across = frame(line), frame(line).T.copy()
+    down = frame(line)
+    across = frame(line).T.copy()
     transfer_loss(down, cti, 0.0)
     transfer_loss(across, 0.0, cti)
     # 1e-6 of some packets is a place or so amiss, and float32 rounds to 1e-3 e.
@@ -157,7 +165,8 @@ def test_parallel_and_serial_loss_of_a_frame_are_clocked_one_after_the_other() -
 @pytest.mark.slow
 def test_deferred_charge_of_a_flat_field_is_transfers_times_inefficiency() -> None:
     """The extended-pixel edge response: what trails a flat field of n rows is n cti of a row (Janesick 2001)."""
-    rows, cti = 1000, 1e-6
+    rows = 1000
+    cti = 1e-6
     image = np.zeros((rows + 20, 130))
     image[:rows] = 5e4
     transfer_loss(image, cti, 0.0)
@@ -178,7 +187,8 @@ def test_no_charge_is_lost_in_late_packets() -> None:
 
 def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: float) -> np.ndarray:
     """One column: dark charge clocked in row by row under the light, exposed, and clocked out into the store."""
-    charge, store = np.zeros(len(rate_e_s)), []
+    charge = np.zeros(len(rate_e_s))
+    store = []
     for _ in rate_e_s:
         charge = np.append((charge + rate_e_s * row_time_s)[1:], 0.0)
     charge += rate_e_s * exposure_s
@@ -190,7 +200,8 @@ def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: flo
 
 @pytest.mark.slow
 def test_smear_is_that_of_a_column_clocked_under_light() -> None:
-    exposure_s, row_time_s = 0.05, 2e-6
+    exposure_s = 0.05
+    row_time_s = 2e-6
     rate = np.random.default_rng(7).uniform(0, 1e5, (90, 130))
     wanted = np.array([clocked_under_light(column, exposure_s, row_time_s) for column in rate.T]).T
     light = rate * exposure_s
@@ -204,10 +215,13 @@ def test_smear_is_that_of_a_column_clocked_under_light() -> None:
 @pytest.mark.slow
 def test_a_leaking_register_smears_by_its_leak() -> None:
     rate = np.random.default_rng(8).uniform(0, 1e5, (40, 65))
-    open_sky, covered = rate * 0.1, rate * 0.1
+    open_sky = rate * 0.1
+    covered = rate * 0.1
     frame_transfer_smear(open_sky, 0.1, 5e-6)
     interline_smear(covered, 0.1, 5e-6, leak=1e-3)
-    np.testing.assert_allclose(covered - rate * 0.1, 1e-3 * (open_sky - rate * 0.1), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        covered - rate * 0.1, 1e-3 * (open_sky - rate * 0.1), rtol=0, atol=1e-9
+    )
 
 
 def test_a_bright_star_smears_its_column_alone() -> None:

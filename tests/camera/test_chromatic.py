@@ -32,8 +32,12 @@ from skysim.sources.photometry import (
     temperature_k,
 )
 
-A0, M1 = (0.0, 0.004), (1.485, 2.005)  # B-V and V-I
-WAVELENGTH_NM, FOCUS_UM, CORNER_PX = [450, 550, 700, 900], [120, 0, 40, 250], [-1.4, 0, 0.8, 1.5]
+# B-V and V-I
+A0 = (0.0, 0.004)
+M1 = (1.485, 2.005)
+WAVELENGTH_NM = [450, 550, 700, 900]
+FOCUS_UM = [120, 0, 40, 250]
+CORNER_PX = [-1.4, 0, 0.8, 1.5]
 CHROMATIC = {
     "wavelength": [f"{one} nm" for one in WAVELENGTH_NM],
     "focus": [f"{one} um" for one in FOCUS_UM],
@@ -63,7 +67,8 @@ def photons(power: Callable[[Floats], Floats]) -> Callable[[Floats], Floats]:
     return lambda wavelength_m: power(wavelength_m) * wavelength_m
 
 
-WHITE, BLUE = photons(measured("white").response_at), photons(colored(470e-9, 25e-9))
+WHITE = photons(measured("white").response_at)
+BLUE = photons(colored(470e-9, 25e-9))
 CASES = {
     "a blue star": (lambda band: star_chromatic(*A0, band), planck(A0), None),
     "a red star": (lambda band: star_chromatic(*M1, band), planck(M1), None),
@@ -86,10 +91,13 @@ def test_mean_and_spread_of_a_light(case: str) -> None:
 
         return sum(fixed_quad(shape, *ends, n=8)[0] for ends in itertools.pairwise(knots))
 
-    total, wanted = integral(np.ones_like), list[float]()
+    total = integral(np.ones_like)
+    wanted = list[float]()
     for column in (1e-6 * np.array(FOCUS_UM), CORNER_PX):
         mean = integral(lambda nm, of=column: np.interp(nm, WAVELENGTH_NM, of)) / total
-        square = integral(lambda nm, of=column, mean=mean: (np.interp(nm, WAVELENGTH_NM, of) - mean) ** 2)
+        square = integral(
+            lambda nm, of=column, mean=mean: (np.interp(nm, WAVELENGTH_NM, of) - mean) ** 2
+        )
         wanted += [mean, (square / total) ** 0.5]
     made = np.array(moments(band)).ravel()
     if case == "a line":  # a narrow one has no width, that of the quadrature 2 nm
@@ -107,12 +115,24 @@ def test_images_are_those_of_all_rays(case: str) -> None:
     """
     moments, spectrum, distance_m = CASES[case]
     config = camera(focus="0.7 m") if distance_m else camera()
-    band, lens = Band.from_camera(config), Optics.from_camera(config)
+    band = Band.from_camera(config)
+    lens = Optics.from_camera(config)
     along = (np.array([50.0, 34.0]) - config.center_px) / config.focal_px
     place = np.append(along, 1.0)
-    place = np.append(place * distance_m, 1.0) if distance_m else np.append(place / np.linalg.norm(place), 0.0)
+    place = (
+        np.append(place * distance_m, 1.0)
+        if distance_m
+        else np.append(place / np.linalg.norm(place), 0.0)
+    )
     image = np.zeros((48, 64))
-    render(image, light(place, np.reshape(moments(band), (1, 4))), lens, STILL, AT_CENTER, Window(0.0, 0.1))
+    render(
+        image,
+        light(place, np.reshape(moments(band), (1, 4))),
+        lens,
+        STILL,
+        AT_CENTER,
+        Window(0.0, 0.1),
+    )
     x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     mean, square = weighted_moments(pixels, image.ravel())
@@ -124,19 +144,32 @@ def test_images_are_those_of_all_rays(case: str) -> None:
 
 
 def chip_points(
-    config: CameraConfig, band: Band, spectrum: Callable[[Floats], Floats], along: Floats, distance_m: float | None
+    config: CameraConfig,
+    band: Band,
+    spectrum: Callable[[Floats], Floats],
+    along: Floats,
+    distance_m: float | None,
 ) -> tuple[Floats, Floats]:
     """Pixels that rays of many wavelengths meet, from rings of the pupil, and their shares of the light."""
     wavelength_nm = np.arange(380.0, 1100.0)
     share = spectrum(wavelength_nm * 1e-9).ravel() * band.response_at(wavelength_nm * 1e-9)
     focal_m = config.focal_length_m + 1e-6 * np.interp(wavelength_nm, WAVELENGTH_NM, FOCUS_UM)
     image_m = 1 / (1 / focal_m - (1 / distance_m if distance_m else 0.0))
-    ring, angle = np.sqrt((np.arange(12) + 0.5) / 12), 2 * np.pi * np.arange(8) / 8
-    pupil_m = config.pupil_m / 2 * np.stack([np.outer(ring, np.cos(angle)), np.outer(ring, np.sin(angle))], axis=-1)
+    ring = np.sqrt((np.arange(12) + 0.5) / 12)
+    angle = 2 * np.pi * np.arange(8) / 8
+    pupil_m = (
+        config.pupil_m
+        / 2
+        * np.stack([np.outer(ring, np.cos(angle)), np.outer(ring, np.sin(angle))], axis=-1)
+    )
     height_px = config.focal_px * along
     lateral = 1 + np.interp(wavelength_nm, WAVELENGTH_NM, CORNER_PX) / config.corner_px
     # A ray from p on the pupil to the image at v meets the chip at v0 in p (1 - v0 / v) and the chief ray's height.
-    defocus_px = (1 - config.image_distance_m / image_m)[:, None, None] * pupil_m.reshape(1, -1, 2) / config.pixel_m
+    defocus_px = (
+        (1 - config.image_distance_m / image_m)[:, None, None]
+        * pupil_m.reshape(1, -1, 2)
+        / config.pixel_m
+    )
     points = config.center_px + lateral[:, None, None] * height_px + defocus_px
     return points.reshape(-1, 2), np.repeat(share, points.shape[1])
 
@@ -148,10 +181,13 @@ def weighted_moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
 
 
 def light(place: Floats, chromatic: Floats) -> Sources:
-    one, zero = np.ones(1), np.zeros(1)
+    one = np.ones(1)
+    zero = np.zeros(1)
     normal = -place[None, :3] / np.linalg.norm(place[:3]) * place[3]
     rows = np.zeros(1, np.int64)
-    return Sources(rows, place[None], normal, zero, 1e9 * one, one, zero, one, rows, one, None, chromatic)
+    return Sources(
+        rows, place[None], normal, zero, 1e9 * one, one, zero, one, rows, one, None, chromatic
+    )
 
 
 STILL = Trajectory.at_rest(Rotation.identity(), 1.0)
@@ -166,7 +202,14 @@ CELESTIAL = "{kind: celestial, cap_deg: 10, count: 20, camera: [0 m, 0 m, 0 m], 
     [
         ("shefex2", {}),
         ("afit_simsat", {}),
-        ("afit_simsat", {"light.led.spectrum": "630 nm", "light.led.fwhm": "18 nm", "light.led.color_scatter": "3 nm"}),
+        (
+            "afit_simsat",
+            {
+                "light.led.spectrum": "630 nm",
+                "light.led.fwhm": "18 nm",
+                "light.led.color_scatter": "3 nm",
+            },
+        ),
         ("nps_tas2", {}),
         ("collimated_display", {}),
     ],
@@ -174,25 +217,34 @@ CELESTIAL = "{kind: celestial, cap_deg: 10, count: 20, camera: [0 m, 0 m, 0 m], 
 def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) -> None:
     """And is imaged where its mean wavelength is."""
     lab = build_lab(loader.load(scene, keys | {"camera.chromatic": LENS}))
-    sources, config = lab.camera.sources, lab.scene.camera
+    sources = lab.camera.sources
+    config = lab.scene.camera
     assert sources.chromatic is not None
     assert sources.chromatic.shape == (len(sources), 4)
     assert np.all((sources.chromatic[:, [0, 2]] > 0) & (sources.chromatic[:, [0, 2]] < [40e-6, 1]))
     spread = np.ptp(sources.chromatic[:, 2])
     assert (spread > 0.01) == (scene == "shefex2" or "light.led.color_scatter" in keys)
     toward = Rotation.align_vectors([[0, 0, 1]], sources.place[:1, :3])[0]
-    pose = Poses((Rotation.from_euler("x", 2, degrees=True) * toward).as_matrix()[None], np.zeros((1, 3)))
+    pose = Poses(
+        (Rotation.from_euler("x", 2, degrees=True) * toward).as_matrix()[None], np.zeros((1, 3))
+    )
     first = sources.take(np.arange(1))
     gray = Sources(*(getattr(first, name) for name in Sources.__slots__[:-1]))
-    seen, nominal = (project(one, lab.camera.optics, pose)[0][0, 0] - config.center_px for one in (first, gray))
-    np.testing.assert_allclose(seen, nominal * (1 + first.chromatic[0, 2] / config.corner_px), rtol=1e-9, atol=1e-9)
+    seen, nominal = (
+        project(one, lab.camera.optics, pose)[0][0, 0] - config.center_px for one in (first, gray)
+    )
+    np.testing.assert_allclose(
+        seen, nominal * (1 + first.chromatic[0, 2] / config.corner_px), rtol=1e-9, atol=1e-9
+    )
 
 
 def test_bodies_and_satellites_have_their_colors() -> None:
     """Mars is redder than the Sun and Uranus bluer; a satellite is as the Sun."""
     lens = {"camera.chromatic": LENS, "light.bodies": "{}"}
     lab = build_lab(loader.load("shefex2", lens))
-    bodies = beam_of(lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)).discs
+    bodies = beam_of(
+        lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)
+    ).discs
     lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies}
     assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
     assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
@@ -204,10 +256,19 @@ def test_bodies_and_satellites_have_their_colors() -> None:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("{wavelength: [400 nm, 900 nm]}", "nothing depends on the wavelength; allowed: focus or corner_px other than"),
+        (
+            "{wavelength: [400 nm, 900 nm]}",
+            "nothing depends on the wavelength; allowed: focus or corner_px other than",
+        ),
         ("{wavelength: [400 nm, 900 nm], corner_px: [0, 0]}", "nothing depends on the wavelength"),
-        ("{wavelength: [400 nm, 900 nm], corner_px: [0, 1, 2]}", "wavelength has 2 numbers, corner_px has 3"),
-        ("{wavelength: [900 nm, 400 nm], corner_px: [0, 1]}", "wavelength is not strictly ascending"),
+        (
+            "{wavelength: [400 nm, 900 nm], corner_px: [0, 1, 2]}",
+            "wavelength has 2 numbers, corner_px has 3",
+        ),
+        (
+            "{wavelength: [900 nm, 400 nm], corner_px: [0, 1]}",
+            "wavelength is not strictly ascending",
+        ),
     ],
 )
 def test_what_is_no_aberration_is_refused(value: str, message: str) -> None:

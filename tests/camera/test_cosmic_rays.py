@@ -33,7 +33,8 @@ def many(count: int = 100_000, **part: object) -> np.ndarray:
 
 def test_the_count_is_flux_times_area_times_time() -> None:
     """What goes in within the frame is Poisson: mean and variance of 400 exposures."""
-    rng, counts = np.random.default_rng(2), []
+    rng = np.random.default_rng(2)
+    counts = []
     for _ in range(400):
         tracks = draw_tracks(protons(), SHAPE, 0.1, PIXEL_M, rng)
         inside = (np.abs(tracks["x_px"] - 149.5) < 150) & (np.abs(tracks["y_px"] - 99.5) < 100)
@@ -70,7 +71,9 @@ def test_an_image_of_a_track_is_as_long_as_its_tangent_says() -> None:
     tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
     np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)
-    assert np.median(along) == pytest.approx(1.0, abs=4 * 1.0 / np.sqrt(len(tracks)))  # 45 degrees, 10 um, 10 um
+    assert np.median(along) == pytest.approx(
+        1.0, abs=4 * 1.0 / np.sqrt(len(tracks))
+    )  # 45 degrees, 10 um, 10 um
 
 
 def test_most_probable_charge_is_that_of_the_length() -> None:
@@ -79,10 +82,14 @@ def test_most_probable_charge_is_that_of_the_length() -> None:
     ratio = tracks["electrons"] / (80.0 * tracks["length_m"] * 1e6)
     counts, edges = np.histogram(ratio, np.arange(0.8, 1.3, 0.02))
     peak = counts.argmax()
-    mode = np.polyfit((edges[peak - 3 : peak + 4] + 0.01) - edges[peak], counts[peak - 3 : peak + 4], 2)
+    mode = np.polyfit(
+        (edges[peak - 3 : peak + 4] + 0.01) - edges[peak], counts[peak - 3 : peak + 4], 2
+    )
     assert edges[peak] - mode[1] / (2 * mode[0]) == pytest.approx(1.0, abs=0.02)
     sigma = 0.06 * np.pi / np.sqrt(2)
-    assert ratio.mean() == pytest.approx(1 + 0.06 * (np.euler_gamma + np.log(2)), abs=4 * sigma / np.sqrt(len(ratio)))
+    assert ratio.mean() == pytest.approx(
+        1 + 0.06 * (np.euler_gamma + np.log(2)), abs=4 * sigma / np.sqrt(len(ratio))
+    )
     assert ratio.std() == pytest.approx(sigma, rel=0.03)
     assert ratio.min() > 0
 
@@ -90,7 +97,9 @@ def test_most_probable_charge_is_that_of_the_length() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("diffusion_px", [0.0, 0.3, 2.0])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_every_electron_of_a_track_within_the_frame_is_in_it(diffusion_px: float, kind: type) -> None:
+def test_every_electron_of_a_track_within_the_frame_is_in_it(
+    diffusion_px: float, kind: type
+) -> None:
     image = np.zeros(SHAPE, kind)
     ends = np.array([[40.2, 60.0, 47.9, 20.3], [100.0, 100.0, 100.0, 100.0]])
     kept = deposit(image, ends, np.array([5000.0, 300.0]), max(diffusion_px, 1e-3))
@@ -103,8 +112,11 @@ def test_charge_is_spread_evenly_along_the_track() -> None:
     """Sum over rows of a level track: 10 electrons a pixel of way, half in the end pixels; rows are a Gaussian."""
     image = np.zeros((41, 141))
     deposit(image, np.array([[20.0, 20.0, 120.0, 20.0]]), np.array([1000.0]), 0.5)
-    columns, rows = image.sum(axis=0), image.sum(axis=1)
-    np.testing.assert_allclose(columns[25:116], 10.0, rtol=0.02)  # whole steps are no whole part of a pixel
+    columns = image.sum(axis=0)
+    rows = image.sum(axis=1)
+    np.testing.assert_allclose(
+        columns[25:116], 10.0, rtol=0.02
+    )  # whole steps are no whole part of a pixel
     assert np.average(np.arange(141), weights=columns) == pytest.approx(70.0, abs=1e-6)
     share = np.diff(stats.norm.cdf(np.arange(42) - 0.5, 20.0, 0.5))
     np.testing.assert_allclose(rows / 1000, share, rtol=0, atol=1e-8)
@@ -118,7 +130,9 @@ def test_diffusion_widens_the_cloud() -> None:
         image = np.zeros((61, 61))
         deposit(image, np.array([[30.0, 30.0, 30.0, 30.0]]), np.array([1.0]), sigma_px)
         spots.append(image.sum(axis=0) @ (np.arange(61) - 30.0) ** 2)
-    np.testing.assert_allclose(spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3)  # Sheppard: the pixel's own 1/12
+    np.testing.assert_allclose(
+        spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3
+    )  # Sheppard: the pixel's own 1/12
 
 
 @pytest.mark.slow
@@ -153,12 +167,17 @@ def test_frames_gain_the_tracks_and_keep_what_they_had() -> None:
 def test_nothing_flies_nothing_changes() -> None:
     image = np.zeros(SHAPE, np.float32)
     assert len(add_particles(image, 1.0, PIXEL_M, (), np.random.default_rng(7))) == 0
-    assert len(add_particles(image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7))) == 0
+    assert (
+        len(add_particles(image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7)))
+        == 0
+    )
     assert not image.any()
 
 
 def test_the_same_stream_draws_the_same_tracks() -> None:
-    first, again, other = np.zeros(SHAPE), np.zeros(SHAPE), np.zeros(SHAPE)
+    first = np.zeros(SHAPE)
+    again = np.zeros(SHAPE)
+    other = np.zeros(SHAPE)
     for image, seed in ((first, 1), (again, 1), (other, 2)):
         add_particles(image, 0.1, PIXEL_M, (protons(),), np.random.default_rng(seed))
     np.testing.assert_array_equal(first, again)
@@ -167,5 +186,7 @@ def test_the_same_stream_draws_the_same_tracks() -> None:
 
 def test_more_tracks_than_memory_should_hold_are_refused() -> None:
     image = np.zeros((64, 64), np.float32)
-    with pytest.raises(InputError, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"):
+    with pytest.raises(
+        InputError, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"
+    ):
         add_particles(image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1))

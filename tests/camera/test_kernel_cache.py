@@ -21,7 +21,9 @@ def camera(**changes: Any) -> CameraConfig:
     return CameraConfig.model_validate(part | changes)
 
 
-def shapes(lens: CameraConfig, radius_m: list[float], near: list[bool], distance_m: list[float]) -> Any:
+def shapes(
+    lens: CameraConfig, radius_m: list[float], near: list[bool], distance_m: list[float]
+) -> Any:
     count = len(radius_m)
     return source_kernels(
         lens, np.tile(lens.center_px, (count, 1)), np.array(radius_m), np.array(near), np.array(distance_m),
@@ -33,7 +35,10 @@ def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disk() -> None:
     sharp = shapes(camera(focus="infinity"), [0.0], [False], [1.0])
     assert sharp.kind.tolist() == [GAUSS]
     both = shapes(camera(), [0.0, 1e-3], [False, True], [1.0, 1.0])
-    assert both.kind.tolist() == [ROUND, ROUND]  # focused on the lamp, the star is a disk of confusion
+    assert both.kind.tolist() == [
+        ROUND,
+        ROUND,
+    ]  # focused on the lamp, the star is a disk of confusion
     assert both.reach_px[0] != both.reach_px[1]
 
 
@@ -52,7 +57,9 @@ def test_a_far_lamp_is_smaller() -> None:
 
 
 def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
-    lens = camera(focus="infinity", psf={"kind": "gaussian", "sigma_px": 0.7, "corner_sigma_px": 2.4})
+    lens = camera(
+        focus="infinity", psf={"kind": "gaussian", "sigma_px": 0.7, "corner_sigma_px": 2.4}
+    )
     place = np.array([lens.center_px, (-0.5, -0.5)])
     made = source_kernels(lens, place, np.zeros(2), np.zeros(2, bool), np.ones(2), np.ones(2))
     np.testing.assert_allclose(made.sigma_px, [0.7, 2.5], rtol=1e-12, atol=0)
@@ -60,7 +67,9 @@ def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
 
 
 def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
-    assert sharpness_px(build_kernel(camera().psf, camera())) == pytest.approx(np.sqrt(0.49 + 1 / 12), rel=1e-12)
+    assert sharpness_px(build_kernel(camera().psf, camera())) == pytest.approx(
+        np.sqrt(0.49 + 1 / 12), rel=1e-12
+    )
     edge = sharpness_px(build_kernel(camera().psf, camera(), emitter_radius_px=12.0))
     assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
 
@@ -69,7 +78,10 @@ def test_sharpness_of_a_grid_is_as_a_table_s(tmp_path: Any) -> None:
     """Half the peak of a Gaussian over its steepest slope is sigma sqrt(e) / 2, the pixel included."""
     at = np.arange(-24, 25) / 4
     np.savetxt(tmp_path / "psf.csv", np.exp(-(at**2 + at[:, None] ** 2) / 2), delimiter=",")
-    lens = camera(focus="infinity", psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 4})
+    lens = camera(
+        focus="infinity",
+        psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 4},
+    )
     wanted = np.sqrt(np.e) / 2 * np.sqrt(1 + 1 / 12)
     assert sharpness_px(build_kernel(lens.psf, lens)) == pytest.approx(wanted, rel=0.02)
 

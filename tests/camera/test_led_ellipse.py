@@ -23,8 +23,11 @@ from skysim.sources.dome.led import Emitter
 
 AT_CENTER = Mount(np.zeros(3), Rotation.identity())
 STILL = Trajectory(np.linspace(0, 1, 11), Rotation.identity(11), np.zeros((11, 3)))
-RADIUS_M, DEPTH_M, PATCH = 5e-3, 1.0, 48
-CENTER, CORNER = (319.9, 240.2), (600.3, 440.8)
+RADIUS_M = 5e-3
+DEPTH_M = 1.0
+PATCH = 48
+CENTER = (319.9, 240.2)
+CORNER = (600.3, 440.8)
 
 
 def lens_of(**changes: Any) -> Optics:
@@ -34,18 +37,38 @@ def lens_of(**changes: Any) -> Optics:
         "focus": f"{DEPTH_M} m", "psf": {"kind": "gaussian", "sigma_px": 0.7},
         "detector": {"quantum_efficiency": 0.5, "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
     }  # fmt: skip
-    return replace(Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=1.0)
+    return replace(
+        Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=1.0
+    )
 
 
-def led(lens: Optics, xy_px: tuple[float, float], incidence_deg: float, around_deg: float = 20.0) -> Sources:
+def led(
+    lens: Optics, xy_px: tuple[float, float], incidence_deg: float, around_deg: float = 20.0
+) -> Sources:
     """An LED of unit strength imaged there, its normal inclined to the line of sight."""
-    place = DEPTH_M * np.append((np.array(xy_px) - lens.camera.center_px) / lens.camera.focal_px, 1.0)
+    place = DEPTH_M * np.append(
+        (np.array(xy_px) - lens.camera.center_px) / lens.camera.focal_px, 1.0
+    )
     sight = place / np.linalg.norm(place)
-    tilt = Rotation.from_rotvec(np.radians(around_deg) * sight).apply(np.cross(sight, [0.0, 1.0, 0.0]))
-    normal = Rotation.from_rotvec(np.radians(incidence_deg) * tilt / np.linalg.norm(tilt)).apply(-sight)
-    one, zero = np.ones(1), np.zeros(1)
+    tilt = Rotation.from_rotvec(np.radians(around_deg) * sight).apply(
+        np.cross(sight, [0.0, 1.0, 0.0])
+    )
+    normal = Rotation.from_rotvec(np.radians(incidence_deg) * tilt / np.linalg.norm(tilt)).apply(
+        -sight
+    )
+    one = np.ones(1)
+    zero = np.zeros(1)
     return Sources(
-        np.array([1]), np.append(place, 1)[None], normal[None], RADIUS_M * one, one, one, zero, one, np.array([0]), zero
+        np.array([1]),
+        np.append(place, 1)[None],
+        normal[None],
+        RADIUS_M * one,
+        one,
+        one,
+        zero,
+        one,
+        np.array([0]),
+        zero,
     )
 
 
@@ -60,29 +83,41 @@ def disk_points(rings: int, spokes: int) -> tuple[Floats, Floats]:
     node, weight = np.polynomial.legendre.leggauss(rings)
     angle = (np.arange(spokes) + 0.5) * 2 * np.pi / spokes
     polar = np.sqrt((node[:, None] + 1) / 2) * np.exp(1j * angle)
-    return np.stack([polar.real.ravel(), polar.imag.ravel()]), np.repeat(weight / 2 / spokes, spokes)
+    return np.stack([polar.real.ravel(), polar.imag.ravel()]), np.repeat(
+        weight / 2 / spokes, spokes
+    )
 
 
 def rays(camera: CameraConfig, source: Sources, exponent: float) -> tuple[Floats, Floats]:
     """(2, N) pixels and (N,) light of points of the LED: I cos^n(theta) cos(phi) / d^2 for each of them."""
     e, share = disk_points(24, 80)
-    place, normal = source.place[0, :3], source.normal[0]
+    place = source.place[0, :3]
+    normal = source.normal[0]
     across = np.cross(normal, [0.3, -0.8, 0.52])
     across /= np.linalg.norm(across)
-    points = place[:, None] + RADIUS_M * (np.outer(across, e[0]) + np.outer(np.cross(normal, across), e[1]))
+    points = place[:, None] + RADIUS_M * (
+        np.outer(across, e[0]) + np.outer(np.cross(normal, across), e[1])
+    )
     distance = np.linalg.norm(points, axis=0)
     light = share * (-normal @ points / distance) ** exponent * points[2] / distance**3
     return camera.focal_px * points[:2] / points[2] + np.array(camera.center_px)[:, None], light
 
 
 def traced(
-    camera: CameraConfig, source: Sources, exponent: float = 1.0, sigma_px: float = 0.7, shift_px: float = 0.0
+    camera: CameraConfig,
+    source: Sources,
+    exponent: float = 1.0,
+    sigma_px: float = 0.7,
+    shift_px: float = 0.0,
 ) -> tuple[Any, Floats]:
     """The pixels of a patch, as slices, and its light, shifted along x."""
     xy, light = rays(camera, source, exponent)
     xy[0] += shift_px
-    pupil_m, image_m = camera.pupil_m, camera.image_distance_m
-    defocus_px = pupil_m * image_m * abs(1 / source.place[0, 2] - 1 / camera.focus_m) / 2 / camera.pixel_m
+    pupil_m = camera.pupil_m
+    image_m = camera.image_distance_m
+    defocus_px = (
+        pupil_m * image_m * abs(1 / source.place[0, 2] - 1 / camera.focus_m) / 2 / camera.pixel_m
+    )
     if defocus_px > 1e-9:
         e, share = disk_points(8, 20)
         xy = (xy[:, :, None] + defocus_px * e[:, None, :]).reshape(2, -1)
@@ -92,7 +127,8 @@ def traced(
     edges = corner[:, None] + np.arange(PATCH + 1) - 0.5
     for part in np.array_split(np.arange(len(light)), max(1, len(light) // 20_000)):
         columns, rows = (
-            np.diff(ndtr((edge[:, None] - at) / sigma_px), axis=0) for edge, at in zip(edges, xy[:, part], strict=True)
+            np.diff(ndtr((edge[:, None] - at) / sigma_px), axis=0)
+            for edge, at in zip(edges, xy[:, part], strict=True)
         )
         total += (rows * light[part]) @ columns.T
     x, y = corner
@@ -150,7 +186,9 @@ LENSES = {
 
 @pytest.mark.parametrize("kind", LENSES)
 @pytest.mark.parametrize("focus", [f"{DEPTH_M} m", "0.5 m"])
-def test_an_ellipse_of_equal_axes_is_the_round_image(kind: str, focus: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ellipse_of_equal_axes_is_the_round_image(
+    kind: str, focus: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An LED that faces the camera on its axis, drawn by either way, behind every lens: to 1e-3 of the peak, as the
     round kernels' sizes are in steps of 0.01 px.
     """
@@ -168,7 +206,9 @@ def test_a_measured_lens_that_is_not_round_draws_ellipses_too(tmp_path: Any) -> 
     """A coma-like table, the sum of two Gaussians: the image is the sum of two traced ones, shifted."""
     x = np.arange(-32, 33) / 8
     spots = [(0.7, -0.3), (0.3, 0.7)]  # (light, x in px): mean 0
-    cells = sum(light * np.exp(-((x - at) ** 2 + x[:, None] ** 2) / 2 / 0.7**2) for light, at in spots)
+    cells = sum(
+        light * np.exp(-((x - at) ** 2 + x[:, None] ** 2) / 2 / 0.7**2) for light, at in spots
+    )
     np.savetxt(tmp_path / "psf.csv", cells, delimiter=",")
     lens = lens_of(psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 8})
     source = led(lens, CENTER, 40)
@@ -182,11 +222,13 @@ def test_a_measured_lens_that_is_not_round_draws_ellipses_too(tmp_path: Any) -> 
 
 def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
     """A streak of 6 px of an LED at 50 deg, and a rolling shutter that reads slowly enough to see it move."""
-    lens, source = lens_of(), led(lens_of(), CENTER, 50)
+    lens = lens_of()
+    source = led(lens_of(), CENTER, 50)
     t = np.linspace(0, 1, 41)
     rate = np.array([0.002, 0.006, 0.0])
     path = Trajectory(t, Rotation.from_rotvec((t[:, None] - 0.5) * rate), np.tile(rate, (41, 1)))
-    image, stills = np.zeros((480, 640)), np.zeros((480, 640))
+    image = np.zeros((480, 640))
+    stills = np.zeros((480, 640))
     render(image, source, lens, path, AT_CENTER, Window(0.0, 1.0))
     times = (np.arange(64) + 0.5) / 64
     for pose in path.attitude_at(times):
@@ -220,20 +262,37 @@ def test_rim_and_mean_light_are_those_of_the_projected_disk(
     np.testing.assert_allclose(mean, xy @ light / light.sum() - xy_px, rtol=0, atol=third)
     cos_i, cos_a = np.cos(np.radians([incidence_deg, field_deg]))
     circle_px = lens.camera.focal_px * RADIUS_M * cos_a / DEPTH_M  # f r / d
-    assert np.prod(images.semi_axes_px()) == pytest.approx(circle_px**2 * cos_i / cos_a**3, rel=1e-3)
-    normal, place = source.normal[0], source.place[0, :3]
+    assert np.prod(images.semi_axes_px()) == pytest.approx(
+        circle_px**2 * cos_i / cos_a**3, rel=1e-3
+    )
+    normal = source.normal[0]
+    place = source.place[0, :3]
     across = np.cross(normal, [0.3, -0.8, 0.52])
     across /= np.linalg.norm(across)
     t = np.linspace(0, 2 * np.pi, 100)
-    rim = place[:, None] + RADIUS_M * (np.outer(across, np.cos(t)) + np.outer(np.cross(normal, across), np.sin(t)))
-    offset = lens.camera.focal_px * rim[:2] / rim[2] + np.array(lens.camera.center_px)[:, None] - xy_px[:, None]
-    unit = np.linalg.norm(np.linalg.solve(images.matrix[0], offset - images.center[0][:, None]), axis=0)
-    np.testing.assert_allclose(unit, 1, rtol=0, atol=3 * RADIUS_M**2 / np.cos(np.radians(incidence_deg)) ** 2)
+    rim = place[:, None] + RADIUS_M * (
+        np.outer(across, np.cos(t)) + np.outer(np.cross(normal, across), np.sin(t))
+    )
+    offset = (
+        lens.camera.focal_px * rim[:2] / rim[2]
+        + np.array(lens.camera.center_px)[:, None]
+        - xy_px[:, None]
+    )
+    unit = np.linalg.norm(
+        np.linalg.solve(images.matrix[0], offset - images.center[0][:, None]), axis=0
+    )
+    np.testing.assert_allclose(
+        unit, 1, rtol=0, atol=3 * RADIUS_M**2 / np.cos(np.radians(incidence_deg)) ** 2
+    )
 
 
 def test_a_disk_behind_the_camera_has_no_image() -> None:
     images = disk_images(
-        lens_of(), Emitter(), np.array([[0, 0, 1e-3], [0, 0, -1.0]]), np.array([[0.8, 0, -0.6]] * 2), np.full(2, 2e-3)
+        lens_of(),
+        Emitter(),
+        np.array([[0, 0, 1e-3], [0, 0, -1.0]]),
+        np.array([[0.8, 0, -0.6]] * 2),
+        np.full(2, 2e-3),
     )
     assert isinstance(images, DiskImages)
     assert np.isnan(images.matrix).any(axis=(1, 2)).all()

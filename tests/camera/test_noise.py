@@ -8,7 +8,8 @@ from scipy import stats
 
 from skysim.camera.detector import noise
 
-ROWS, COLUMNS = 1000, 1000
+ROWS = 1000
+COLUMNS = 1000
 N = ROWS * COLUMNS
 MEMORY = noise.scratch(COLUMNS)
 
@@ -29,7 +30,8 @@ def drawn_normals(seed: int = 0) -> np.ndarray:
 
 def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
     """Share of honest draws that are farther from the law than these; bins of less than 10 are one."""
-    found, wanted = np.bincount(numbers, minlength=len(probability)), probability * len(numbers)
+    found = np.bincount(numbers, minlength=len(probability))
+    wanted = probability * len(numbers)
     assert len(found) == len(wanted), "a number that the law does not have"
     common = wanted >= 10
     found = np.append(found[common], found[~common].sum())
@@ -38,7 +40,9 @@ def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
 
 
 # On both sides of the change of method at 16, in the middle and at the very edge of a guide's step.
-@pytest.mark.parametrize("mean", [0.0, 0.004, 0.25, 1.0, 2.9921875, 7.77, 15.999, 16.0, 17.3, 32.2, 100, 1e3, 4e4])
+@pytest.mark.parametrize(
+    "mean", [0.0, 0.004, 0.25, 1.0, 2.9921875, 7.77, 15.999, 16.0, 17.3, 32.2, 100, 1e3, 4e4]
+)
 def test_counts_are_poisson(mean: float) -> None:
     numbers = drawn_counts(mean, seed=int(mean * 1000)).astype(np.int64).ravel()
     law = stats.poisson.pmf(np.arange(int(mean + 12 * np.sqrt(mean)) + 12), np.float32(mean))
@@ -55,7 +59,9 @@ def test_normal_numbers_are_normal() -> None:
 
 def test_the_logarithm_is_that_of_double_precision() -> None:
     """Of mantissa and exponent as `normal` takes a number apart; relative, also near 1, where it vanishes."""
-    u = np.concatenate([np.geomspace(2.0**-32, 0.999, 2000), 1 - np.geomspace(2.0**-24, 0.3, 2000)]).astype(np.float32)
+    u = np.concatenate(
+        [np.geomspace(2.0**-32, 0.999, 2000), 1 - np.geomspace(2.0**-24, 0.3, 2000)]
+    ).astype(np.float32)
     above = u.view(np.int32) - np.int32(noise.ROOT_HALF_BITS)
     exponent = (above >> 23).astype(np.float32)
     mantissa = ((above & 0x7FFFFF) + np.int32(noise.ROOT_HALF_BITS)).view(np.float32)
@@ -91,8 +97,10 @@ def test_the_least_uniform_numbers_have_the_law_s_tail() -> None:
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 8, 9, 31, 33])
 def test_rows_of_any_width_have_the_law(width: int) -> None:
     """Also the last pixel of an odd row, and where small and large means are side by side."""
-    memory, seeds = noise.scratch(width), noise.seeds(np.random.default_rng(width), 4000)
-    normals, counts = np.empty((4000, width), np.float32), np.empty((4000, width), np.float32)
+    memory = noise.scratch(width)
+    seeds = noise.seeds(np.random.default_rng(width), 4000)
+    normals = np.empty((4000, width), np.float32)
+    counts = np.empty((4000, width), np.float32)
     means = np.where(np.arange(width) % 3 == 1, 40.0, 3.0)
     counts[:] = means
     for normal_row, count_row, seed in zip(normals, counts, seeds, strict=True):
@@ -133,10 +141,12 @@ def test_a_seed_is_a_stream() -> None:
 
 def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count() -> None:
     """n is certain where F(n - 1) of the least mean is below the bucket, and F(n) of the greatest mean above it."""
-    guide, bucket = noise.guide(), np.arange(noise.BUCKETS) / noise.BUCKETS
+    guide = noise.guide()
+    bucket = np.arange(noise.BUCKETS) / noise.BUCKETS
     counts = np.arange(80)
     for k in (0, 1, 37, 128, 500, 1777, len(guide) - 2):
-        low, high = k / noise.GUIDES_PER_E, (k + 1) / noise.GUIDES_PER_E
+        low = k / noise.GUIDES_PER_E
+        high = (k + 1) / noise.GUIDES_PER_E
         below = stats.poisson.cdf(counts - 1, low)[:, None] <= bucket + 1e-12
         above = stats.poisson.cdf(counts, high)[:, None] >= bucket + 1 / noise.BUCKETS - 1e-12
         certain = below & above

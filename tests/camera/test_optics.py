@@ -30,13 +30,16 @@ def optics(**camera: object) -> Optics:
 
 
 def rays(count: int, half_angle_deg: float, seed: int) -> np.ndarray:
-    tangent = np.random.default_rng(seed).uniform(-1, 1, (count, 2)) * np.tan(np.radians(half_angle_deg))
+    tangent = np.random.default_rng(seed).uniform(-1, 1, (count, 2)) * np.tan(
+        np.radians(half_angle_deg)
+    )
     return np.column_stack([tangent, np.ones(count)])
 
 
 def matrix(lens: Optics) -> np.ndarray:
     """OpenCV's camera matrix."""
-    focal, (x, y) = lens.camera.focal_px, lens.camera.center_px
+    focal = lens.camera.focal_px
+    (x, y) = lens.camera.center_px
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
@@ -48,13 +51,19 @@ small = st.floats(-0.3, 0.3, allow_subnormal=False)
 @settings(max_examples=50, derandomize=True, deadline=None)
 @given(st.tuples(small, small, st.floats(-0.02, 0.02), st.floats(-0.02, 0.02), small))
 def test_distortion_is_opencv_s(distortion: tuple[float, ...]) -> None:
-    lens, vectors = optics(distortion=list(distortion), principal_point_px=[300.0, 250.0]), rays(100, 25, 1)
-    wanted, _ = cv2.projectPoints(vectors, np.zeros(3), np.zeros(3), matrix(lens), np.array(distortion))
-    np.testing.assert_allclose(lens.project(vectors), wanted[:, 0], rtol=0, atol=1e-9)  # rounding of 1e3 px
+    lens = optics(distortion=list(distortion), principal_point_px=[300.0, 250.0])
+    vectors = rays(100, 25, 1)
+    wanted, _ = cv2.projectPoints(
+        vectors, np.zeros(3), np.zeros(3), matrix(lens), np.array(distortion)
+    )
+    np.testing.assert_allclose(
+        lens.project(vectors), wanted[:, 0], rtol=0, atol=1e-9
+    )  # rounding of 1e3 px
 
 
 def test_a_distortion_too_small_to_matter_does_no_harm() -> None:
-    lens, vectors = optics(distortion=[0, 0, 0, 0, 1e-320]), rays(100, 25, 1)
+    lens = optics(distortion=[0, 0, 0, 0, 1e-320])
+    vectors = rays(100, 25, 1)
     np.testing.assert_allclose(lens.project(vectors), optics().project(vectors), rtol=0, atol=1e-9)
 
 
@@ -75,7 +84,9 @@ def test_right_is_plus_x_and_down_is_plus_y() -> None:
 
 def test_a_vector_s_length_does_not_matter_and_what_is_behind_has_no_pixel() -> None:
     vectors = rays(10, 10, 2)
-    np.testing.assert_allclose(optics().project(7 * vectors), optics().project(vectors), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        optics().project(7 * vectors), optics().project(vectors), rtol=0, atol=1e-10
+    )
     assert np.isnan(optics().project(-vectors)).all()
 
 
@@ -123,8 +134,12 @@ def test_the_fold_is_where_the_image_stops_growing(distortion: tuple[float, ...]
 def test_reference_field_of_view_and_diagonal() -> None:
     # Reference H1: 14.868 x 11.150 degrees over the whole chip, true diagonal 18.51.
     lens = optics()
-    assert np.degrees(2 * np.arctan(659 / 2 / lens.camera.focal_px)) == pytest.approx(14.868, abs=0.001)
-    assert np.degrees(2 * np.arctan(493 / 2 / lens.camera.focal_px)) == pytest.approx(11.150, abs=0.001)
+    assert np.degrees(2 * np.arctan(659 / 2 / lens.camera.focal_px)) == pytest.approx(
+        14.868, abs=0.001
+    )
+    assert np.degrees(2 * np.arctan(493 / 2 / lens.camera.focal_px)) == pytest.approx(
+        11.150, abs=0.001
+    )
     assert np.degrees(2 * lens.field_rad) == pytest.approx(18.51, abs=0.01)
 
 
@@ -132,18 +147,28 @@ def test_the_field_reaches_the_farthest_corner_of_a_shifted_chip() -> None:
     shifted = optics(principal_point_px=[100.0, 400.0])
     corner = np.array([658.5 - 100, 400.5, shifted.camera.focal_px])
     # Linear between 4,001 tangents: its curvature is not seen.
-    assert shifted.field_rad == pytest.approx(np.arccos(corner[2] / np.linalg.norm(corner)), abs=1e-9)
+    assert shifted.field_rad == pytest.approx(
+        np.arccos(corner[2] / np.linalg.norm(corner)), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("k1", [-0.3, -0.1, 0.2, 0.5])
 def test_the_field_undoes_distortion(k1: float) -> None:
     """What stands at that angle, towards the farthest corner of a wide lens's chip, OpenCV puts on that corner."""
-    lens = optics(focal_length="7 mm", distortion=[k1, 0, 0, 0, 0], principal_point_px=[300.0, 250.0])
+    lens = optics(
+        focal_length="7 mm", distortion=[k1, 0, 0, 0, 0], principal_point_px=[300.0, 250.0]
+    )
     corner = np.array([658.5, -0.5])
-    aside = (corner - [300.0, 250.0]) / np.hypot(*(corner - [300.0, 250.0])) * np.tan(lens.field_rad)
+    aside = (
+        (corner - [300.0, 250.0]) / np.hypot(*(corner - [300.0, 250.0])) * np.tan(lens.field_rad)
+    )
     edge = np.array([[*aside, 1.0]])
-    found, _ = cv2.projectPoints(edge, np.zeros(3), np.zeros(3), matrix(lens), np.array([k1, 0, 0, 0, 0.0]))
-    np.testing.assert_allclose(found[0, 0], corner, rtol=0, atol=2e-3)  # a table of 4,001 rows, linear between
+    found, _ = cv2.projectPoints(
+        edge, np.zeros(3), np.zeros(3), matrix(lens), np.array([k1, 0, 0, 0, 0.0])
+    )
+    np.testing.assert_allclose(
+        found[0, 0], corner, rtol=0, atol=2e-3
+    )  # a table of 4,001 rows, linear between
 
 
 def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:
@@ -171,7 +196,8 @@ def test_the_field_is_never_too_small(distortion: list[float]) -> None:
 def test_a_lens_focused_nearby_stands_farther_from_its_chip() -> None:
     """Reference §1.2: 35 mm at 33 in is 36.53 mm, and 6.4 mm of chip see 10.01 deg in place of 10.45."""
     afit = {"width_px": 1600, "height_px": 1200, "pixel": "4 um", "focal_length": "35 mm"}
-    near, far = optics(**afit, focus="33 in"), optics(**afit)
+    near = optics(**afit, focus="33 in")
+    far = optics(**afit)
     assert near.camera.image_distance_m == pytest.approx(36.53e-3, abs=5e-6)
     assert far.camera.image_distance_m == pytest.approx(35e-3, rel=1e-15)
     fields = [np.degrees(2 * np.arctan(800 / lens.camera.focal_px)) for lens in (near, far)]
@@ -257,10 +283,16 @@ def test_a_star_gives_the_light_that_passes() -> None:
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 40}, focal_length="15 mm")
     angle = np.radians([0.0, 8.0])
     place = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle), 0 * angle])
-    id, one, zero = np.arange(2), np.ones(2), np.zeros(2)
-    stars = Sources(id, place, np.zeros((2, 3)), zero, 1e8 * one, one, zero, one, 0 * id, np.full(2, np.nan))
+    id = np.arange(2)
+    one = np.ones(2)
+    zero = np.zeros(2)
+    stars = Sources(
+        id, place, np.zeros((2, 3)), zero, 1e8 * one, one, zero, one, 0 * id, np.full(2, np.nan)
+    )
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
     image = np.zeros((493, 659))
-    seen = render(image, stars, lens, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 0.5))
+    seen = render(
+        image, stars, lens, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 0.5)
+    )
     wanted = np.cos(angle) * [1, traced(angle[1], np.radians(40))] * lens.collecting_m2 * 0.5e8
     np.testing.assert_allclose(seen.electrons, wanted, rtol=1e-3, atol=0)

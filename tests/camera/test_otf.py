@@ -12,8 +12,22 @@ from scipy import special
 from scipy.signal import fftconvolve
 from splatting import add_kernel
 
-from skysim.camera.psf.kernel import HARMONIC_FLOOR, Kernel, bandwidth, build_kernel, pack_table, round_kernel
-from skysim.camera.psf.otf import EXTENT, PSFS, airy_unit_px, blur_radius_px, cell_response, field_sigma_px
+from skysim.camera.psf.kernel import (
+    HARMONIC_FLOOR,
+    Kernel,
+    bandwidth,
+    build_kernel,
+    pack_table,
+    round_kernel,
+)
+from skysim.camera.psf.otf import (
+    EXTENT,
+    PSFS,
+    airy_unit_px,
+    blur_radius_px,
+    cell_response,
+    field_sigma_px,
+)
 from skysim.camera.psf.splat import PER_PX
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -51,20 +65,26 @@ def draw(image: Kernel, x: float, y: float, size: int) -> Floats:
 
 def profile(image: Kernel, radii: Floats) -> Floats:
     """The image along the x axis."""
-    return np.array([draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii])
+    return np.array(
+        [draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii]
+    )
 
 
 # --- defocus ---
 
 
 @pytest.mark.parametrize(("f_number", "diameter_px"), [(1.4, 249), (2.8, 124), (8, 43), (16, 22)])
-def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(f_number: float, diameter_px: float) -> None:
+def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(
+    f_number: float, diameter_px: float
+) -> None:
     lens = camera(f_number=f_number)
     assert 2 * blur_radius_px(lens, 33 * INCH_M) == pytest.approx(diameter_px, abs=0.5)
 
 
 @pytest.mark.parametrize(("f_number", "blur_um"), [(1.4, 9.4), (8, 1.6)])
-def test_reference_blur_of_an_led_a_little_farther_than_the_focus(f_number: float, blur_um: float) -> None:
+def test_reference_blur_of_an_led_a_little_farther_than_the_focus(
+    f_number: float, blur_um: float
+) -> None:
     lens = camera(f_number=f_number, focus="33 in")
     assert 2 * blur_radius_px(lens, 33.287 * INCH_M) * 4.2 == pytest.approx(blur_um, abs=0.05)
 
@@ -88,7 +108,8 @@ def test_the_blur_is_the_cone_s_section_at_the_chip() -> None:
 
 
 def test_the_field_blur_grows_from_the_center_to_the_far_corner() -> None:
-    lens, psf = camera(principal_point_px=[500.0, 700.0]), GaussianPsfConfig(corner_sigma_px=1.5)
+    lens = camera(principal_point_px=[500.0, 700.0])
+    psf = GaussianPsfConfig(corner_sigma_px=1.5)
     corner = np.array([1599.5, -0.5])  # the farthest of the four
     at = np.array([[500.0, 700.0], (corner + np.array([500, 700])) / 2, corner])
     np.testing.assert_allclose(field_sigma_px(psf, lens, at), [0, 0.75, 1.5], rtol=0, atol=1e-12)
@@ -144,7 +165,9 @@ def test_diffraction_is_that_of_the_working_f_number() -> None:
     psf = AiryPsfConfig(kind="airy")
     assert airy_unit_px(psf, camera()) == pytest.approx(0.55 * 8 / 4.2, rel=1e-12)
     near = camera(focus="33 in")
-    assert airy_unit_px(psf, near) == pytest.approx(0.55 * 8 / 4.2 * near.image_distance_m / 0.035, rel=1e-12)
+    assert airy_unit_px(psf, near) == pytest.approx(
+        0.55 * 8 / 4.2 * near.image_distance_m / 0.035, rel=1e-12
+    )
 
 
 # --- images ---
@@ -152,7 +175,8 @@ def test_diffraction_is_that_of_the_working_f_number() -> None:
 
 def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
     """1.22 lambda N, and 83.8 % of the light (Born & Wolf 8.5), on pixels so small that they blur nothing."""
-    lens, psf = camera(pixel="0.4 um"), AiryPsfConfig(kind="airy")
+    lens = camera(pixel="0.4 um")
+    psf = AiryPsfConfig(kind="airy")
     image = build_kernel(psf, lens)
     unit = 0.55 * 8 / 0.4
     radii = np.linspace(0.9, 1.6, 281) * unit
@@ -160,14 +184,17 @@ def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
     size = 2 * math.ceil(image.reach_px) + 1
     y, x = np.indices((size, size)) - size // 2
     inside = draw(image, size // 2, size // 2, size)[np.hypot(x, y) <= 1.2197 * unit].sum()
-    beyond = 2 / (np.pi**2) * unit / image.reach_px  # mean light beyond the reach, put back into the image
+    beyond = (
+        2 / (np.pi**2) * unit / image.reach_px
+    )  # mean light beyond the reach, put back into the image
     assert inside * (1 - beyond) == pytest.approx(0.838, abs=0.004)
 
 
 @pytest.mark.parametrize("pixel_um", [0.2, 0.4, 0.55, 1.0, 4.2, 30.0])
 def test_airy_s_light_beyond_its_reach_is_a_fortieth_at_most(pixel_um: float) -> None:
     """On average over its rings 2 / (pi z) of the light is farther than z = pi r / (lambda N) (Born & Wolf 8.5)."""
-    psf, lens = AiryPsfConfig(kind="airy"), camera(pixel=f"{pixel_um} um")
+    psf = AiryPsfConfig(kind="airy")
+    lens = camera(pixel=f"{pixel_um} um")
     reach_px, _ = EXTENT["airy"](psf, lens)
     assert 2 / np.pi**2 * airy_unit_px(psf, lens) / reach_px < 0.0254
 
@@ -215,7 +242,9 @@ def covered_disk(radius: float, size: int, fine: int) -> Floats:
 @pytest.mark.parametrize("sigma_px", [0.25, 0.7])
 def test_disks_against_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
     """Emitter x defocus x Gaussian x pixel, summed on a grid of 1/21 px, within 5e-4 of the peak."""
-    size, fine = 25, 21  # odd: the middle cell is in the middle of the middle pixel
+    # odd: the middle cell is in the middle of the middle pixel
+    size = 25
+    fine = 21
     grid_x, grid_y = fine_grid(size, fine)
     parts = [np.exp(-(grid_x**2 + grid_y**2) / (2 * sigma_px**2))]
     parts += [covered_disk(radius, size, fine) for radius in radii if radius]
@@ -227,18 +256,24 @@ def test_disks_against_brute_force(radii: tuple[float, float], sigma_px: float) 
 
 
 def test_blurs_add_in_quadrature() -> None:
-    lens, half = camera(), 12
-    apart = build_kernel(DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.3), lens, extra_sigma_px=0.4)
+    lens = camera()
+    half = 12
+    apart = build_kernel(
+        DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.3), lens, extra_sigma_px=0.4
+    )
     together = build_kernel(DiskPsfConfig(kind="disk", radius_px=3.0, sigma_px=0.5), lens)
     emitter = build_kernel(GaussianPsfConfig(sigma_px=0.3), lens, 0.4, 3.0)
     for x, y in PLACES + half:
         wanted = draw(together, x, y, 25)
         for image in (apart, emitter):
-            np.testing.assert_allclose(draw(image, x, y, 25), wanted, rtol=0, atol=1e-5 * wanted.max())
+            np.testing.assert_allclose(
+                draw(image, x, y, 25), wanted, rtol=0, atol=1e-5 * wanted.max()
+            )
 
 
 def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
-    lens, psf = camera(), GaussianPsfConfig(sigma_px=0.7)
+    lens = camera()
+    psf = GaussianPsfConfig(sigma_px=0.7)
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(psf, lens, 0.1, 5.02, 2.0)
 
@@ -260,33 +295,47 @@ def cells(tmp_path: Path, table: Floats, name: str = "psf.csv") -> str:
     return str(path)
 
 
-def gaussian_cells(sigma_px: float, oversampling: int, half_px: int, x: float = 0.0, y: float = 0.0) -> Floats:
+def gaussian_cells(
+    sigma_px: float, oversampling: int, half_px: int, x: float = 0.0, y: float = 0.0
+) -> Floats:
     """The light of a Gaussian on cells of 1 / oversampling px."""
     edges = np.linspace(-half_px, half_px, 2 * half_px * oversampling + 1)
-    across, down = (np.diff(special.erf((edges - at) / (sigma_px * np.sqrt(2)))) / 2 for at in (x, y))
+    across, down = (
+        np.diff(special.erf((edges - at) / (sigma_px * np.sqrt(2)))) / 2 for at in (x, y)
+    )
     return np.outer(down, across)
 
 
 @pytest.mark.parametrize(("sigma_px", "oversampling"), [(0.7, 8), (1.0, 6)])
-def test_a_measured_gaussian_is_that_gaussian(tmp_path: Path, sigma_px: float, oversampling: int) -> None:
+def test_a_measured_gaussian_is_that_gaussian(
+    tmp_path: Path, sigma_px: float, oversampling: int
+) -> None:
     psf = MeasuredPsfConfig(
         kind="measured",
         file=cells(tmp_path, gaussian_cells(sigma_px, oversampling, 7)),
         oversampling=oversampling,
     )
-    image, wanted = build_kernel(psf, camera()), build_kernel(GaussianPsfConfig(sigma_px=sigma_px), camera())
+    image = build_kernel(psf, camera())
+    wanted = build_kernel(GaussianPsfConfig(sigma_px=sigma_px), camera())
     for x, y in PLACES + 10:
         peak = draw(wanted, x, y, 21)
         np.testing.assert_allclose(draw(image, x, y, 21), peak, rtol=0, atol=5e-4 * peak.max())
     # As few sub-pixel positions, in powers of two, as are more than seven times the highest frequency.
-    assert 7 * bandwidth(psf, camera(), 0.0, 1e-3) < len(image.grid) - 3 <= 14 * bandwidth(psf, camera(), 0.0, 1e-3)
+    assert (
+        7 * bandwidth(psf, camera(), 0.0, 1e-3)
+        < len(image.grid) - 3
+        <= 14 * bandwidth(psf, camera(), 0.0, 1e-3)
+    )
 
 
 def test_a_star_measured_in_whole_pixels_gives_its_image_back(tmp_path: Path) -> None:
     """Oversampling 1: the image itself where it was measured, centered on its center of gravity."""
-    table = np.array([[0, 1, 1, 0, 0], [1, 6, 9, 2, 0], [1, 9, 20, 8, 1], [0, 3, 7, 4, 1], [0, 0, 1, 1, 0.0]])
+    table = np.array(
+        [[0, 1, 1, 0, 0], [1, 6, 9, 2, 0], [1, 9, 20, 8, 1], [0, 3, 7, 4, 1], [0, 0, 1, 1, 0.0]]
+    )
     table /= table.sum()
-    x, y = table.sum(axis=0) @ np.arange(5), table.sum(axis=1) @ np.arange(5)
+    x = table.sum(axis=0) @ np.arange(5)
+    y = table.sum(axis=1) @ np.arange(5)
     image = build_kernel(MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table)), camera())
     patch = draw(image, 10 + x, 10 + y, 25)
     np.testing.assert_allclose(patch[10:15, 10:15], table, rtol=0, atol=5e-3 * table.max())
@@ -300,7 +349,9 @@ def test_a_measured_image_keeps_its_handedness_and_its_center(tmp_path: Path) ->
     index = np.arange(41)
     for x, y in PLACES + 20:
         patch = draw(build_kernel(psf, camera()), x, y, 41)
-        np.testing.assert_allclose([(patch @ index).sum(), (index @ patch).sum()], [x, y], rtol=0, atol=2e-3)
+        np.testing.assert_allclose(
+            [(patch @ index).sum(), (index @ patch).sum()], [x, y], rtol=0, atol=2e-3
+        )
         third = (((index - x) ** 3) @ patch.sum(axis=0), ((index - y) ** 3) @ patch.sum(axis=1))
         assert third[0] > third[1] > 0.5
 
@@ -318,7 +369,9 @@ def test_mirroring_a_measured_lens_mirrors_its_image(tmp_path: Path) -> None:
     )
     for x, y in PLACES + 20:
         wanted = draw(there, x, y, 41)[:, ::-1]
-        np.testing.assert_allclose(draw(back, 40 - x, y, 41), wanted, rtol=0, atol=1e-5 * wanted.max())
+        np.testing.assert_allclose(
+            draw(back, 40 - x, y, 41), wanted, rtol=0, atol=1e-5 * wanted.max()
+        )
 
 
 def test_interpolation_of_cells_is_keys_cubic() -> None:
@@ -336,10 +389,16 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
     import cv2
     from astropy.io import fits
 
-    table = np.round(gaussian_cells(0.8, 4, 5) / gaussian_cells(0.8, 4, 5).max() * 60000).astype(np.uint16)
+    table = np.round(gaussian_cells(0.8, 4, 5) / gaussian_cells(0.8, 4, 5).max() * 60000).astype(
+        np.uint16
+    )
     fits.PrimaryHDU(table).writeto(tmp_path / "psf.fits")
     cv2.imwrite(str(tmp_path / "psf.png"), table)
-    files = [cells(tmp_path, table.astype(float)), str(tmp_path / "psf.fits"), str(tmp_path / "psf.png")]
+    files = [
+        cells(tmp_path, table.astype(float)),
+        str(tmp_path / "psf.fits"),
+        str(tmp_path / "psf.png"),
+    ]
     csv, *others = (
         draw(
             build_kernel(MeasuredPsfConfig(kind="measured", file=file, oversampling=4), camera()),
@@ -367,7 +426,9 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
         ("psf.docx", "x", "unknown image suffix"),
     ],
 )
-def test_a_file_that_is_no_psf_is_told_in_one_line(tmp_path: Path, name: str, text: str | None, said: str) -> None:
+def test_a_file_that_is_no_psf_is_told_in_one_line(
+    tmp_path: Path, name: str, text: str | None, said: str
+) -> None:
     path = tmp_path / name
     written = [path.write_text(line) for line in ([] if text is None else [text])]
     assert len(written) == (text is not None)

@@ -41,7 +41,9 @@ def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
         "psf": {"kind": "gaussian", "sigma_px": 0.7},
         "detector": {"quantum_efficiency": 0.5, "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
     }
-    return replace(Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=collecting_m2)
+    return replace(
+        Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=collecting_m2
+    )
 
 
 def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
@@ -51,12 +53,15 @@ def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
 
 
 LENS = lens_of()
-AT_CENTER = Mount(np.zeros(3), Rotation.identity())  # camera axes are the body's: it looks along lab z
+AT_CENTER = Mount(
+    np.zeros(3), Rotation.identity()
+)  # camera axes are the body's: it looks along lab z
 
 
 def turning(rate_rad_s: Floats | list[float], start: Rotation | None = None) -> Trajectory:
     """Three seconds at a constant rate about a fixed axis, through `start` in the middle of the first."""
-    t, rate = np.linspace(0, 3, 31), np.array(rate_rad_s, float)
+    t = np.linspace(0, 3, 31)
+    rate = np.array(rate_rad_s, float)
     turned = Rotation.from_rotvec((t[:, None] - 0.5) * rate)
     return Trajectory(t, (start or Rotation.identity()) * turned, np.tile(rate, (31, 1)))
 
@@ -124,7 +129,10 @@ def moments(image: Floats) -> tuple[Floats, Floats]:
     """Mean place and variance along x and y."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     mean = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
-    var = np.array([(image * (x - mean[0]) ** 2).sum(), (image * (y - mean[1]) ** 2).sum()]) / image.sum()
+    var = (
+        np.array([(image * (x - mean[0]) ** 2).sum(), (image * (y - mean[1]) ** 2).sum()])
+        / image.sum()
+    )
     return mean, var
 
 
@@ -169,7 +177,8 @@ def test_a_star_on_the_border_leaves_half_of_itself_outside() -> None:
 
 
 def test_lights_add() -> None:
-    near, far = star_at(20.2, 20.9, 1e3), star_at(22.0, 21.0, 2e3)
+    near = star_at(20.2, 20.9, 1e3)
+    far = star_at(22.0, 21.0, 2e3)
     both = with_sources([near, far])
     np.testing.assert_allclose(shot(both)[0], shot(near)[0] + shot(far)[0], rtol=0, atol=1e-9)
 
@@ -200,7 +209,9 @@ def test_a_still_star_s_centroid_is_its_projected_pixel(x_px: float) -> None:
     image, seen = shot(star_at(x_px, 20.3), lens=blurred(1.2))
     np.testing.assert_allclose(seen.xy_px, [[x_px, 20.3]], rtol=0, atol=1e-10)
     np.testing.assert_allclose(seen.flux_xy_px, seen.xy_px, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(moments(image)[0], [x_px, 20.3], rtol=0, atol=1e-8)  # cut at 6.5 sigma
+    np.testing.assert_allclose(
+        moments(image)[0], [x_px, 20.3], rtol=0, atol=1e-8
+    )  # cut at 6.5 sigma
 
 
 @pytest.mark.parametrize("sigma_px", [0.2, 0.25, 0.3, 0.4, 0.5, 0.6])
@@ -208,7 +219,9 @@ def test_pixels_bend_the_centroid_by_the_s_curve(sigma_px: float) -> None:
     """First harmonic exp(-2 pi^2 sigma^2) / pi over the wide window (reference §3)."""
     phase = np.arange(16) / 16
     lens = blurred(sigma_px)
-    bias = np.array([moments(shot(star_at(30 + p, 20.0), lens=lens)[0])[0][0] - 30 - p for p in phase])
+    bias = np.array(
+        [moments(shot(star_at(30 + p, 20.0), lens=lens)[0])[0][0] - 30 - p for p in phase]
+    )
     amplitude = -2 * np.mean(bias * np.sin(2 * np.pi * phase))
     assert amplitude == pytest.approx(np.exp(-2 * np.pi**2 * sigma_px**2) / np.pi, abs=1e-6)
 
@@ -219,7 +232,9 @@ def test_a_star_is_a_gaussian_integrated_over_each_pixel(sigma_px: float, fine: 
     image, _ = shot(star_at(30.37, 22.81), lens=blurred(sigma_px))
     sub = (np.arange(fine) + 0.5) / fine - 0.5
     x, y = (np.arange(n)[:, None] + sub for n in (64, 48))
-    density = [np.exp(-((axis - at) ** 2) / 2 / sigma_px**2) for axis, at in ((x, 30.37), (y, 22.81))]
+    density = [
+        np.exp(-((axis - at) ** 2) / 2 / sigma_px**2) for axis, at in ((x, 30.37), (y, 22.81))
+    ]
     columns, rows = (d.mean(axis=1) / np.sqrt(2 * np.pi) / sigma_px for d in density)
     np.testing.assert_allclose(
         image, np.outer(rows, columns), rtol=0, atol=2 * image.max() / (fine * sigma_px) ** 2 / 24
@@ -256,7 +271,9 @@ def test_a_disk_s_centroid_is_its_projected_pixel(radius_px: float) -> None:
 
 
 @pytest.mark.parametrize(("pixel_um", "distance_in"), [(4.0, 33), (4.2, 33), (4.2, 66)])
-def test_an_led_s_image_has_the_diameter_of_thin_geometry(pixel_um: float, distance_in: float) -> None:
+def test_an_led_s_image_has_the_diameter_of_thin_geometry(
+    pixel_um: float, distance_in: float
+) -> None:
     """2 mm through 35 mm: 2 mm x f / (u - f) / pixel, in focus. Read off the image's second moments: the variance of
     a disk is a quarter of its radius squared, the blur's and the pixel's are added."""
     distance_m = distance_in * 0.0254
@@ -264,8 +281,12 @@ def test_an_led_s_image_has_the_diameter_of_thin_geometry(pixel_um: float, dista
     lens = lens_of(pixel=f"{pixel_um} um", focal_length="35 mm", focus=f"{distance_in} in", psf=psf)
     image, _ = shot(led_at(0, 0, distance_m), lens=lens)
     radius_px = 2 * np.sqrt(moments(image)[1] - 1 - 1 / 12)
-    wanted = 2e-3 * 35e-3 / (distance_m - 35e-3) / (pixel_um * 1e-6)  # reference §2: 20.8 px at 33 in, 4.2 um
-    np.testing.assert_allclose(2 * radius_px, wanted, rtol=0, atol=0.01)  # sizes are rounded to 0.01 px
+    wanted = (
+        2e-3 * 35e-3 / (distance_m - 35e-3) / (pixel_um * 1e-6)
+    )  # reference §2: 20.8 px at 33 in, 4.2 um
+    np.testing.assert_allclose(
+        2 * radius_px, wanted, rtol=0, atol=0.01
+    )  # sizes are rounded to 0.01 px
 
 
 # Smear
@@ -287,9 +308,13 @@ def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length
     assert seen.streak_px[0] == pytest.approx(length_px, rel=1e-4)
     np.testing.assert_allclose(seen.xy_px, [[31.5, 23.5]], rtol=0, atol=1e-9)
     np.testing.assert_allclose(seen.flux_xy_px, [[31.5, 23.5]], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(mean, [31.5, 23.5], rtol=0, atol=1e-4)  # the S-curve of sigma .7 is 2e-5
+    np.testing.assert_allclose(
+        mean, [31.5, 23.5], rtol=0, atol=1e-4
+    )  # the S-curve of sigma .7 is 2e-5
     along = 0.7**2 + 1 / 12 + length_px**2 / 12
-    np.testing.assert_allclose(variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4)  # the same of the second moment
+    np.testing.assert_allclose(
+        variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4
+    )  # the same of the second moment
 
 
 def test_stars_move_against_the_camera() -> None:
@@ -307,8 +332,12 @@ def test_a_roll_leaves_the_boresight_and_swings_the_rest_by_radius_times_angle()
     assert aside.streak_px[0] == pytest.approx(20 * 0.2, rel=1e-3)
 
 
-@pytest.mark.parametrize(("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)])
-def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(length_px: float, ratio: float) -> None:
+@pytest.mark.parametrize(
+    ("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)]
+)
+def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(
+    length_px: float, ratio: float
+) -> None:
     # Reference §3, sigma .7: peak relative to the still star's.
     def share(x: float) -> float:
         return float(erf((0.5 - x) / 0.7 / np.sqrt(2)) + erf((0.5 + x) / 0.7 / np.sqrt(2)))
@@ -317,14 +346,17 @@ def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(length_px: floa
     _, still = shot(star_at(31.0, 23.0))
     _, smeared = shot(star_at(31.0, 23.0), turning([0, length_px / 2500, 0]))
     measured = float(smeared.peak_e[0] / still.peak_e[0])
-    assert measured == pytest.approx(exact, rel=2e-3)  # parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends
+    assert measured == pytest.approx(
+        exact, rel=2e-3
+    )  # parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends
     assert measured == pytest.approx(ratio, abs=0.03)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 77.0])
 def test_a_streak_is_the_integral_of_its_moments(angle_deg: float) -> None:
     """Ten thousand still stars along the line, added up."""
-    length_px, steps = 11.3, 10_000
+    length_px = 11.3
+    steps = 10_000
     across = np.array([-np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg)), 0])
     image, _ = shot(star_at(31.5, 23.5), turning(across * length_px / 2500))
     along = length_px * ((np.arange(steps) + 0.5) / steps - 0.5)
@@ -340,7 +372,9 @@ def test_a_streak_is_the_integral_of_its_moments(angle_deg: float) -> None:
 
 @pytest.mark.parametrize("length_px", [0.9, 3.0, 9.0, 21.0])
 @pytest.mark.parametrize("radius_px", [1.0, 2.5, 10.0])
-def test_a_smeared_disk_has_converged(monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float) -> None:
+def test_a_smeared_disk_has_converged(
+    monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float
+) -> None:
     """In pieces of a twentieth the image is no other one."""
     path = turning([0.6 * length_px / 2500, 0.8 * length_px / 2500, 0])
     usual, _ = shot(star_at(31.3, 23.1), path, blurred(0.8, radius_px))
@@ -365,7 +399,8 @@ def test_halving_the_pieces_divides_the_error_by_sixteen(monkeypatch: pytest.Mon
 def test_a_star_that_sweeps_through_from_outside_the_field_is_not_missed() -> None:
     """At 60 deg/s for half a second the star is 15 degrees out at mid-exposure, on the chip at the beginning:
     from the boresight to the left edge, the light of the integral of the cosine."""
-    rate, focal = np.radians(60.0), 25e-3 / 9.9e-6
+    rate = np.radians(60.0)
+    focal = 25e-3 / 9.9e-6
     lens = lens_of(pixel="9.9 um", width_px=659, height_px=493)
     image, seen = draw(light(), Window(0.5, 0.5), turning([0, rate, 0]), lens)
     edge_rad = np.arctan(329.5 / focal)
@@ -380,7 +415,11 @@ def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
     ring = with_sources(stars)
     t = np.linspace(0, 3, 3001)
-    spin = Trajectory(t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1)))
+    spin = Trajectory(
+        t,
+        Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])),
+        np.tile([0, 2 * np.pi, 0], (len(t), 1)),
+    )
     lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7})
     _, seen = draw(ring, Window(1.0, 1.0), spin, lens)
     assert len(seen.id) == len(around)
@@ -394,7 +433,12 @@ def test_an_led_s_electrons_are_those_of_the_reference() -> None:
     # Reference §2: 0.6 cd, 33 in, 35 mm at f/8, T .85, QE .30: 3.1e7 electrons a millisecond.
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2 * 0.85
     lens = lens_of(pupil_m2, pixel="4.2 um", focal_length="35 mm", focus="33 in")
-    source = led_at(0, 0, 33 * 0.0254, strength=[float(led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)))])
+    source = led_at(
+        0,
+        0,
+        33 * 0.0254,
+        strength=[float(led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)))],
+    )
     image, _ = draw(source, Window(0.1, 1e-3), lens=lens)
     assert image.sum() == pytest.approx(3.1e7, rel=0.02)  # two digits
 
@@ -408,7 +452,9 @@ def test_twice_as_far_is_a_quarter_of_the_light_and_half_the_size() -> None:
 
 def test_an_led_off_the_axis_is_dimmed_by_the_fourth_power_of_the_cosine() -> None:
     """Distance squared, emission and incidence under a flat panel: cos^4; off a dome that faces it, one."""
-    lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7}, focus="1 m", f_number=1e3)
+    lens = lens_of(
+        pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7}, focus="1 m", f_number=1e3
+    )
     on_axis, aside = (shot(led_at(x, 0, 1.0, 1e-4), lens=lens)[1].electrons[0] for x in (0.0, 0.2))
     assert aside / on_axis == pytest.approx(np.cos(np.arctan(0.2)) ** 4, rel=1e-6)
 
@@ -416,7 +462,9 @@ def test_an_led_off_the_axis_is_dimmed_by_the_fourth_power_of_the_cosine() -> No
 @pytest.mark.parametrize("duty", [0.35, 0.5, 0.7])
 def test_duty_scales_the_light_of_whole_periods(duty: float) -> None:
     full, dim = (
-        shot(led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]), exposure_s=0.01)[0].sum()
+        shot(led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]), exposure_s=0.01)[
+            0
+        ].sum()
         for d in (1.0, duty)
     )
     assert dim / full == pytest.approx(duty, rel=1e-10)
@@ -440,9 +488,13 @@ def test_a_pulse_marks_where_the_led_was_while_it_shone() -> None:
 def test_parallax_is_that_computed_by_hand(tilt_deg: float) -> None:
     """An LED R above the bearing, a camera h above it: after a tilt of a about y the LED stands at
     (-R sin a, 0, R cos a - h) from the camera."""
-    radius, height, angle = 1.2192, 0.381, np.radians(tilt_deg)
+    radius = 1.2192
+    height = 0.381
+    angle = np.radians(tilt_deg)
     mount = Mount(np.array([0, 0, height]), Rotation.identity())
-    _, seen = shot(led_at(0, 0, radius), turning([0, 0, 0], Rotation.from_rotvec([0, angle, 0])), mount=mount)
+    _, seen = shot(
+        led_at(0, 0, radius), turning([0, 0, 0], Rotation.from_rotvec([0, angle, 0])), mount=mount
+    )
     wanted = 31.5 - 2500 * radius * np.sin(angle) / (radius * np.cos(angle) - height)
     np.testing.assert_allclose(seen.xy_px, [[wanted, 23.5]], rtol=0, atol=1e-9)
 
@@ -459,10 +511,8 @@ def test_a_moving_led_draws_a_dashed_streak() -> None:
     image, seen = shot(pulsed, turning([0, 40 / lens.camera.focal_px, 0]), lens)
     profile = image.sum(axis=0)
     bright = profile > profile.max() / 2
-    begin, end = (
-        np.flatnonzero(np.diff(bright.astype(int)) == 1),
-        np.flatnonzero(np.diff(bright.astype(int)) == -1),
-    )
+    begin = np.flatnonzero(np.diff(bright.astype(int)) == 1)
+    end = np.flatnonzero(np.diff(bright.astype(int)) == -1)
     assert len(begin) == 5
     np.testing.assert_allclose(np.diff(begin), 8, rtol=0, atol=1)
     np.testing.assert_allclose(end - begin, 8 / 3, rtol=0, atol=1)
@@ -484,15 +534,22 @@ def test_a_rolling_shutter_sees_still_light_as_a_global_one_does() -> None:
 
 def test_a_rolling_shutter_shears_what_moves() -> None:
     """Every row sees the star where it is at its own time: the speed times the rows' time, to the left."""
-    speed_px_s, row_time_s = 200.0, 2e-3
-    image, seen = draw(star_at(31.5, 23.5), Window(0.45, 1e-3, row_time_s), turning([0, speed_px_s / 2500, 0]))
+    speed_px_s = 200.0
+    row_time_s = 2e-3
+    image, seen = draw(
+        star_at(31.5, 23.5), Window(0.45, 1e-3, row_time_s), turning([0, speed_px_s / 2500, 0])
+    )
     rows = np.arange(21, 27)
     middle = (image[rows] @ np.arange(64)) / image[rows].sum(axis=1)
     np.testing.assert_allclose(np.diff(middle), -speed_px_s * row_time_s, rtol=0, atol=2e-3)
     when = 0.4505 + 23.5 * row_time_s  # of the row in which it stands
-    np.testing.assert_allclose(seen.flux_xy_px[0, 0], 31.5 - speed_px_s * (when - 0.5), rtol=0, atol=0.02)
+    np.testing.assert_allclose(
+        seen.flux_xy_px[0, 0], 31.5 - speed_px_s * (when - 0.5), rtol=0, atol=0.02
+    )
     middle_s = 0.45 + (1e-3 + 47 * row_time_s) / 2  # of the frame: the truth's own time
-    np.testing.assert_allclose(seen.xy_px[0, 0], 31.5 - speed_px_s * (middle_s - 0.5), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        seen.xy_px[0, 0], 31.5 - speed_px_s * (middle_s - 0.5), rtol=0, atol=1e-4
+    )
 
 
 def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
@@ -502,7 +559,11 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
     pulsed, _ = draw(emitter, window)
     steady, _ = draw(led_at(0, 0, 0.4, 2e-3), window)
     rows = np.flatnonzero(steady.sum(axis=1) > 0.01 * steady.sum(axis=1).max())
-    t = window.open_s + window.row_time_s * rows[:, None] + window.exposure_s * (np.arange(3000) + 0.5) / 3000
+    t = (
+        window.open_s
+        + window.row_time_s * rows[:, None]
+        + window.exposure_s * (np.arange(3000) + 0.5) / 3000
+    )
     lit = ((t - 2.5e-4) % 1e-3 < 4e-4).mean(axis=1)
     assert np.ptp(lit) > 0.2
     shares = pulsed[rows].sum(axis=1) / steady[rows].sum(axis=1)
@@ -520,7 +581,9 @@ def test_jitter_widens_a_star_by_its_own_variance() -> None:
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x
     np.testing.assert_allclose(moments(image)[1], 0.7**2 + 1 / 12 + wide, rtol=2e-3, atol=0)
     assert image.sum() == pytest.approx(1, rel=1e-4)
-    assert seen.streak_px[0] > 40 * 4 * np.sqrt(2 * wide.max())  # four amplitudes a period, at the least
+    assert seen.streak_px[0] > 40 * 4 * np.sqrt(
+        2 * wide.max()
+    )  # four amplitudes a period, at the least
 
 
 def test_a_step_of_the_attitude_draws_two_stars() -> None:
@@ -536,7 +599,9 @@ def test_a_step_of_the_attitude_draws_two_stars() -> None:
 def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
     t = np.linspace(0, 3, 60_000)
     fine = Trajectory(t, Rotation.identity(len(t)), np.zeros((len(t), 3)))
-    with pytest.raises(InputError, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769"):
+    with pytest.raises(
+        InputError, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769"
+    ):
         draw(light(), Window(0.1, 2.0), fine)
 
 
@@ -546,7 +611,9 @@ def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
 def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
     """A sweep of 0.2 rad from pose to pose, five fields wide: every star that is on the chip at any time is kept."""
     rng = np.random.default_rng(8)
-    rays = Rotation.from_rotvec(np.outer(rng.uniform(-1.2, 1.2, 3000), [0, 1, 0])).apply([0.0, 0.0, 1.0])
+    rays = Rotation.from_rotvec(np.outer(rng.uniform(-1.2, 1.2, 3000), [0, 1, 0])).apply(
+        [0.0, 0.0, 1.0]
+    )
     rays = Rotation.from_rotvec(np.outer(rng.uniform(-1.2, 1.2, 3000), [1, 0, 0])).apply(rays)
     stars = light().take(np.zeros(3000, int))
     stars.place[:, :3] = rays
@@ -572,13 +639,20 @@ def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
     rng = np.random.default_rng(5)
     rays = rng.standard_normal((25_000, 3))
     stars = steady_points(
-        np.arange(25_000), rays / np.linalg.norm(rays, axis=1, keepdims=True), np.ones(25_000), np.zeros(25_000)
+        np.arange(25_000),
+        rays / np.linalg.norm(rays, axis=1, keepdims=True),
+        np.ones(25_000),
+        np.zeros(25_000),
     )
     turns = Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()
     poses = rendering.Poses(turns, np.zeros((len(angles), 3)))
     tested = []
     in_cone = rendering._in_cone
-    monkeypatch.setattr(rendering, "_in_cone", lambda place, *more: tested.append(len(place)) or in_cone(place, *more))
+    monkeypatch.setattr(
+        rendering,
+        "_in_cone",
+        lambda place, *more: tested.append(len(place)) or in_cone(place, *more),
+    )
     rows = rendering.in_view(stars, LENS, poses)
     monkeypatch.setattr(rendering, "MIN_BAND_STARS", 10**9)
     assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
@@ -593,18 +667,24 @@ def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
     x0, x1, y0, y1 = rendering.patches(xy[:, None], np.array([3.0]), (300, 300))[0]
     assert max(x0, y0) <= 150 - 100 - 3
     assert min(x1, y1) > 150 + 100 + 3
-    assert x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4  # and no more than a quarter of a chord of 77 px wider
+    assert (
+        x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4
+    )  # and no more than a quarter of a chord of 77 px wider
 
 
 def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() -> None:
     """A cubic through four samples is the path itself if that is cubic, in the first and last interval too."""
 
     def path(t: Any) -> Any:
-        return np.stack([30 + 4 * t - 2 * t**2 + t**3, 20 - 3 * t + t**2 - 0.5 * t**3, 100 + t**3], axis=-1)
+        return np.stack(
+            [30 + 4 * t - 2 * t**2 + t**3, 20 - 3 * t + t**2 - 0.5 * t**3, 100 + t**3], axis=-1
+        )
 
     t_s = np.linspace(0.0, 4.0, 9)
     samples = path(t_s)[:, None]
-    tracks = rendering.Tracks(0.0, 0.5, samples[:, :, :2].copy(), samples[:, :, 2].copy(), np.ones((1, 3)))
+    tracks = rendering.Tracks(
+        0.0, 0.5, samples[:, :, :2].copy(), samples[:, :, 2].copy(), np.ones((1, 3))
+    )
     times = np.linspace(0.0, 4.0, 33)
     found = np.array([rendering._interpolate(tracks, 0, t) for t in times])
     np.testing.assert_allclose(found, path(times), rtol=0, atol=1e-11)
@@ -614,7 +694,9 @@ def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() ->
 
 
 @pytest.mark.parametrize(("focus", "radius_px"), [("33 in", 0.0), ("infinity", None)])
-def test_an_led_out_of_focus_is_blurred_by_the_circle_of_confusion(focus: str, radius_px: float | None) -> None:
+def test_an_led_out_of_focus_is_blurred_by_the_circle_of_confusion(
+    focus: str, radius_px: float | None
+) -> None:
     """A (v - f) / v of a lens focused at infinity; variances of disks, a quarter of the radii squared, add."""
     lens = lens_of(pixel="40 um", focal_length="35 mm", focus=focus)
     image, _ = shot(led_at(0, 0, 33 * 0.0254, 1e-3), lens=lens)
@@ -637,7 +719,9 @@ def test_blur_grows_to_its_value_in_the_corner() -> None:
 
 
 def test_vignetting_dims_a_star_and_an_led_alike() -> None:
-    lens = lens_of(pixel="250 um", vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]})
+    lens = lens_of(
+        pixel="250 um", vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]}
+    )
     plain = lens_of(pixel="250 um")
     for source in (star_at(41.5, 23.5, lens=plain), led_at(0.1, 0, 1.0, 1e-5)):
         ratio = shot(source, lens=lens)[1].electrons[0] / shot(source, lens=plain)[1].electrons[0]
@@ -648,7 +732,9 @@ def test_a_lobe_dims_an_led_seen_aslant() -> None:
     source = led_at(0.2, 0, 1.0, 1e-5)
     lens = lens_of(pixel="250 um")
     lambert, narrow = (
-        draw(source, Window(0.1, 0.1), lens=lens, emitter=Emitter(lobe=CosineLobeConfig(exponent=n)))[1].electrons[0]
+        draw(
+            source, Window(0.1, 0.1), lens=lens, emitter=Emitter(lobe=CosineLobeConfig(exponent=n))
+        )[1].electrons[0]
         for n in (1.0, 7.0)
     )
     assert narrow / lambert == pytest.approx(np.cos(np.arctan(0.2)) ** 6, rel=1e-6)
@@ -672,16 +758,20 @@ def test_the_brightest_pixel_is_where_the_star_is() -> None:
 # Centroids of what was rendered and exposed follow the Cramer-Rao bound
 
 
-def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_noise_e: float) -> Floats:
+def fitted(
+    frames: Floats, x_px: float, y_px: float, electrons: float, read_noise_e: float
+) -> Floats:
     """(K, 2) maximum-likelihood places of K stars of unknown flux: Fisher's scoring from the truth."""
     grid = np.arange(frames.shape[1])
-    flux, x, y = np.full(len(frames), electrons), np.full(len(frames), x_px), np.full(len(frames), y_px)
+    flux = np.full(len(frames), electrons)
+    x = np.full(len(frames), x_px)
+    y = np.full(len(frames), y_px)
 
     def edge(at: Floats) -> tuple[Floats, Floats]:
         u = (grid[:, None] + np.array([-0.5, 0.5]) - at[:, None, None]) / 0.7
-        return np.diff(erf(u / np.sqrt(2)))[..., 0] / 2, -np.diff(np.exp(-(u**2) / 2))[..., 0] / 0.7 / np.sqrt(
-            2 * np.pi
-        )
+        return np.diff(erf(u / np.sqrt(2)))[..., 0] / 2, -np.diff(np.exp(-(u**2) / 2))[
+            ..., 0
+        ] / 0.7 / np.sqrt(2 * np.pi)
 
     for _ in range(12):
         (px, dx), (py, dy) = edge(x), edge(y)
@@ -693,7 +783,9 @@ def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_nois
         fisher = np.einsum("kaij,kbij,kij->kab", slopes, slopes, weight)
         score = np.einsum("kaij,kij,kij->ka", slopes, frames - model, weight)
         step = np.linalg.solve(fisher, score[..., None])[..., 0]
-        flux, x, y = flux + step[:, 0], x + np.clip(step[:, 1], -0.3, 0.3), y + np.clip(step[:, 2], -0.3, 0.3)
+        flux = flux + step[:, 0]
+        x = x + np.clip(step[:, 1], -0.3, 0.3)
+        y = y + np.clip(step[:, 2], -0.3, 0.3)
     return np.column_stack([x, y])
 
 
@@ -706,9 +798,12 @@ def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_nois
         (50, 1e3, 0.148), (50, 3e3, 0.051), (50, 1e4, 0.017), (50, 1e5, 0.0031),
     ],
 )  # fmt: skip
-def test_centroids_follow_the_cramer_rao_bound(read_noise_e: float, electrons: float, bound_px: float) -> None:
+def test_centroids_follow_the_cramer_rao_bound(
+    read_noise_e: float, electrons: float, bound_px: float
+) -> None:
     """Reference §3, sigma .7: within a tenth, 600 stars at 30 places within a pixel, through optics and detector."""
-    rng, errors = np.random.default_rng(int(electrons + read_noise_e)), []
+    rng = np.random.default_rng(int(electrons + read_noise_e))
+    errors = []
     detector = Detector.from_camera(
         lens_of(
             width_px=16, height_px=16,
@@ -719,8 +814,13 @@ def test_centroids_follow_the_cramer_rao_bound(read_noise_e: float, electrons: f
     lens = lens_of(width_px=16, height_px=16)
     for x, y in rng.uniform(7, 8, (30, 2)):
         image, _ = shot(star_at(x, y, electrons, lens), lens=lens)
-        frames = np.array([expose(image.astype(np.float32), 1.0, detector, rng) for _ in range(20)]) - 500.0
-        errors.append(fitted(frames, x, y, electrons, np.hypot(read_noise_e, np.sqrt(1 / 12))) - [x, y])
+        frames = (
+            np.array([expose(image.astype(np.float32), 1.0, detector, rng) for _ in range(20)])
+            - 500.0
+        )
+        errors.append(
+            fitted(frames, x, y, electrons, np.hypot(read_noise_e, np.sqrt(1 / 12))) - [x, y]
+        )
     assert np.std(np.concatenate(errors)) == pytest.approx(bound_px, rel=0.1)
 
 
@@ -734,7 +834,9 @@ def test_a_star_of_magnitude_zero_gives_liebe_s_electrons() -> None:
     assert image.sum() == pytest.approx(19_100, rel=2e-3)
 
 
-@pytest.mark.parametrize(("v_mag", "electrons"), [(4.0, 6008), (5.0, 2392), (5.4, 1655), (6.0, 952)])
+@pytest.mark.parametrize(
+    ("v_mag", "electrons"), [(4.0, 6008), (5.0, 2392), (5.4, 1655), (6.0, 952)]
+)
 def test_reference_electrons_of_stars_in_the_ec655(v_mag: float, electrons: float) -> None:
     # Reference §2: f/1.4, 50 ms, Liebe's rate.
     camera = loader.load("shefex2", {"camera.detector.quantum_efficiency": "0.40"}).camera

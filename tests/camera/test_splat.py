@@ -23,7 +23,8 @@ CAMERA = CameraConfig.model_validate(
         "detector": {"quantum_efficiency": 0.4, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
     }
 )
-SIZE, MIDDLE = 61, 30
+SIZE = 61
+MIDDLE = 30
 PLACES = np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)) + MIDDLE
 
 
@@ -31,7 +32,9 @@ def gaussian(sigma_px: float) -> Psf:
     return GaussianPsfConfig(sigma_px=sigma_px)
 
 
-def draw(image: Kernel, x: float, y: float, rows: tuple[int, int] = (0, SIZE), electrons: float = 1.0) -> Floats:
+def draw(
+    image: Kernel, x: float, y: float, rows: tuple[int, int] = (0, SIZE), electrons: float = 1.0
+) -> Floats:
     patch = np.zeros((SIZE, SIZE))
     add_kernel(patch, *rows, float(x), float(y), electrons, image)
     return patch
@@ -60,7 +63,9 @@ every_kernel = pytest.mark.parametrize("image", KERNELS.values(), ids=KERNELS)
 
 
 def test_the_kernels_are_of_every_kind() -> None:
-    shapes = [(k.radial.shape[1] if len(k.radial) else 0, len(k.grid) > 0) for k in KERNELS.values()]
+    shapes = [
+        (k.radial.shape[1] if len(k.radial) else 0, len(k.grid) > 0) for k in KERNELS.values()
+    ]
     assert shapes == [(0, False), (3, False), (5, False), (7, False), (0, True)]
 
 
@@ -77,7 +82,10 @@ def test_the_image_stands_where_it_is_told_to(image: Kernel) -> None:
     for x, y in PLACES:
         patch = draw(image, x, y)
         np.testing.assert_allclose(
-            [(patch @ index).sum(), (index @ patch).sum()], [x, y], rtol=0, atol=2e-3 + 1e-5 * MIDDLE
+            [(patch @ index).sum(), (index @ patch).sum()],
+            [x, y],
+            rtol=0,
+            atol=2e-3 + 1e-5 * MIDDLE,
         )
 
 
@@ -102,12 +110,16 @@ def test_mirrored_places_give_mirrored_images(image: Kernel) -> None:
 
 
 @every_kernel
-@pytest.mark.parametrize("place", [(-3.3, 20.2), (20.2, -3.3), (62.7, 61.4), (0.0, 0.0), (-1e6, 5.0), (5.0, 1e6)])
+@pytest.mark.parametrize(
+    "place", [(-3.3, 20.2), (20.2, -3.3), (62.7, 61.4), (0.0, 0.0), (-1e6, 5.0), (5.0, 1e6)]
+)
 def test_what_is_beyond_the_patch_is_left_out(image: Kernel, place: tuple[float, float]) -> None:
     x, y = place
     wide = np.zeros((SIZE + 80, SIZE + 80))
     add_kernel(wide, 0, len(wide), x + 40, y + 40, 1.0, image)
-    np.testing.assert_allclose(draw(image, x, y), wide[40:-40, 40:-40], rtol=0, atol=1e-6 * KERNELS["grid"].grid.max())
+    np.testing.assert_allclose(
+        draw(image, x, y), wide[40:-40, 40:-40], rtol=0, atol=1e-6 * KERNELS["grid"].grid.max()
+    )
 
 
 @every_kernel
@@ -129,7 +141,9 @@ def test_the_reach_holds_all_of_the_image(image: Kernel) -> None:
 def test_a_point_through_a_gaussian_lens_is_exact(sigma_px: float) -> None:
     image = build_kernel(gaussian(sigma_px), CAMERA)
     for x, y in PLACES:
-        np.testing.assert_allclose(draw(image, x, y), exact_gaussian(x, y, sigma_px), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            draw(image, x, y), exact_gaussian(x, y, sigma_px), rtol=0, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("sigma_px", [0.35, 0.5, 0.7, 1.0, 2.0])
@@ -142,7 +156,9 @@ def test_tables_give_the_error_function_s_image(make: object, sigma_px: float) -
         np.testing.assert_allclose(draw(image, x, y), wanted, rtol=0, atol=1e-4 * wanted.max())
 
 
-@pytest.mark.parametrize(("sigma_px", "radius_px"), [(0.8, 0.0), (0.8, 6.0), (2.0, 6.0), (0.7, 1.5), (1.5, 12.0)])
+@pytest.mark.parametrize(
+    ("sigma_px", "radius_px"), [(0.8, 0.0), (0.8, 6.0), (2.0, 6.0), (0.7, 1.5), (1.5, 12.0)]
+)
 def test_variances_of_lens_disk_and_pixel_add_up(sigma_px: float, radius_px: float) -> None:
     """sigma^2 + a^2 / 4 + 1 / 12 along each axis; the cut at 5 sigma takes 1e-4 of sigma^2."""
     image = build_kernel(gaussian(sigma_px), CAMERA, 0, radius_px)

@@ -38,22 +38,36 @@ CAMERA = {
 
 def test_glow_of_a_uniform_sphere() -> None:
     """Radiance rho E / pi with E = P / (A (1 - rho)), and the cos^4 law; wherever the camera is and looks."""
-    wall, share, count = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 2.0)), 0.6, 30
+    wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 2.0))
+    share = 0.6
+    count = 30
     place = wall.meet(np.zeros(3), spiral(count))
     ones = np.ones(count)
     rows = np.arange(count)
     leds = Sources(
-        rows, np.column_stack([place, ones]), wall.inward(place), ones, ones, ones, 0 * ones, ones, rows, ones
+        rows,
+        np.column_stack([place, ones]),
+        wall.inward(place),
+        ones,
+        ones,
+        ones,
+        0 * ones,
+        ones,
+        rows,
+        ones,
     )
     config = ReflectionConfig(diffuse=share)
     dome = ReflectingDome(config, wall, diffuse_light(config, wall, leds, CosineLobeConfig()))
     optics = Optics.from_camera(CameraConfig.model_validate(CAMERA))
-    turned, camera_m = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]), np.array([0.3, -0.5, 0.2])
+    turned = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
+    camera_m = np.array([0.3, -0.5, 0.2])
     glow = wall_glow(dome, optics, turned, camera_m, Band.from_efficiency(0.5))
     xy_px, shape = nodes_px(optics.camera)
     radius = np.linalg.norm(xy_px - optics.camera.center_px, axis=1) / optics.camera.focal_px
     radiance = share * count * math.pi / (16 * math.pi) / (1 - share) / math.pi
-    expected = radiance * optics.collecting_m2 * np.cos(np.arctan(radius)) ** 4 / optics.camera.focal_px**2
+    expected = (
+        radiance * optics.collecting_m2 * np.cos(np.arctan(radius)) ** 4 / optics.camera.focal_px**2
+    )
     np.testing.assert_allclose(glow, expected.reshape(shape), rtol=1e-4)
 
 
@@ -68,13 +82,17 @@ DEEP = {
 @pytest.mark.slow
 def test_reflections_are_in_the_frame_and_its_truth() -> None:
     """A deep dome: what the wall mirrors is drawn where its truth says, and nothing else changes."""
-    black, _ = frame("apl_dome", {key: value for key, value in DEEP.items() if key != "light.reflection"})
+    black, _ = frame(
+        "apl_dome", {key: value for key, value in DEEP.items() if key != "light.reflection"}
+    )
     shiny, truth = frame("apl_dome", DEEP)
     gained = shiny.image_dn - black.image_dn
     lights = truth.sources
     false = lights.id > MIRRORED
     assert false.sum() >= 5
-    assert set(lights.id[false] % MIRRORED) <= set(build_lab(loader.load("apl_dome", DEEP)).camera.sources.id)
+    assert set(lights.id[false] % MIRRORED) <= set(
+        build_lab(loader.load("apl_dome", DEEP)).camera.sources.id
+    )
     gain = loader.load("apl_dome").camera.detector.gain_e_dn
     assert gained.sum() * gain == pytest.approx(lights.electrons[false].sum(), rel=2e-3)
     for n in np.flatnonzero(false):
@@ -98,9 +116,11 @@ def test_ghosts_are_mirrored_through_the_axis(magnification: float) -> None:
     ghost = f"[{{magnification: {magnification}, share: {share}, radius_px: 6}}]"
     clear, _ = frame("shefex2", SKY)
     haunted, truth = frame("shefex2", SKY | {"camera.ghosts": ghost})
-    lights, camera = truth.sources, loader.load("shefex2").camera
+    lights = truth.sources
+    camera = loader.load("shefex2").camera
     is_ghost = lights.id > GHOST
-    center, size = np.array(camera.center_px), np.array([camera.width_px, camera.height_px])
+    center = np.array(camera.center_px)
+    size = np.array([camera.width_px, camera.height_px])
     own = {int(id): n for n, id in enumerate(lights.id[~is_ghost])}
     inside = np.all((lights.xy_px > 15) & (lights.xy_px < size - 15), axis=1)
     checked = 0
@@ -135,18 +155,23 @@ def test_glare_leaves_uniform_light_uniform() -> None:
     np.testing.assert_allclose(light, 7.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("config", [GLARE, GlareConfig(share=0.02, exponent=2.4, core_px=9.0)], ids=["steep", "flat"])
+@pytest.mark.parametrize(
+    "config", [GLARE, GlareConfig(share=0.02, exponent=2.4, core_px=9.0)], ids=["steep", "flat"]
+)
 def test_glare_of_a_point(config: GlareConfig) -> None:
     """The share left in the image, and the law of the power around it, with the mirrored field beside the chip."""
     side = block_px((256, 320), config.core_px)
-    light, (x, y) = np.zeros((256, 320)), np.array([140, 130]) + (side - 1) / 2
+    light = np.zeros((256, 320))
+    (x, y) = np.array([140, 130]) + (side - 1) / 2
     light[130 : 130 + side, 140 : 140 + side] = 1 / side**2
     add_glare(light, config)
     assert light[130, 140] == pytest.approx((1 - config.share) / side**2, rel=1e-3)
 
     def law(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
         shape = (1 + (dx**2 + dy**2) / config.core_px**2) ** (-config.exponent / 2)
-        return np.asarray(config.share * (config.exponent - 2) / (2 * math.pi * config.core_px**2) * shape)
+        return np.asarray(
+            config.share * (config.exponent - 2) / (2 * math.pi * config.core_px**2) * shape
+        )
 
     places = np.arange(-60, 61)
     mirrored_x = np.concatenate([640 * places + x, 640 * places - 1 - x])

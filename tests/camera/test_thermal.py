@@ -30,7 +30,16 @@ def config(temperature: dict[str, Any], **rest: Any) -> ThermalConfig:
     [
         ({"kind": "steady", "temperature_c": 23.0}, 23.0),
         (LINEAR, 23.0),
-        ({"kind": "sine", "mean_c": 20.0, "amplitude_c": 4.0, "period": "9 h", "phase_deg": 30.0}, 24.0),
+        (
+            {
+                "kind": "sine",
+                "mean_c": 20.0,
+                "amplitude_c": 4.0,
+                "period": "9 h",
+                "phase_deg": 30.0,
+            },
+            24.0,
+        ),
         ({"kind": "table", "hours": [0.0, 1.0, 2.0], "temperature_c": [20.0, 22.0, 26.0]}, 24.0),
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
@@ -38,7 +47,9 @@ def config(temperature: dict[str, Any], **rest: Any) -> ThermalConfig:
 def test_temperature_after_an_hour_and_a_half(history: dict[str, Any], expected_c: float) -> None:
     """And with a history three times as fast, after half an hour."""
     assert temperature_c(config(history), 5400.0) == pytest.approx(expected_c, abs=1e-12)
-    assert temperature_c(config(history, speed=3.0, **MOUNT), 1800.0) == pytest.approx(expected_c, abs=1e-12)
+    assert temperature_c(config(history, speed=3.0, **MOUNT), 1800.0) == pytest.approx(
+        expected_c, abs=1e-12
+    )
 
 
 def test_table_is_constant_beyond_its_ends() -> None:
@@ -54,7 +65,9 @@ def leds_and_stars() -> Sources:
     ones = np.ones(3)
     place = np.array([[0.3, -0.2, 1.1, 1.0], [0.0, 0.0, 1.2, 1.0], [0.0, 0.0, 1.0, 0.0]])
     rows = np.arange(3)
-    return Sources(rows, place, np.tile([0.0, 0, -1], (3, 1)), ones, ones, ones, ones, ones, rows, ones)
+    return Sources(
+        rows, place, np.tile([0.0, 0, -1], (3, 1)), ones, ones, ones, ones, ones, rows, ones
+    )
 
 
 def test_dome_expands_from_its_anchor() -> None:
@@ -62,7 +75,8 @@ def test_dome_expands_from_its_anchor() -> None:
     told = config(LINEAR, dome_ppm_k=70.0, anchor_height="0.9 m", creep=["0 m", "0 m", "-1 mm"])
     before = leds_and_stars()
     after = leds_at(told, before, 2 * 3600.0)
-    anchor, strain = np.array([0.0, 0.0, 0.9]), 70e-6 * 4.0
+    anchor = np.array([0.0, 0.0, 0.9])
+    strain = 70e-6 * 4.0
     expected = anchor + (1 + strain) * (before.place[:2, :3] - anchor) + [0.0, 0.0, -1e-3]
     np.testing.assert_allclose(after.place[:2, :3], expected, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(after.place[2], before.place[2])

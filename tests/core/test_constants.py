@@ -95,7 +95,9 @@ def test_the_suns_magnitude_follows_from_its_luminosity() -> None:
 def test_a_constant_is_defined_once(package: str) -> None:
     own = [ROOT / package / name for name in OWN_FILES[package]]
     others = [path for path in sorted((ROOT / package).rglob("*.py")) if path not in own]
-    known = numbers_of(constants) | numbers_of(time) if package == "skysim" else numbers_of(believed)
+    known = (
+        numbers_of(constants) | numbers_of(time) if package == "skysim" else numbers_of(believed)
+    )
     assert len(others) > 80
     assert [again for path in others for again in defined_again(path, known)] == []
 
@@ -128,7 +130,11 @@ def test_a_second_definition_is_found(text: str, tmp_path: Path) -> None:
 def numbers_of(module: ModuleType) -> dict[str, float]:
     """The numbers that a module defines, by name."""
     values = vars(module).items()
-    return {name: float(value) for name, value in values if name.isupper() and isinstance(value, int | float)}
+    return {
+        name: float(value)
+        for name, value in values
+        if name.isupper() and isinstance(value, int | float)
+    }
 
 
 def digits(value: float) -> str:
@@ -159,7 +165,9 @@ def number_of(node: ast.AST) -> float | None:
     if not names <= {"math", "np", "erfa"}:
         return None
     try:
-        return float(eval(compile(ast.Expression(node), "", "eval"), {"math": math, "np": np, "erfa": erfa}))
+        return float(
+            eval(compile(ast.Expression(node), "", "eval"), {"math": math, "np": np, "erfa": erfa})
+        )
     except (ArithmeticError, AttributeError, TypeError, ValueError):
         return None
 

@@ -16,8 +16,19 @@ from estimator.core.errors import ImageError
 from skysim.core.errors import OVERRIDES, InputError, Where, unknown_name
 
 ROOT = Path(__file__).parents[2]
-COUNT = InputError("light.layout.count", "-3 is negative", "1 to 100,000", Where("scenes/x.yaml", 31))
-READS_TEXT = {"split", "partition", "rpartition", "startswith", "endswith", "removeprefix", "removesuffix", "replace"}
+COUNT = InputError(
+    "light.layout.count", "-3 is negative", "1 to 100,000", Where("scenes/x.yaml", 31)
+)
+READS_TEXT = {
+    "split",
+    "partition",
+    "rpartition",
+    "startswith",
+    "endswith",
+    "removeprefix",
+    "removesuffix",
+    "replace",
+}
 COMMAND_LINE = re.compile(r"(?<![\w-])--[a-z]|skysim \w+ ")
 
 
@@ -34,19 +45,30 @@ def test_message_is_one_printable_line(error: Callable[[str], Exception], quoted
 def test_every_part_is_printable(quoted: str) -> None:
     error = InputError(quoted, quoted, quoted, Where(quoted, 3))
     assert str(error).isprintable()
-    assert all(part.isprintable() for part in (error.key, error.problem, error.allowed, str(error.where)))
+    assert all(
+        part.isprintable() for part in (error.key, error.problem, error.allowed, str(error.where))
+    )
 
 
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        (COUNT, "light.layout.count: -3 is negative; allowed: 1 to 100,000 (scenes/x.yaml, line 31)"),
+        (
+            COUNT,
+            "light.layout.count: -3 is negative; allowed: 1 to 100,000 (scenes/x.yaml, line 31)",
+        ),
         (InputError("seed", "missing"), "seed: missing"),
         (InputError("seed", "", "0 or more"), "seed: allowed: 0 or more"),
         (InputError("", "no frame has been rendered"), "no frame has been rendered"),
-        (InputError("seed", "-1", "0 or more", OVERRIDES), "seed: -1; allowed: 0 or more (overrides)"),
+        (
+            InputError("seed", "-1", "0 or more", OVERRIDES),
+            "seed: -1; allowed: 0 or more (overrides)",
+        ),
         (InputError("schema", "missing", where=Where("x.yaml")), "schema: missing (x.yaml)"),
-        (InputError("a.csv", "3 numbers", 4, Where("a.csv", 7)), "a.csv, line 7: 3 numbers; allowed: 4"),
+        (
+            InputError("a.csv", "3 numbers", 4, Where("a.csv", 7)),
+            "a.csv, line 7: 3 numbers; allowed: 4",
+        ),
         (InputError(Path("a.csv"), "bad", "", Where(Path("a.csv"), 7, "row")), "a.csv, row 7: bad"),
         (InputError("a.csv", "empty", "a table", Where("a.csv")), "a.csv: empty; allowed: a table"),
     ],
@@ -64,9 +86,15 @@ def parts(error: InputError) -> tuple[str, str, str, Where | None]:
     return error.key, error.problem, error.allowed, error.where
 
 
-@pytest.mark.parametrize("twin", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))])
-@pytest.mark.parametrize("error", [COUNT, InputError("", "none"), InputError("a", "b", "c", OVERRIDES)])
-def test_a_copy_has_the_same_parts(twin: Callable[[InputError], InputError], error: InputError) -> None:
+@pytest.mark.parametrize(
+    "twin", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))]
+)
+@pytest.mark.parametrize(
+    "error", [COUNT, InputError("", "none"), InputError("a", "b", "c", OVERRIDES)]
+)
+def test_a_copy_has_the_same_parts(
+    twin: Callable[[InputError], InputError], error: InputError
+) -> None:
     other = twin(error)
     assert other is not error
     assert parts(other) == parts(error)
@@ -91,7 +119,12 @@ def test_under_a_section_the_key_is_longer() -> None:
 
 def test_within_a_key_that_names_it_a_file_begins_the_problem() -> None:
     table = InputError("a.csv", "3 numbers", "4", Where("a.csv", 7))
-    assert parts(table.within("light.file")) == ("light.file", "a.csv, line 7: 3 numbers", "4", None)
+    assert parts(table.within("light.file")) == (
+        "light.file",
+        "a.csv, line 7: 3 numbers",
+        "4",
+        None,
+    )
     assert str(table.within("light.file").at(Where("x.yaml", 2))) == (
         "light.file: a.csv, line 7: 3 numbers; allowed: 4 (x.yaml, line 2)"
     )
@@ -119,7 +152,10 @@ def modules(folder: str) -> Iterator[tuple[Path, ast.Module, str]]:
 def made_errors(tree: ast.AST) -> Iterator[ast.Call]:
     """Calls of InputError."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) == "InputError":
+        if (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "id", getattr(node.func, "attr", "")) == "InputError"
+        ):
             yield node
 
 
@@ -142,7 +178,10 @@ def test_no_error_but_those_of_the_command_line_speaks_of_it() -> None:
         f"{path}:{node.lineno}"
         for path, tree, text in modules("skysim")
         if path.parts[1:3] not in (("apps", "cli"), ("apps", "stream"))
-        for node in [*made_errors(tree), *(one for one in ast.walk(tree) if isinstance(one, ast.Raise))]
+        for node in [
+            *made_errors(tree),
+            *(one for one in ast.walk(tree) if isinstance(one, ast.Raise)),
+        ]
         if COMMAND_LINE.search(ast.get_source_segment(text, node) or "")
     ]
     assert not found
@@ -151,7 +190,12 @@ def test_no_error_but_those_of_the_command_line_speaks_of_it() -> None:
 def catchers(tree: ast.AST) -> Iterator[ast.ExceptHandler]:
     """Handlers of InputError that name it."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.ExceptHandler) and node.type and node.name and mentions(node.type, "InputError"):
+        if (
+            isinstance(node, ast.ExceptHandler)
+            and node.type
+            and node.name
+            and mentions(node.type, "InputError")
+        ):
             yield node
 
 
@@ -163,11 +207,17 @@ def reads_text(node: ast.AST, error: str) -> bool:
         return False
     if isinstance(node.func, ast.Name):
         return (
-            node.func.id == "InputError" and isinstance(node.args[0], ast.JoinedStr) and mentions(node.args[0], error)
+            node.func.id == "InputError"
+            and isinstance(node.args[0], ast.JoinedStr)
+            and mentions(node.args[0], error)
         )
     if mentions(node.func.value, "re"):
         return any(mentions(one, error) for one in node.args)
-    return node.func.attr in READS_TEXT and mentions(node.func.value, "str") and mentions(node.func.value, error)
+    return (
+        node.func.attr in READS_TEXT
+        and mentions(node.func.value, "str")
+        and mentions(node.func.value, error)
+    )
 
 
 def test_no_handler_reads_the_text_of_an_error() -> None:

@@ -68,7 +68,11 @@ def complaint(path: Path) -> str:
 
 
 def test_a_frame_is_three_files_and_nothing_else(written: Path) -> None:
-    assert {p.name for p in written.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
+    assert {p.name for p in written.iterdir()} == {
+        "frame_0000.fits",
+        "frame_0000.png",
+        "frame_0000.ecsv",
+    }
 
 
 @pytest.mark.parametrize("suffix", ["fits", "png"])
@@ -87,7 +91,9 @@ def test_every_16_bit_value_survives_png_and_fits(tmp_path: Path, sky: Shot) -> 
 
 
 @pytest.mark.slow
-def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(tmp_path: Path, dome: Shot) -> None:
+def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(
+    tmp_path: Path, dome: Shot
+) -> None:
     loaded, frame, truth = dome
     frames.write_frame(tmp_path, frame, truth, loaded)
     np.testing.assert_array_equal(images.read_image(tmp_path / "frame_0000.fits"), frame.image_dn)
@@ -132,7 +138,8 @@ def test_a_fits_file_is_standard(written: Path) -> None:
 
 
 def test_truth_comes_back(sky: Shot, written: Path) -> None:
-    truth, seen = sky[2], sky[2].sources
+    truth = sky[2]
+    seen = sky[2].sources
     table = Table.read(written / "frame_0000.ecsv", format="ascii.ecsv")
     np.testing.assert_array_equal(table["id"], seen.id)
     columns = {
@@ -150,13 +157,19 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
     assert table["saturated"].dtype == bool
     np.testing.assert_array_equal(table["saturated"], seen.saturated)
     for name, values in columns.items():
-        np.testing.assert_allclose(table[name], values, rtol=1e-8, atol=0)  # nine digits are written
+        np.testing.assert_allclose(
+            table[name], values, rtol=1e-8, atol=0
+        )  # nine digits are written
     back = Rotation.from_quat(table.meta["cam_from_lab_xyzw"])
     assert (back * truth.cam_from_lab.inv()).magnitude() < 1e-15
     back = Rotation.from_quat(table.meta["lab_from_body_xyzw"])
     assert (back * truth.lab_from_body.inv()).magnitude() < 1e-15
     np.testing.assert_array_equal(table.meta["rate_cam_rad_s"], truth.rate_cam_rad_s)
-    assert (table.meta["scene"], table.meta["seed"], table.meta["t_mid_s"]) == ("shefex2", 2, truth.t_s)
+    assert (table.meta["scene"], table.meta["seed"], table.meta["t_mid_s"]) == (
+        "shefex2",
+        2,
+        truth.t_s,
+    )
 
 
 def test_bodies_come_back_by_name(sky: Shot, tmp_path: Path) -> None:
@@ -201,7 +214,9 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
     ids=["orion", "through RA 0", "near the pole", "off-center lens", "focused nearby"],
 )
 @pytest.mark.filterwarnings("ignore:.*datfix")
-def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointing: dict[str, str]) -> None:
+def test_astropy_puts_the_true_stars_on_their_true_pixels(
+    tmp_path: Path, pointing: dict[str, str]
+) -> None:
     """Directions from the scene's own sources, pixels by astropy's WCS of the header alone."""
     loaded = loader.load("shefex2", {k.replace("__", "."): v for k, v in pointing.items()})
     flight = simulate_motion(loaded)
@@ -219,7 +234,9 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointi
 @pytest.mark.slow
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
     frames.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
-    assert not [key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))]
+    assert not [
+        key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))
+    ]
 
 
 # Nothing half-written
@@ -247,13 +264,16 @@ def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
 
 def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded in this format"
+        InputError,
+        match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded in this format",
     ):
         files.write_image(tmp_path / "x.png", np.zeros((4, 4, 2), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupt_leaves_the_old_folder_or_the_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_leaves_the_old_folder_or_the_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(folder: Path, **_: object) -> None:
         next(Path(folder).iterdir()).unlink()
         raise KeyboardInterrupt
@@ -300,7 +320,9 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) ->
     }
     for other in others:
         (tmp_path / other).write_text("mine")
-    ours_before = tmp_path / name.replace(f"-{pid}.", f"-{os.getpid()}.")  # of an earlier process by our number
+    ours_before = tmp_path / name.replace(
+        f"-{pid}.", f"-{os.getpid()}."
+    )  # of an earlier process by our number
     ours_before.write_text("half")
     with files.atomic_file(tmp_path / "truth.ecsv") as temporary:
         temporary.write_text("whole")
@@ -319,7 +341,9 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.0044, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("suffix", ["fits", "png"])
-def test_a_truncated_frame_is_one_line(written: Path, tmp_path: Path, suffix: str, share: float) -> None:
+def test_a_truncated_frame_is_one_line(
+    written: Path, tmp_path: Path, suffix: str, share: float
+) -> None:
     data = (written / f"frame_0000.{suffix}").read_bytes()
     path = tmp_path / f"cut.{suffix}"
     path.write_bytes(data[: int(share * len(data))])
@@ -335,12 +359,16 @@ def test_other_truncated_pictures_are_one_line(tmp_path: Path, suffix: str) -> N
     assert "truncated" in complaint(tmp_path / f"cut.{suffix}")
 
 
-@pytest.mark.parametrize(("at", "told"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"])
+@pytest.mark.parametrize(
+    ("at", "told"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"]
+)
 def test_a_png_that_tells_of_more_than_it_holds_is_not_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, told: int
 ) -> None:
     """A chunk's length stands after IHDR, the height in it; OpenCV would take the memory for both."""
-    data = bytearray(cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8))[1])
+    data = bytearray(
+        cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8))[1]
+    )
     data[at : at + 4] = told.to_bytes(4, "big")
     (tmp_path / "much.png").write_bytes(data)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
@@ -379,7 +407,9 @@ def test_the_image_of_an_extension_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", [*range(40), 172])
 @pytest.mark.filterwarnings("error")
-def test_a_few_flipped_bytes_give_an_image_or_one_line(written: Path, tmp_path: Path, seed: int) -> None:
+def test_a_few_flipped_bytes_give_an_image_or_one_line(
+    written: Path, tmp_path: Path, seed: int
+) -> None:
     """Whatever the damage to a header: no other exception, no warning. A lie that is valid FITS stays one."""
     rng = np.random.default_rng(seed)
     data = bytearray((written / "frame_0000.fits").read_bytes())
@@ -406,7 +436,9 @@ def test_color_becomes_luminance_and_monochrome_stays() -> None:
     np.testing.assert_array_equal(images.monochrome(np.dstack([gray] * 4)), gray)
     blue_green_red = np.full((2, 2, 3), (10.0, 20.0, 30.0), np.float32)
     # ITU-R BT.601: .299 R + .587 G + .114 B.
-    np.testing.assert_allclose(images.monochrome(blue_green_red), 0.299 * 30 + 0.587 * 20 + 1.14, rtol=1e-6)
+    np.testing.assert_allclose(
+        images.monochrome(blue_green_red), 0.299 * 30 + 0.587 * 20 + 1.14, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("shape", [(5,), (3, 20, 30), (4, 5, 2), (2, 2, 3, 3)])
@@ -416,7 +448,11 @@ def test_a_shape_that_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
 
 
 def test_json_has_null_for_what_is_no_number() -> None:
-    data = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.bool_(True), "x", None)}
+    data = {
+        "a": float("nan"),
+        "b": [np.float64("inf"), np.int64(3)],
+        "c": (np.bool_(True), "x", None),
+    }
     assert json.loads(files.to_json(data)) == {"a": None, "b": [None, 3], "c": [True, "x", None]}
 
 
@@ -424,7 +460,9 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
     """A video file stands for the camera: its first frame, to what JPEG leaves of it."""
     frame = np.zeros((48, 64, 3), np.uint8)
     frame[20:30, 30:40] = 200
-    video = cv2.VideoWriter(str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    video = cv2.VideoWriter(
+        str(tmp_path / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48)
+    )
     video.write(frame)
     video.release()
     grabbed = images.grab_frame(str(tmp_path / "camera.avi"))
@@ -435,7 +473,9 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
             images.grab_frame(nowhere)
 
 
-def test_a_yaml_file_is_read_anew_after_a_change_of_the_file_or_of_its_values(tmp_path: Path) -> None:
+def test_a_yaml_file_is_read_anew_after_a_change_of_the_file_or_of_its_values(
+    tmp_path: Path,
+) -> None:
     """Values are kept by the file's text, and every reader has its own."""
     file = tmp_path / "a.yaml"
     file.write_text("a: {b: [1, 2]}")

@@ -18,7 +18,9 @@ PIXELS = np.random.default_rng(1).integers(0, 500, (60, 80)).astype(np.int16)
 
 def compressed(kind: str = "HCOMPRESS_1") -> bytes:
     file = io.BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(PIXELS, compression_type=kind)]).writeto(file)
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(PIXELS, compression_type=kind)]).writeto(
+        file
+    )
     return file.getvalue()
 
 
@@ -47,7 +49,9 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
         ("ZNAXIS2", 2**31 - 1, "2147483647x80 pixels by its header"),
     ],
 )
-def test_a_wrong_size_of_a_compressed_image_is_one_line(tmp_path: Path, key: str, value: int, told: str) -> None:
+def test_a_wrong_size_of_a_compressed_image_is_one_line(
+    tmp_path: Path, key: str, value: int, told: str
+) -> None:
     path = tmp_path / "x.fits"
     path.write_bytes(with_value(compressed(), key, value))
     with pytest.raises(InputError, match=re.escape(f"{path}: {told}")) as refusal:
@@ -78,13 +82,17 @@ def test_more_axes_than_the_standard_has_are_refused_at_once(tmp_path: Path, num
     path = tmp_path / "axes.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]).writeto(path)
     data = path.read_bytes()
-    start = [hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0][number]
+    start = [hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0][
+        number
+    ]
     path.write_bytes(data[: start + 10] + b"2147483647".rjust(20) + data[start + 30 :])
     with pytest.raises(InputError, match=r"axes\.fits: NAXIS 2147483647; allowed: up to 999 axes$"):
         images.read_image(path)
 
 
-def test_a_guarded_script_that_waits_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_guarded_script_that_waits_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(guarded, "WALL_S", 0.5)
     (tmp_path / "script.py").write_text("import time; time.sleep(60)")
     told = guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29)

@@ -22,11 +22,18 @@ from skysim.core.io import decoding, encoded, images, tiff
 from skysim.core.io import fits as fits_images
 
 RNG = np.random.default_rng(4)
-GRAY = np.kron(RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8))  # blocks, which JPEG keeps
-ORIENTATION, EXIF, FOCAL_35MM = 0x0112, 0x8769, 0xA405  # Exif 2.32, tables 4 to 8
+GRAY = np.kron(
+    RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8)
+)  # blocks, which JPEG keeps
+# Exif 2.32, tables 4 to 8
+ORIENTATION = 0x0112
+EXIF = 0x8769
+FOCAL_35MM = 0xA405
 
 
-def with_exif(path: Path, image: NDArray, orientation: int | None, focal_35mm: int | None = None) -> Path:
+def with_exif(
+    path: Path, image: NDArray, orientation: int | None, focal_35mm: int | None = None
+) -> Path:
     """Write an image by Pillow with these tags."""
     exif = Image.Exif()
     if orientation is not None:
@@ -34,8 +41,12 @@ def with_exif(path: Path, image: NDArray, orientation: int | None, focal_35mm: i
     if focal_35mm is not None:
         exif.get_ifd(EXIF)[FOCAL_35MM] = focal_35mm
     written = Image.Exif()
-    written.load(exif.tobytes())  # without this, Pillow leaves the inner directory out of a TIFF file
-    Image.fromarray(image).save(path, exif=written, **({"quality": 95} if path.suffix == ".jpg" else {}))
+    written.load(
+        exif.tobytes()
+    )  # without this, Pillow leaves the inner directory out of a TIFF file
+    Image.fromarray(image).save(
+        path, exif=written, **({"quality": 95} if path.suffix == ".jpg" else {})
+    )
     return path
 
 
@@ -58,13 +69,19 @@ def test_a_picture_is_seen_as_pillow_shows_it(
     tmp_path: Path, suffix: str, orientation: int | None, color: bool
 ) -> None:
     """OpenCV leaves JPEG and PNG as stored and turns TIFF; Pillow's `exif_transpose` is another implementation."""
-    path = with_exif(tmp_path / f"x{suffix}", np.dstack([GRAY, GRAY[::-1], GRAY]) if color else GRAY, orientation)
-    with Image.open(io.BytesIO(path.read_bytes())) as stored:  # by its path, Pillow does not turn a gray TIFF
+    path = with_exif(
+        tmp_path / f"x{suffix}", np.dstack([GRAY, GRAY[::-1], GRAY]) if color else GRAY, orientation
+    )
+    with Image.open(
+        io.BytesIO(path.read_bytes())
+    ) as stored:  # by its path, Pillow does not turn a gray TIFF
         shown = np.asarray(ImageOps.exif_transpose(stored))
     seen = images.read_picture(path).pixels
     assert seen.shape == shown.shape
     assert seen.flags["C_CONTIGUOUS"]
-    np.testing.assert_allclose(seen[..., ::-1] if color else seen, shown, atol=2)  # two JPEG decoders
+    np.testing.assert_allclose(
+        seen[..., ::-1] if color else seen, shown, atol=2
+    )  # two JPEG decoders
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -88,7 +105,9 @@ def test_upright_undoes_what_the_tag_says(orientation: int) -> None:
 def test_the_focal_length_of_35_mm_film_is_read(tmp_path: Path, suffix: str) -> None:
     assert images.read_picture(with_exif(tmp_path / f"x{suffix}", GRAY, 1, 26)).focal_35mm == 26
     assert images.read_picture(with_exif(tmp_path / f"y{suffix}", GRAY, 6)).focal_35mm is None
-    assert images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None  # 0: unknown
+    assert (
+        images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None
+    )  # 0: unknown
 
 
 def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) -> bytes:
@@ -109,8 +128,14 @@ def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) 
         (exif_block("<", (ORIENTATION, 3, 1, 0)), tiff.Exif()),
         (exif_block("<", (ORIENTATION, 3, 1, 99)), tiff.Exif()),
         (exif_block("<", (ORIENTATION, 2, 1, 6)), tiff.Exif()),  # text
-        (exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 8)), tiff.Exif(6)),  # the directory contains itself
-        (exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 2**32 - 1)), tiff.Exif(6)),  # beyond the end
+        (
+            exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 8)),
+            tiff.Exif(6),
+        ),  # the directory contains itself
+        (
+            exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 2**32 - 1)),
+            tiff.Exif(6),
+        ),  # beyond the end
         (exif_block("<", first=2**32 - 1), tiff.Exif()),
     ],
 )
@@ -133,7 +158,11 @@ def test_an_exif_block_that_lies_leaves_the_picture(tmp_path: Path) -> None:
 def test_pillow_does_not_talk_past_us_of_damaged_exif(tmp_path: Path) -> None:
     """A text of 4,000 characters in a block of a hundred."""
     data = bytearray(with_exif(tmp_path / "x.jpg", GRAY, 6, 26).read_bytes())
-    at = data.index(struct.pack("<HHI", EXIF, 4, 1)) if b"II*" in data else data.index(struct.pack(">HHI", EXIF, 4, 1))
+    at = (
+        data.index(struct.pack("<HHI", EXIF, 4, 1))
+        if b"II*" in data
+        else data.index(struct.pack(">HHI", EXIF, 4, 1))
+    )
     order = "<" if b"II*" in data else ">"
     data[at : at + 12] = struct.pack(f"{order}HHII", 270, 2, 4000, 8)
     (tmp_path / "x.jpg").write_bytes(data)
@@ -154,7 +183,12 @@ def fits_file(path: Path, pixels: NDArray, **cards: Any) -> Path:
 def test_the_last_row_is_the_highest_unless_the_header_says_otherwise(tmp_path: Path) -> None:
     """FITS standard 4.0, section 3.3.1 and the pictures of every viewer; ROWORDER is Siril's and N.I.N.A.'s keyword."""
     for n, (order, highest_first, known) in enumerate(
-        [("TOP-DOWN", True, True), ("BOTTOM-UP", False, True), (None, False, False), ("sideways", False, False)]
+        [
+            ("TOP-DOWN", True, True),
+            ("BOTTOM-UP", False, True),
+            (None, False, False),
+            ("sideways", False, False),
+        ]
     ):
         path = fits_file(tmp_path / f"{n}.fits", FRAME, **({"ROWORDER": order} if order else {}))
         picture = images.read_picture(path)
@@ -166,7 +200,9 @@ def test_the_last_row_is_the_highest_unless_the_header_says_otherwise(tmp_path: 
 @pytest.mark.parametrize("name", ["x.fits.gz", "x.FIT.GZ", "a.b.fts.gz"])
 def test_a_gzipped_file_is_read(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    path.write_bytes(gzip.compress(fits_file(tmp_path / "x.fits", FRAME, ROWORDER="TOP-DOWN").read_bytes()))
+    path.write_bytes(
+        gzip.compress(fits_file(tmp_path / "x.fits", FRAME, ROWORDER="TOP-DOWN").read_bytes())
+    )
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
 
 
@@ -175,9 +211,9 @@ def test_a_gzipped_file_is_read(tmp_path: Path, name: str) -> None:
 def test_a_file_of_tiles_is_read_with_its_header(tmp_path: Path, packed: bool) -> None:
     header = fits.Header([("ROWORDER", "TOP-DOWN"), ("DATE-OBS", "2012-06-22T21:00:00")])
     path = tmp_path / "x.fits.fz"
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.kron(FRAME, np.ones((5, 5), np.uint16)), header)]).writeto(
-        path
-    )
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.CompImageHDU(np.kron(FRAME, np.ones((5, 5), np.uint16)), header)]
+    ).writeto(path)
     if packed:
         path = path.rename(tmp_path / "y.fits.gz")
         path.write_bytes(gzip.compress(path.read_bytes()))
@@ -192,24 +228,34 @@ def test_color_cubes_of_both_kinds_are_one_picture(tmp_path: Path, kind: str) ->
     rgb = np.random.default_rng(1).integers(0, 250, (6, 9, 3)).astype(kind)
     expected = rgb @ [0.299, 0.587, 0.114]
     for name, cube in (("planes", np.moveaxis(rgb, 2, 0)), ("pixels", rgb)):
-        picture = images.read_picture(fits_file(tmp_path / f"{name}.fits", cube, ROWORDER="TOP-DOWN"))
+        picture = images.read_picture(
+            fits_file(tmp_path / f"{name}.fits", cube, ROWORDER="TOP-DOWN")
+        )
         tolerance = 0.51 if kind in ("u1", "u2") else 1e-3
-        np.testing.assert_allclose(images.monochrome(picture.pixels), expected, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(
+            images.monochrome(picture.pixels), expected, rtol=0, atol=tolerance
+        )
 
 
-def test_a_cube_of_one_plane_is_a_picture_and_of_many_is_refused_by_its_shape(tmp_path: Path) -> None:
+def test_a_cube_of_one_plane_is_a_picture_and_of_many_is_refused_by_its_shape(
+    tmp_path: Path,
+) -> None:
     path = fits_file(tmp_path / "one.fits", FRAME[None, None], ROWORDER="TOP-DOWN")
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
     for shape in ((12, 6, 9), (2, 6, 9), (3, 2, 6, 9), (5,)):
         path = fits_file(tmp_path / f"{len(shape)}_{shape[0]}.fits", np.zeros(shape, np.int16))
-        told = re.escape(f"a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)")
+        told = re.escape(
+            f"a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)"
+        )
         assert re.search(told, complaint(path))
 
 
 # What hostile files promise
 
 
-def test_a_gzipped_file_is_unpacked_up_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gzipped_file_is_unpacked_up_to_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gigabyte of zeros is a megabyte; what is beyond the limit is not unpacked."""
     monkeypatch.setattr(decoding, "MAX_BYTES", 100_000)
     monkeypatch.setattr(fits_images, "GZIP_BLOCK", 10_000)
@@ -223,13 +269,17 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
 def test_a_truncated_gzipped_file_is_one_line(tmp_path: Path, share: float) -> None:
-    data = gzip.compress(fits_file(tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)).read_bytes())
+    data = gzip.compress(
+        fits_file(tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)).read_bytes()
+    )
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data[: int(share * len(data))])
     assert f"not a complete {'gzip' if share else 'FITS'} file" in complaint(path)
 
 
-@pytest.mark.parametrize("data", [b"once upon a time", gzip.compress(b"once upon a time", mtime=0), bytes(99)])
+@pytest.mark.parametrize(
+    "data", [b"once upon a time", gzip.compress(b"once upon a time", mtime=0), bytes(99)]
+)
 def test_what_is_no_gzipped_fits_file_is_one_line(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data)
@@ -246,7 +296,13 @@ def test_a_header_without_an_end_is_refused(tmp_path: Path) -> None:
 def test_a_packed_file_s_pixels_are_counted_before_they_are_read(tmp_path: Path) -> None:
     header = b"".join(
         card.ljust(80)
-        for card in (b"SIMPLE  = T", b"BITPIX  = 16", b"NAXIS   = 2", b"NAXIS1  = 99999", b"NAXIS2  = 99999")
+        for card in (
+            b"SIMPLE  = T",
+            b"BITPIX  = 16",
+            b"NAXIS   = 2",
+            b"NAXIS1  = 99999",
+            b"NAXIS2  = 99999",
+        )
     )
     path = tmp_path / "x.fits.gz"
     path.write_bytes(gzip.compress((header + b"END".ljust(80)).ljust(2880) + bytes(2880)))
@@ -269,7 +325,10 @@ def test_color_planes_of_a_tiff_are_read_right_or_refused_by_name(
     tifffile.imwrite(path, np.moveaxis(rgb, 2, 0) if planes else rgb, photometric="rgb", **order)
     if planes and kind != "u1":
         bits = 8 * np.dtype(kind).itemsize
-        assert f"separate color planes (PlanarConfiguration 2) of {bits} bits; allowed: inter" in complaint(path)
+        assert (
+            f"separate color planes (PlanarConfiguration 2) of {bits} bits; allowed: inter"
+            in complaint(path)
+        )
     else:
         np.testing.assert_array_equal(images.read_picture(path).pixels, rgb[:, :, ::-1])
 

@@ -27,14 +27,20 @@ def test_rotation_vectors_go_there_and_back(turn: list[float]) -> None:
 @pytest.mark.parametrize("one", TURNS)
 @pytest.mark.parametrize("two", TURNS)
 def test_products_and_turned_vectors_are_scipys(one: list[float], two: list[float]) -> None:
-    a, b = Rotation.from_rotvec(one), Rotation.from_rotvec(two)
+    a = Rotation.from_rotvec(one)
+    b = Rotation.from_rotvec(two)
     product = quaternion.multiply(wxyz(one), quaternion.inverse(wxyz(two)))
-    assert (Rotation.from_quat(product, scalar_first=True).inv() * (a * b.inv())).magnitude() < 3e-15
+    assert (
+        Rotation.from_quat(product, scalar_first=True).inv() * (a * b.inv())
+    ).magnitude() < 3e-15
     vector = np.array([0.2, -3.0, 1.1])
-    np.testing.assert_allclose(quaternion.apply(wxyz(one), vector), a.apply(vector), rtol=0, atol=2e-15)
+    np.testing.assert_allclose(
+        quaternion.apply(wxyz(one), vector), a.apply(vector), rtol=0, atol=2e-15
+    )
     np.testing.assert_allclose(quaternion.to_matrix(wxyz(one)), a.as_matrix(), rtol=0, atol=1e-15)
 
 
 def test_cross_is_numpys() -> None:
-    a, b = np.array([1.0, -2.0, 0.5]), np.array([0.3, 4.0, -7.0])
+    a = np.array([1.0, -2.0, 0.5])
+    b = np.array([0.3, 4.0, -7.0])
     np.testing.assert_array_equal(quaternion.cross(a, b), np.cross(a, b))

@@ -29,7 +29,11 @@ DATES = (
     "2017-01-01T00:00:00",
     "2024-02-29T12:34:56.789",
 )
-UNKNOWN = ("1905-01-01T00:00:00", "2030-01-01T00:00:00", "2099-12-31T23:59:59")  # no UTC yet; leap seconds to come
+UNKNOWN = (
+    "1905-01-01T00:00:00",
+    "2030-01-01T00:00:00",
+    "2099-12-31T23:59:59",
+)  # no UTC yet; leap seconds to come
 
 
 @pytest.mark.parametrize("text", DATES + UNKNOWN)
@@ -38,7 +42,8 @@ def test_terrestrial_time_is_astropys(text: str) -> None:
     theirs = astropy_time(text)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
-        tt, tai = theirs.tt, theirs.tai
+        tt = theirs.tt
+        tai = theirs.tai
     days = (tt.jd1 - erfa.DJ00) + tt.jd2
     assert DAY_S * (time.tt_days(date) - days) == pytest.approx(0, abs=2e-6)
     assert DAY_S * (time.tt_jd(date) - tt.jd) == pytest.approx(0, abs=1e-4)
@@ -67,9 +72,16 @@ def test_leap_seconds_are_those_of_the_iers() -> None:
 
 def test_the_earths_rotation_is_astropys_within_the_table_of_the_iers() -> None:
     with iers.earth_orientation_table.set(iers.IERS_B.open()):
-        for text in ("1972-08-01T06:00:00", "1998-03-02T03:04:05", "2012-06-22T21:00:00", "2020-11-05T18:00:00"):
+        for text in (
+            "1972-08-01T06:00:00",
+            "1998-03-02T03:04:05",
+            "2012-06-22T21:00:00",
+            "2020-11-05T18:00:00",
+        ):
             date = datetime.datetime.fromisoformat(text)
-            assert DAY_S * (time.ut1_jd(date) - astropy_time(text).ut1.jd) == pytest.approx(0, abs=1e-4)
+            assert DAY_S * (time.ut1_jd(date) - astropy_time(text).ut1.jd) == pytest.approx(
+                0, abs=1e-4
+            )
     for text in UNKNOWN:
         date = datetime.datetime.fromisoformat(text)
         assert time.ut1_jd(date) == time.utc_jd(date)
@@ -78,19 +90,25 @@ def test_the_earths_rotation_is_astropys_within_the_table_of_the_iers() -> None:
 def test_epochs_are_erfas() -> None:
     assert (time.J2000_JD, time.MJD_ZERO_JD) == (erfa.DJ00, erfa.DJM0)
     assert Time(time.J2000, scale="tt").jd == time.J2000_JD
-    assert (erfa.TTMTAI, (Time(0, format="gps").tai - Time("1980-01-06T00:00:00", scale="tai")).sec) == pytest.approx(
-        (time.TT_MINUS_TAI_S, -time.GPS_MINUS_TAI_S), abs=1e-9
-    )
+    assert (
+        erfa.TTMTAI,
+        (Time(0, format="gps").tai - Time("1980-01-06T00:00:00", scale="tai")).sec,
+    ) == pytest.approx((time.TT_MINUS_TAI_S, -time.GPS_MINUS_TAI_S), abs=1e-9)
 
 
 def test_the_estimators_epochs_are_erfas_and_its_leap_seconds_todays() -> None:
     assert (believed.J2000, believed.J2000_JD) == (time.J2000, erfa.DJ00)
-    assert pytest.approx(time.tt_minus_utc_s(datetime.datetime(2026, 1, 1)), abs=1e-12) == believed.TT_MINUS_UTC_S
+    assert (
+        pytest.approx(time.tt_minus_utc_s(datetime.datetime(2026, 1, 1)), abs=1e-12)
+        == believed.TT_MINUS_UTC_S
+    )
 
 
 def test_time_zones_and_naive_times_are_one() -> None:
     naive = datetime.datetime(2024, 2, 29, 12)
-    zoned = datetime.datetime(2024, 2, 29, 17, 30, tzinfo=datetime.timezone(datetime.timedelta(hours=5.5)))
+    zoned = datetime.datetime(
+        2024, 2, 29, 17, 30, tzinfo=datetime.timezone(datetime.timedelta(hours=5.5))
+    )
     assert time.tt_days(naive) == time.tt_days(zoned)
     # JD 2460370.0 is 2024-02-29 12:00; TT is 69.184 s ahead of UTC.
     assert time.tt_days(naive) == pytest.approx(2460370.0 - 2451545.0 + 69.184 / 86400, abs=1e-9)

@@ -44,17 +44,27 @@ def normals(count: int = COUNT, seed: int = 1) -> np.ndarray:
 # --- the laws
 
 
-@pytest.mark.parametrize(("half", "sigma"), [(0.5, None), (0.5, 0.5 / 3), (0.5, 0.2), (0.5, 1.0), (0.5, 10.0)])
-def test_a_tolerance_has_the_deviation_of_its_distribution(half: float, sigma: float | None) -> None:
+@pytest.mark.parametrize(
+    ("half", "sigma"), [(0.5, None), (0.5, 0.5 / 3), (0.5, 0.2), (0.5, 1.0), (0.5, 10.0)]
+)
+def test_a_tolerance_has_the_deviation_of_its_distribution(
+    half: float, sigma: float | None
+) -> None:
     """Against SciPy, and against the moments of what is drawn; a wide parent is uniform within the bounds."""
-    oracle = stats.uniform(-half, 2 * half) if sigma is None else stats.truncnorm(-half / sigma, half / sigma, 0, sigma)
+    oracle = (
+        stats.uniform(-half, 2 * half)
+        if sigma is None
+        else stats.truncnorm(-half / sigma, half / sigma, 0, sigma)
+    )
     tolerance = Tolerance(half, sigma)
     assert float(tolerance) == pytest.approx(oracle.std(), rel=1e-9)
     drawn = scaled_errors(tolerance, normals())
     assert np.abs(drawn).max() <= half
     assert stats.kstest(drawn, oracle.cdf).pvalue > 1e-6
     assert abs(drawn.mean()) < 5 * float(tolerance) / np.sqrt(COUNT)
-    kurtosis = float(oracle.stats("k")) + 2  # the variance of a variance is (kurtosis + 2) sigma^4 / N
+    kurtosis = (
+        float(oracle.stats("k")) + 2
+    )  # the variance of a variance is (kurtosis + 2) sigma^4 / N
     assert drawn.var() == pytest.approx(oracle.var(), rel=5 * np.sqrt(kurtosis / COUNT))
 
 
@@ -83,7 +93,10 @@ def test_a_plain_size_scales_standard_normal_numbers_bit_for_bit() -> None:
         ({"tolerance": "±0.5 mm", "distribution": "uniform"}, Tolerance(5e-4)),
         ({"tolerance": "+/-20 um"}, Tolerance(2e-5)),
         ({"tolerance": "+- 1 mm", "distribution": "truncated_normal"}, Tolerance(1e-3, 1e-3 / 3)),
-        ({"tolerance": "1 mm", "distribution": "truncated_normal", "sigma": "0.5 mm"}, Tolerance(1e-3, 5e-4)),
+        (
+            {"tolerance": "1 mm", "distribution": "truncated_normal", "sigma": "0.5 mm"},
+            Tolerance(1e-3, 5e-4),
+        ),
     ],
 )
 def test_a_size_is_read_as_a_sigma_or_a_tolerance(value: Any, expected: float) -> None:
@@ -91,12 +104,16 @@ def test_a_size_is_read_as_a_sigma_or_a_tolerance(value: Any, expected: float) -
     assert float(read) == pytest.approx(float(expected), rel=1e-12)
     assert isinstance(read, Tolerance) == isinstance(expected, Tolerance)
     if isinstance(expected, Tolerance):
-        assert (read.half_width, read.parent_sigma) == pytest.approx((expected.half_width, expected.parent_sigma))
+        assert (read.half_width, read.parent_sigma) == pytest.approx(
+            (expected.half_width, expected.parent_sigma)
+        )
 
 
 def test_a_bare_number_takes_a_tolerance_too() -> None:
     assert size(0.08, "ratio") == 0.08
-    assert size({"tolerance": 0.1}, "ratio") == size({"tolerance": "±0.1"}, "ratio") == Tolerance(0.1)
+    assert (
+        size({"tolerance": 0.1}, "ratio") == size({"tolerance": "±0.1"}, "ratio") == Tolerance(0.1)
+    )
 
 
 @pytest.mark.parametrize(
@@ -109,10 +126,22 @@ def test_a_bare_number_takes_a_tolerance_too() -> None:
         ({"tolerence": "1 mm"}, "Extra inputs"),
         ({}, "an error requires a tolerance"),
         ({"distribution": "uniform"}, "uniform requires a tolerance"),
-        ({"sigma": "1 mm", "distribution": "truncated_normal"}, "truncated_normal requires a tolerance"),
-        ({"tolerance": "1 mm", "distribution": "normal"}, "a normal distribution has none; allowed: uniform"),
-        ({"tolerance": "1 mm", "sigma": "1 mm"}, "a uniform distribution has none; allowed: distribution: truncated"),
-        ({"tolerance": "1 mm", "sigma": "1 m", "distribution": "truncated_normal"}, "a hundredth to a hundred times"),
+        (
+            {"sigma": "1 mm", "distribution": "truncated_normal"},
+            "truncated_normal requires a tolerance",
+        ),
+        (
+            {"tolerance": "1 mm", "distribution": "normal"},
+            "a normal distribution has none; allowed: uniform",
+        ),
+        (
+            {"tolerance": "1 mm", "sigma": "1 mm"},
+            "a uniform distribution has none; allowed: distribution: truncated",
+        ),
+        (
+            {"tolerance": "1 mm", "sigma": "1 m", "distribution": "truncated_normal"},
+            "a hundredth to a hundred times",
+        ),
         ("-1 mm", "greater than or equal to 0"),
     ],
 )
@@ -127,7 +156,10 @@ def test_a_tolerance_is_not_a_sigma_of_its_size() -> None:
     assert tolerance != float(tolerance)
     assert tolerance == Tolerance(1.0) != Tolerance(1.0, 0.5)
     assert pickle.loads(pickle.dumps(tolerance)) == copy.deepcopy(tolerance) == tolerance
-    assert Sized(place="1 mm").model_dump() != Sized(place={"tolerance": "1.7320508075688772 mm"}).model_dump()
+    assert (
+        Sized(place="1 mm").model_dump()
+        != Sized(place={"tolerance": "1.7320508075688772 mm"}).model_dump()
+    )
 
 
 def test_a_misspelled_tolerance_is_answered_with_key_and_line() -> None:
@@ -143,7 +175,8 @@ def test_a_misspelled_tolerance_is_answered_with_key_and_line() -> None:
 
 
 def test_the_survey_s_leds_and_lever_stay_within_their_tolerance() -> None:
-    places_m, tolerance = np.zeros((20_000, 3)), Tolerance(5e-4)
+    places_m = np.zeros((20_000, 3))
+    tolerance = Tolerance(5e-4)
     error_m = survey_errors.assumed_m(places_m, tolerance, 3, "leds")
     assert np.abs(error_m).max() <= 5e-4
     assert error_m.std(axis=0) == pytest.approx(5e-4 / np.sqrt(3), rel=0.02)
@@ -153,13 +186,17 @@ def dome_of(**led: Any) -> Any:
     keys = {"layout": "{kind: random, count: 20000, cap_deg: 60}", "occlusion": "false"}
     texts = {f"light.{key}": value for key, value in keys.items()}
     texts["light.surface"] = "{kind: sphere, apex: 1 m, radius: 1 m}"
-    return loader.load("afit_simsat", texts | {f"light.led.{key}": value for key, value in led.items()}).light
+    return loader.load(
+        "afit_simsat", texts | {f"light.led.{key}": value for key, value in led.items()}
+    ).light
 
 
 def test_leds_of_a_bin_are_as_bright_as_its_tolerance() -> None:
     """±10 % about the nominal intensity, uniformly, and not lognormal."""
     band = Band.from_efficiency(0.5)
-    binned = dome.sources(dome_of(scatter="{tolerance: 0.1}", drive="{kind: direct}"), band).strength
+    binned = dome.sources(
+        dome_of(scatter="{tolerance: 0.1}", drive="{kind: direct}"), band
+    ).strength
     exact = dome.sources(dome_of(scatter="0", drive="{kind: direct}"), band).strength
     factor = binned / exact
     assert np.abs(factor - 1).max() <= 0.1 * (1 + 1e-12)
@@ -168,7 +205,9 @@ def test_leds_of_a_bin_are_as_bright_as_its_tolerance() -> None:
 
 def test_a_bin_that_leaves_no_light_is_refused() -> None:
     with pytest.raises(InputError, match=r"light.led.scatter: a tolerance of 1 leaves no light"):
-        loader.load("afit_simsat", {"light.led.scatter": "{tolerance: 1.0, distribution: truncated_normal}"})
+        loader.load(
+            "afit_simsat", {"light.led.scatter": "{tolerance: 1.0, distribution: truncated_normal}"}
+        )
 
 
 def test_crystals_of_a_data_sheet_are_within_their_tolerance() -> None:
@@ -181,10 +220,18 @@ def test_crystals_of_a_data_sheet_are_within_their_tolerance() -> None:
 def test_gyros_of_a_data_sheet_are_within_their_tolerance() -> None:
     """Scale factors, misalignments and turn-on biases over a thousand units."""
     config = vehicle.ImuConfig.model_validate(
-        {"gyro": {"scale_ppm": {"tolerance": 300}, "turn_on_bias_deg_h": {"tolerance": 2}, "misalignment_arcsec": 0}}
+        {
+            "gyro": {
+                "scale_ppm": {"tolerance": 300},
+                "turn_on_bias_deg_h": {"tolerance": 2},
+                "misalignment_arcsec": 0,
+            }
+        }
     )
     units = [
-        imu.Imu.from_config(config.model_copy(update={"hardware_seed": seed}), np.random.default_rng(0))
+        imu.Imu.from_config(
+            config.model_copy(update={"hardware_seed": seed}), np.random.default_rng(0)
+        )
         for seed in range(1000)
     ]
     scale_ppm = np.array([np.diag(unit.gyro.matrix) - 1 for unit in units]) * 1e6
@@ -202,7 +249,9 @@ def test_glued_leds_stay_within_their_tolerance() -> None:
     }
     made = [
         dome.sources(
-            loader.load("afit_simsat", keys | {"light.layout": keys["light.layout"].replace("GLUE", glue)}).light,
+            loader.load(
+                "afit_simsat", keys | {"light.layout": keys["light.layout"].replace("GLUE", glue)}
+            ).light,
             Band.from_efficiency(0.5),
         ).place[:, :3]
         for glue in ("{tolerance: 0.1 mm}", "0 mm")

@@ -29,7 +29,9 @@ def test_a_common_unit_is_that_of_astropy(si: str, unit: str, value: float, spac
     assert in_si(text, si) == by_astropy(text, si)
 
 
-@pytest.mark.parametrize("text", ["1 ft 2", "1 parsec", "3 mm mm", "2 m(9)", "1e999 m", "0x10 m", "1_0 m", "nan m"])
+@pytest.mark.parametrize(
+    "text", ["1 ft 2", "1 parsec", "3 mm mm", "2 m(9)", "1e999 m", "0x10 m", "1_0 m", "nan m"]
+)
 def test_what_is_not_common_goes_to_astropy(text: str) -> None:
     try:
         expected = by_astropy(text, "m")

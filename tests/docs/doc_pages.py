@@ -27,14 +27,20 @@ def blocks(page: str, language: str) -> list[str]:
 
 def yaml_block(page: str, key: str) -> str:
     """The one block of YAML that has this key at its top."""
-    (block,) = [block for block in blocks(page, "yaml") if re.search(rf"^{key}:", block, re.MULTILINE)]
+    (block,) = [
+        block for block in blocks(page, "yaml") if re.search(rf"^{key}:", block, re.MULTILINE)
+    ]
     return block
 
 
 def commands(page: str) -> list[list[str]]:
     """The skysim commands of its shell blocks; `make` is what runs this test."""
     lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
-    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith(".venv/bin/skysim")]
+    return [
+        shlex.split(line, comments=True)[1:]
+        for line in lines
+        if line.startswith(".venv/bin/skysim")
+    ]
 
 
 def checkout(folder: Path) -> Path:

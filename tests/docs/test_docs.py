@@ -22,7 +22,9 @@ MINUTES = {"benchmarks.placement", "benchmarks.lost_in_space"}  # even with two 
 
 def commands(page: str = DOME) -> list[list[str]]:
     blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
+    return [
+        shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line
+    ]
 
 
 def test_the_page_s_commands_are_of_this_project() -> None:
@@ -44,7 +46,9 @@ TABLES = [words for words in commands(DOME) + commands(ESTIMATOR) if words[0] ==
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(words, id=" ".join(words), marks=[pytest.mark.long] if words[2] in MINUTES else [])
+        pytest.param(
+            words, id=" ".join(words), marks=[pytest.mark.long] if words[2] in MINUTES else []
+        )
         for words in TABLES
     ],
 )
@@ -76,20 +80,31 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
     (words,) = [words for words in commands() if words[0] == "skysim"]
     command = [sys.executable, "-m", *words]
     done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        command,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
-    (after,) = re.findall(r"^after: (\d+) of \d+.*?cross median ([\d.]+)″.*?roll median ([\d.]+)″", done.stdout, re.M)
+    (after,) = re.findall(
+        r"^after: (\d+) of \d+.*?cross median ([\d.]+)″.*?roll median ([\d.]+)″", done.stdout, re.M
+    )
     rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
     shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
     assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)
 
 
-@pytest.mark.parametrize("words", [words for words in commands() if words[0] == "skysim"], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [words for words in commands() if words[0] == "skysim"], ids=" ".join
+)
 def test_the_page_s_skysim_commands_are_understood(words: list[str]) -> None:
     """Their options are: the run itself is `test_measure.py`'s."""
     done = subprocess.run(
-        [sys.executable, "-m", "skysim", words[1], "--help"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "skysim", words[1], "--help"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0
     assert [word for word in words if word.startswith("--") and word not in done.stdout] == []
@@ -109,16 +124,21 @@ STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 @pytest.mark.long
 def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
     shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
-    told = re.findall(r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES)
+    told = re.findall(
+        r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES
+    )
     assert {name for name, page, _, command in told if name == page == command} == shipped
     for name, _, verb, _ in told:
         assert (verb == "optimize") == (loader.load(name).study.optimize is not None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem
+)
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
-    text, told = path.read_text(encoding="utf-8"), loader.load(path.stem)
+    text = path.read_text(encoding="utf-8")
+    told = loader.load(path.stem)
     assert text.startswith(f"# {told.study.title}\n")
     assert f"seed {told.study.seed}." in text
     counted = re.search(r"(\d+) trials, (\d+) failed", text)

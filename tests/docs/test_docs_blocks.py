@@ -90,7 +90,11 @@ def all_pages() -> list[Path]:
 def walked() -> list[Any]:
     """The pages that have something to run and no test of their own."""
     pages = [path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE]
-    running = [path for path in pages if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}]
+    running = [
+        path
+        for path in pages
+        if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}
+    ]
     names = [os.path.relpath(path, DOCS) for path in running if "studies" not in path.parts]
     return [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in names]
 
@@ -107,13 +111,18 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # a reader sees them too
 @pytest.mark.parametrize("name", walked())
-def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_s_blocks_run_in_their_order(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
-    monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
+    monkeypatch.setenv(
+        "PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    )
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     session: dict[str, Any] = {}
-    printed, files = "", []
+    printed = ""
+    files = []
     for block in blocks(DOCS / name):
         named = FILE.match(block.text)
         if block.language in ("yaml", "python") and named:
@@ -128,11 +137,19 @@ def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch
             printed = "".join(ran(line) for line in block.text.splitlines() if line)
         elif block.language == "text" and printed:
             told = {shape(line) for line in printed.splitlines()}
-            assert [line for line in block.text.splitlines() if shape(line) not in told] == [], printed
+            assert [line for line in block.text.splitlines() if shape(line) not in told] == [], (
+                printed
+            )
         if block.language != "sh":
             printed = ""
-    commands = "\n".join(block.text for block in blocks(DOCS / name) if block.language in ("sh", "yaml"))
-    assert [file for file in files if len(re.findall(rf"\b{file}\b", commands)) < (1 + file.endswith(".yaml"))] == []
+    commands = "\n".join(
+        block.text for block in blocks(DOCS / name) if block.language in ("sh", "yaml")
+    )
+    assert [
+        file
+        for file in files
+        if len(re.findall(rf"\b{file}\b", commands)) < (1 + file.endswith(".yaml"))
+    ] == []
 
 
 def ran(line: str) -> str:
@@ -149,7 +166,9 @@ def ran(line: str) -> str:
     assert printed.getvalue(), line
     assert "failed:" not in printed.getvalue(), line
     if words[0] == "run":
-        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), printed.getvalue()
+        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), (
+            printed.getvalue()
+        )
     return printed.getvalue()
 
 
@@ -195,7 +214,10 @@ SITE = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
 
 def test_every_page_has_its_place_in_the_site() -> None:
     there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
-    there |= {path.relative_to(DOCS).with_suffix(".md").as_posix() for path in DOCS.glob("notebooks/*.ipynb")}
+    there |= {
+        path.relative_to(DOCS).with_suffix(".md").as_posix()
+        for path in DOCS.glob("notebooks/*.ipynb")
+    }
     outside = {name for name in nav(SITE["nav"]) if name.startswith("source/")}
     assert set(nav(SITE["nav"])) - outside == there
     assert all((ROOT / name.removeprefix("source/")).is_file() for name in outside)
@@ -209,24 +231,36 @@ def test_what_the_reference_names_is_a_module() -> None:
     ]
     assert len(named) > 40
     files = [ROOT / name.replace(".", "/") for name in named]
-    assert [path for path in files if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())] == []
+    assert [
+        path
+        for path in files
+        if not (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())
+    ] == []
 
 
 def test_the_reference_holds_every_module_that_a_page_names() -> None:
     """What a reader imports or is sent to; the browser's lab and the papers apart, which are no library."""
     text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
     files = re.findall(r"(?<!tests/)\b((?:skysim|estimator)/[\w/]+)\.py", text)
-    for package, name in re.findall(r"^from ((?:skysim|estimator)\.[\w.]+) import (\w+)", text, re.M):
+    for package, name in re.findall(
+        r"^from ((?:skysim|estimator)\.[\w.]+) import (\w+)", text, re.M
+    ):
         folder = package.replace(".", "/")
-        there = (ROOT / folder / f"{name}.py").is_file() or (ROOT / folder / name / "__init__.py").is_file()
+        there = (ROOT / folder / f"{name}.py").is_file() or (
+            ROOT / folder / name / "__init__.py"
+        ).is_file()
         files.append(f"{folder}/{name}" if there else folder)
     named = {name.replace("/", ".") for name in files}
     named = {
         name
         for name in named
-        if not name.startswith(("skysim.apps.gui.", "skysim.apps.cli.", "skysim.experiments.papers."))
+        if not name.startswith(
+            ("skysim.apps.gui.", "skysim.apps.cli.", "skysim.experiments.papers.")
+        )
     }
-    reference = "".join(path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
+    reference = "".join(
+        path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md")
+    )
     assert len(named) > 40
     assert sorted(named - set(re.findall(r"^::: (\S+)$", reference, re.M))) == []
 
@@ -240,7 +274,9 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
 @pytest.mark.long
 def test_the_figures_are_drawn_by_their_script(tmp_path: Path) -> None:
     script = DOCS / "site/figures.py"
-    subprocess.run([sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    subprocess.run(
+        [sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True
+    )
     drawn = {path.name for path in tmp_path.glob("*.svg")}
     assert drawn == {path.name for path in (DOCS / "images").glob("*.svg")}
     text = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md"))

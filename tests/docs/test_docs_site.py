@@ -32,19 +32,27 @@ def of_the_site(name: str) -> ModuleType:
 
 commands, keys, responses = (of_the_site(name) for name in ("commands", "keys", "study_responses"))
 COMMANDS_MARKDOWN = commands.commands_markdown()
-SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE))
+SECTIONS = dict(
+    re.findall(
+        r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE
+    )
+)
 
 
 def helped(*words: str) -> str:
     """What --help prints, on a terminal wide enough."""
-    told = CliRunner().invoke(main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"})
+    told = CliRunner().invoke(
+        main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
+    )
     assert told.exit_code == 0, told.output
     return re.sub(r"\x1b\[[0-9;]*m", "", told.output)
 
 
 @pytest.mark.slow
 def test_every_command_that_help_names_has_its_section() -> None:
-    shown = {name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS}
+    shown = {
+        name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS
+    }
     assert len(shown[""]) >= 15
     told = {f"{name} {below}".strip() for name, all_below in shown.items() for below in all_below}
     assert told | {""} == set(SECTIONS)
@@ -63,10 +71,14 @@ def test_a_section_has_the_options_that_help_shows(name: str) -> None:
 
 
 def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
-    exposure, survey = keys.table(ExposureConfig), keys.table(SurveyErrorsConfig)
+    exposure = keys.table(ExposureConfig)
+    survey = keys.table(SurveyErrorsConfig)
     assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
     assert "| `rate_hz` | number, > 0 | required |" in exposure
-    assert '| `led_sigma` | a length such as "35 mm" or "48 in" or LengthToleranceConfig | `0 m` |' in survey
+    assert (
+        '| `led_sigma` | a length such as "35 mm" or "48 in" or LengthToleranceConfig | `0 m` |'
+        in survey
+    )
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
 
 
@@ -83,21 +95,30 @@ def test_a_committed_reference_page_is_that_of_the_code(path: Path) -> None:
 @pytest.mark.parametrize("path", KEYS, ids=lambda path: path.stem)
 def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path: Path) -> None:
     page = GENERATED[path]
-    linked, headings = set(re.findall(r"\]\(#(\w+)\)", page)), set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
+    linked = set(re.findall(r"\]\(#(\w+)\)", page))
+    headings = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
     assert len(linked) > 10
     assert linked <= {heading.lower() for heading in headings}
     assert re.findall(r".*\| (?:list of any length: )?text(?: or null)? \|.*", page) == []
-    assert re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []  # every section has a link
+    assert (
+        re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []
+    )  # every section has a link
 
 
 def test_every_response_has_a_row_with_its_meaning() -> None:
     """Proportions, quantities and statistics that the code has, and no others; meanings of several lines are whole."""
     page = GENERATED[responses.PAGE]
     rows = [
-        (set(re.findall(r"`(\w+)`", names)), text) for names, text in re.findall(r"^\| (`.*`) \| (.*) \|$", page, re.M)
+        (set(re.findall(r"`(\w+)`", names)), text)
+        for names, text in re.findall(r"^\| (`.*`) \| (.*) \|$", page, re.M)
     ]
     named = set().union(*(names for names, _ in rows))
-    wanted = {*metrics.PROPORTIONS, "coverage_N", *metrics.QUANTITIES, *(f"_{name}" for name in metrics.STATISTICS)}
+    wanted = {
+        *metrics.PROPORTIONS,
+        "coverage_N",
+        *metrics.QUANTITIES,
+        *(f"_{name}" for name in metrics.STATISTICS),
+    }
     assert named == wanted
     assert min(len(text) for _, text in rows) > 15
     assert "ten arcminutes that the tracker's covariance allows |" in page
@@ -105,7 +126,11 @@ def test_every_response_has_a_row_with_its_meaning() -> None:
 
 def test_names_that_a_key_allows_are_on_its_row() -> None:
     rows = dict(
-        re.findall(r"^\| `(\w+)` \| (.*) \|.*\|$", GENERATED[commands.PAGE.with_name("scene_keys.md")], re.MULTILINE)
+        re.findall(
+            r"^\| `(\w+)` \| (.*) \|.*\|$",
+            GENERATED[commands.PAGE.with_name("scene_keys.md")],
+            re.MULTILINE,
+        )
     )
     assert {"`sequential`", "`local`"} <= set(rows["detector"].split(", "))
     assert "`default`" in rows["identifier"]
@@ -116,10 +141,17 @@ def test_names_that_a_key_allows_are_on_its_row() -> None:
 @pytest.mark.browser
 def test_the_site_s_search_needs_no_server(tmp_path: Path) -> None:
     """Chromium opens the site of `make docs` as a file, with a search in its address."""
-    chromium, site = shutil.which("chromium"), ROOT / "out" / "site" / "index.html"
+    chromium = shutil.which("chromium")
+    site = ROOT / "out" / "site" / "index.html"
     if chromium is None or not site.exists():
         pytest.skip("needs Chromium and the site of `make docs`")
-    words = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=10000", "--dump-dom"]
+    words = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=10000",
+        "--dump-dom",
+    ]
     done = subprocess.run(
         [chromium, *words, f"--user-data-dir={tmp_path}", f"{site.as_uri()}?q=parallax"],
         capture_output=True,
@@ -135,7 +167,9 @@ def test_what_a_page_tells_to_make_is_a_target() -> None:
     told = {
         name
         for path in pages
-        for name in re.findall(r"(?:^|`)make ([a-z-]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        for name in re.findall(
+            r"(?:^|`)make ([a-z-]+)", path.read_text(encoding="utf-8"), re.MULTILINE
+        )
     }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert len(told) >= 10
@@ -149,11 +183,17 @@ def test_what_ci_makes_is_a_target(name: str) -> None:
     subprocess.run(["bash", "-n", script], check=True)
     assert os.access(script, os.X_OK)
     text = script.read_text(encoding="utf-8")
-    told, parts = (re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ "))
+    told, parts = (
+        re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ ")
+    )
     assert len(told) + len(parts) >= 4
-    assert {*told, *parts} <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert {*told, *parts} <= set(
+        re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    )
     pages = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    assert [one for one in (f".ci/{name}", *(f"make {one}" for one in parts)) if f"`{one}" not in pages] == []
+    assert [
+        one for one in (f".ci/{name}", *(f"make {one}" for one in parts)) if f"`{one}" not in pages
+    ] == []
 
 
 def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_path: Path) -> None:
@@ -163,7 +203,9 @@ def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_pa
     (tmp_path / "make").write_text('#!/bin/sh\necho "did $*"\n[ "$1" != oracle ]\n')
     (tmp_path / "make").chmod(0o755)
     path = f"{tmp_path}:{os.environ['PATH']}"
-    done = subprocess.run([weekly], env={"PATH": path, "FUZZ_S": "5"}, capture_output=True, text=True)
+    done = subprocess.run(
+        [weekly], env={"PATH": path, "FUZZ_S": "5"}, capture_output=True, text=True
+    )
     assert done.returncode == 1
     lines = done.stdout.splitlines()
     assert [line.split(" ")[0] for line in lines] == [

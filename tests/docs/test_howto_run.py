@@ -30,7 +30,9 @@ def test_the_commands_leave_what_the_page_says(folder):
 def test_every_file_of_a_run_is_in_the_table(folder):
     page = pages.text(PAGE)
     left = {path.name for path in (folder / "out" / "simsat_bump").iterdir()}
-    assert [name for name in left if f"`{name}`" not in page and not name.startswith("frame_")] == []
+    assert [
+        name for name in left if f"`{name}`" not in page and not name.startswith("frame_")
+    ] == []
 
 
 def test_the_3d_views_are_written_or_the_reason_is_printed(folder):

@@ -41,7 +41,9 @@ def test_the_camera_block_is_a_camera_that_sees(folder):
     assert set(mine) == {"camera", "background", "motion"}
     assert not set(mine["motion"]) & set(tree["motion"])
     path = folder / "mine.yaml"
-    path.write_text(yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False))
+    path.write_text(
+        yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
+    )
     told = pages.answer(folder, "run", str(path), "--frames", "2")
     assert (told["frames"], told["solved"], told["wrong"]) == (2, 2, 0)
 
@@ -81,7 +83,10 @@ def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
 def test_every_choice_that_the_vehicle_block_names_is_one():
     """`# or ...` beside a choice lists the others, all of them; and every kind of maneuver is shown."""
     block = pages.yaml_block(PAGE, "base")
-    told = {key: {one, *others.split(", ")} for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)}
+    told = {
+        key: {one, *others.split(", ")}
+        for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)
+    }
     choices = {
         key: set(get_args(part.model_fields[key].annotation))
         for part, keys in (
@@ -93,7 +98,10 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
     choices["law"] = {*motion.BUILT_IN_LAWS, motion.PRESCRIBED}
     assert told == choices
     shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["maneuver"]}
-    kinds = {get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(motion.Maneuver)[0])}
+    kinds = {
+        get_args(part.model_fields["kind"].annotation)[0]
+        for part in get_args(get_args(motion.Maneuver)[0])
+    }
     assert shown | {"profile"} == kinds  # which has a page of its own
 
 
@@ -104,7 +112,8 @@ def test_the_controller_of_the_page_damps(folder):
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     numbers = [float(word) for word in re.findall(r"[-\d.]+(?:e[-+]\d+)?", done.stdout)]
-    turned, rate = np.array(numbers[:3]), np.array(numbers[3:])
+    turned = np.array(numbers[:3])
+    rate = np.array(numbers[3:])
     inertia = np.array([6.0, 6.5, 9.0])
     expected = np.array([2, 0, 5]) * inertia / 5 * (1 - np.exp(-5 * 1.25 / inertia))
     np.testing.assert_allclose(turned, expected, rtol=0, atol=0.2)
@@ -115,7 +124,9 @@ def test_the_error_message_is_what_a_user_sees(tmp_path, monkeypatch):
     (block,) = pages.blocks(PAGE, "text")
     bad = (ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8")
     (tmp_path / "scenes").mkdir()
-    (tmp_path / "scenes/afit_simsat.yaml").write_text(bad.replace("falloff: inverse_square", "falloff: cubic"))
+    (tmp_path / "scenes/afit_simsat.yaml").write_text(
+        bad.replace("falloff: inverse_square", "falloff: cubic")
+    )
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as raised:
         load("scenes/afit_simsat.yaml")
@@ -132,4 +143,10 @@ def test_every_kind_of_dome_is_in_the_reference():
 def test_every_section_of_a_scene_is_in_the_reference():
     section = pages.text(REFERENCE).partition("## Sections\n")[2].partition("\n## ")[0]
     told = set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
-    assert told == set(Scene.model_fields) - {"schema_version", "name", "title", "seed", "start_time"}
+    assert told == set(Scene.model_fields) - {
+        "schema_version",
+        "name",
+        "title",
+        "seed",
+        "start_time",
+    }

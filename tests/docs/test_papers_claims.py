@@ -21,7 +21,11 @@ def row(begin: str) -> str:
 
 def lowest(failures: int, runs: int) -> float:
     """The probability of success at which so few failures have a probability of 5 %: of the binomial distribution."""
-    return float(scipy.optimize.brentq(lambda p: scipy.stats.binom.cdf(failures, runs, 1 - p) - 0.05, 0.01, 1 - 1e-9))
+    return float(
+        scipy.optimize.brentq(
+            lambda p: scipy.stats.binom.cdf(failures, runs, 1 - p) - 0.05, 0.01, 1 - 1e-9
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -38,7 +42,9 @@ def lowest(failures: int, runs: int) -> float:
 def test_bounds_of_success(begin, failures, runs, text):
     assert text in row(begin)
     digits = len(text.strip("*% ").split(".")[1])
-    assert float(text.strip("*% ")) == pytest.approx(100 * lowest(failures, runs), abs=0.5 * 10**-digits)
+    assert float(text.strip("*% ")) == pytest.approx(
+        100 * lowest(failures, runs), abs=0.5 * 10**-digits
+    )
 
 
 def test_no_false_attitude_in_ten_thousand():
@@ -55,9 +61,12 @@ def test_runs_for_97_percent():
 
 def test_means_of_gaussian_errors():
     """The mean length of two Gaussian axes is sigma sqrt(pi / 2), the mean size of one is sigma sqrt(2 / pi)."""
-    axis, roll = 0.962 / math.sqrt(math.pi / 2), 4.69 / math.sqrt(2 / math.pi)
+    axis = 0.962 / math.sqrt(math.pi / 2)
+    roll = 4.69 / math.sqrt(2 / math.pi)
     assert f"{axis:.2f}″ an axis" in row("PTASE, table 1 | mean error of the optical")
-    assert f"{scipy.stats.rayleigh.ppf(0.997, scale=axis):.1f}″ in 99.7 %" in row("PTASE, table 1 | mean error of")
+    assert f"{scipy.stats.rayleigh.ppf(0.997, scale=axis):.1f}″ in 99.7 %" in row(
+        "PTASE, table 1 | mean error of"
+    )
     assert f"{roll:.1f}″, 1 σ; {scipy.stats.halfnorm.ppf(0.997, scale=roll):.1f}″" in row(
         "PTASE, table 1 | mean error in"
     )

@@ -61,13 +61,19 @@ def test_every_name_in_the_table_of_changes_is_in_its_file():
     rows = re.findall(r"\| ((?:`\w+`(?:, )?)+) in (.*) \|", pages.text(ARCHITECTURE))
     assert len(rows) >= 8
     for names, places in rows:
-        paths = [(ROOT / ARCHITECTURE).parent / path for path in re.findall(r"\]\(([^)]+)\)", places)]
+        paths = [
+            (ROOT / ARCHITECTURE).parent / path for path in re.findall(r"\]\(([^)]+)\)", places)
+        ]
         text = "".join(path.read_text(encoding="utf-8") for path in paths if path.is_file())
         assert [name for name in re.findall(r"`(\w+)`", names) if name not in text] == []
 
 
 def test_every_package_is_in_the_table_of_packages():
     page = pages.text(ARCHITECTURE)
-    packages = [path for root in ("skysim", "estimator") for path in sorted((ROOT / root).glob("*/__init__.py"))]
+    packages = [
+        path
+        for root in ("skysim", "estimator")
+        for path in sorted((ROOT / root).glob("*/__init__.py"))
+    ]
     names = [path.parent.relative_to(ROOT).as_posix() for path in packages]
     assert [name for name in names if f"[`{name}`](../../{name})" not in page] == []

@@ -18,9 +18,13 @@ from skysim.dynamics.multibody.actuators.fans import Desaturator, FanSet
 from skysim.dynamics.multibody.actuators.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
 
-BUS = np.array([[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]])  # kg m2, less the rotors about their axles
+BUS = np.array(
+    [[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]]
+)  # kg m2, less the rotors about their axles
 BUS_INVERSE = np.linalg.inv(BUS)
-SKEW = math.acos(1 / math.sqrt(3))  # 54.74 deg: the pyramid with nearly the same momentum in every direction
+SKEW = math.acos(
+    1 / math.sqrt(3)
+)  # 54.74 deg: the pyramid with nearly the same momentum in every direction
 SLANT = math.cos(SKEW)
 STILL = np.zeros(3)
 
@@ -59,7 +63,9 @@ class Body:
 
     @classmethod
     def start(cls, gimbal, axle, inertia, angle, speed, rate) -> Body:
-        body = cls(gimbal, axle, inertia, np.array(angle, float), np.zeros(len(inertia)), STILL, STILL)
+        body = cls(
+            gimbal, axle, inertia, np.array(angle, float), np.zeros(len(inertia)), STILL, STILL
+        )
         axles = body.axles(body.angle)
         body.spin = inertia * (np.asarray(speed, float) + rate @ axles)
         body.whole = BUS @ rate + axles @ body.spin
@@ -82,10 +88,13 @@ class Body:
     def move(self, dt: float, gimbal_rate=0.0, motor=0.0, outside=STILL) -> Body:
         """The body dt later (or earlier), with what is commanded held."""
         n = len(self.inertia)
-        gimbal_rate, motor = np.broadcast_to(gimbal_rate, n), np.broadcast_to(motor, n)
+        gimbal_rate = np.broadcast_to(gimbal_rate, n)
+        motor = np.broadcast_to(motor, n)
 
         def flow(t: float, state: np.ndarray) -> np.ndarray:
-            whole, angle, spin = state[:3], state[6 : 6 + n], state[6 + n :]
+            whole = state[:3]
+            angle = state[6 : 6 + n]
+            spin = state[6 + n :]
             rate = self.rate_of(whole, angle, spin)
             return np.concatenate([outside - np.cross(rate, whole), rate, gimbal_rate, motor])
 
@@ -97,7 +106,8 @@ class Body:
 
 def torque_felt(body: Body, gimbal_rate=0.0, motor=0.0, dt: float = 1e-4) -> np.ndarray:
     """BUS d(rate)/dt by a central difference, whose own error is of the order of dt squared."""
-    later, earlier = body.move(dt, gimbal_rate, motor), body.move(-dt, gimbal_rate, motor)
+    later = body.move(dt, gimbal_rate, motor)
+    earlier = body.move(-dt, gimbal_rate, motor)
     return BUS @ (later.rate - earlier.rate) / (2 * dt)
 
 
@@ -120,17 +130,17 @@ def test_wheels_turn_the_body_and_take_its_momentum(n):
         body = body.move(0.01, motor=set_.drive(torque, body.speed, 0.01))
     np.testing.assert_allclose(body.rate, np.linalg.solve(BUS, torque * 1.0), rtol=1e-9, atol=0)
     everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
-    np.testing.assert_allclose(set_.momentum(body.speed), -everything @ body.rate, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        set_.momentum(body.speed), -everything @ body.rate, rtol=1e-9, atol=0
+    )
 
 
 def test_with_the_gyroscopic_torque_fed_forward_spinning_wheels_do_what_is_asked():
     """The convention: ask for T + rate x (all momentum), and BUS d(rate)/dt = T; without it, not."""
     set_ = wheels(4, torque_limit_nm=5.0)
-    speed, rate, torque = (
-        np.array([200.0, -50, 120, 10]),
-        np.array([0.3, -0.2, 0.4]),
-        np.array([0.1, 0.2, -0.3]),
-    )
+    speed = np.array([200.0, -50, 120, 10])
+    rate = np.array([0.3, -0.2, 0.4])
+    torque = np.array([0.1, 0.2, -0.3])
     body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(4), speed, rate)
     everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
     gyroscopic = np.cross(rate, everything @ rate + set_.momentum(speed))
@@ -188,7 +198,9 @@ def test_what_level_wheels_cannot_do_is_left_out(angles_deg):
 def fans(limit_n: float = 0.5) -> FanSet:
     """A pair about each axis, a meter apart, whose pushes cancel."""
     places = 0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
-    pushes = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float).T
+    pushes = np.array(
+        [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
+    ).T
     return FanSet(pushes, places, limit_n)
 
 
@@ -200,14 +212,16 @@ def test_a_fan_pair_is_a_couple():
 
 
 def test_fans_make_the_torque_with_the_least_thrust():
-    set_, torque = fans(), np.array([0.1, -0.2, 0.05])
+    set_ = fans()
+    torque = np.array([0.1, -0.2, 0.05])
     thrust = set_.drive(torque)
     np.testing.assert_allclose(set_.torque(thrust), torque, rtol=0, atol=1e-15)
     np.testing.assert_allclose(thrust, np.repeat(torque / 2 / 0.5, 2), rtol=1e-13, atol=0)
 
 
 def test_fans_at_their_limit_keep_the_direction():
-    set_, torque = fans(), np.array([3.0, -2.0, 1.0])
+    set_ = fans()
+    torque = np.array([3.0, -2.0, 1.0])
     thrust = set_.drive(torque)
     assert np.abs(thrust).max() == pytest.approx(0.5, rel=1e-15)
     np.testing.assert_allclose(set_.torque(thrust), torque / 6, rtol=1e-13, atol=0)
@@ -223,13 +237,16 @@ SPEEDS = np.array([100.0, 80, -120, 95])
 def test_the_momentum_is_the_turned_rotors():
     set_ = pyramid_set()
     axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
-    np.testing.assert_allclose(set_.momentum(ANGLES, SPEEDS), 0.01 * SPEEDS @ axles, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        set_.momentum(ANGLES, SPEEDS), 0.01 * SPEEDS @ axles, rtol=0, atol=1e-14
+    )
 
 
 @pytest.mark.slow
 def test_the_jacobian_is_the_momentums_derivative():
     """By a five-point difference, exact to the fourth order of 1e-3 rad."""
-    set_, step = pyramid_set(), 1e-3
+    set_ = pyramid_set()
+    step = 1e-3
     for k, column in enumerate(set_.jacobian(ANGLES, SPEEDS).T):
         near, far = (np.eye(4)[k] * m * step for m in (1, 2))
         one = set_.momentum(ANGLES + near, SPEEDS) - set_.momentum(ANGLES - near, SPEEDS)
@@ -242,7 +259,9 @@ def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
     assert square.manipulability(np.zeros(3), np.full(3, 100.0)) == pytest.approx(1, rel=1e-12)
     assert square.manipulability(np.zeros(3), np.zeros(3)) == 0
     set_ = pyramid_set()
-    assert set_.manipulability(ANGLES, 7 * SPEEDS) == pytest.approx(set_.manipulability(ANGLES, SPEEDS))
+    assert set_.manipulability(ANGLES, 7 * SPEEDS) == pytest.approx(
+        set_.manipulability(ANGLES, SPEEDS)
+    )
     # At rest the columns are (-c, 0, s), (0, -c, s), ...: A A^T = diag(2 c^2, 2 c^2, 4 s^2), c^2 = 1/3, trace 4.
     at_rest = math.sqrt(2 / 3 * 2 / 3 * 8 / 3 / (4 / 3) ** 3)
     assert set_.manipulability(np.zeros(4), SPEED) == pytest.approx(at_rest, rel=1e-12)
@@ -256,8 +275,12 @@ def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
 @pytest.mark.parametrize("rate", [[0, 0, 0], [0.3, -0.2, 0.4]])
 def test_gyros_push_with_gimbal_rate_times_momentum(rate):
     """On a body of its own: ask for T + rate x (all momentum), and BUS d(rate)/dt = T to 1e-6."""
-    set_, rate, torque = pyramid_set("pseudo_inverse"), np.array(rate), np.array([0.1, 0.2, -0.3])
-    body = Body.start(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, ANGLES, SPEEDS, rate)
+    set_ = pyramid_set("pseudo_inverse")
+    rate = np.array(rate)
+    torque = np.array([0.1, 0.2, -0.3])
+    body = Body.start(
+        set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, ANGLES, SPEEDS, rate
+    )
     asked = torque + np.cross(rate, body.whole)
     gimbal_rate, motor = set_.drive(asked, rate, ANGLES, SPEEDS, 0.0)
     assert np.abs(gimbal_rate).max() < 1
@@ -272,21 +295,31 @@ def test_gyros_push_with_gimbal_rate_times_momentum(rate):
 def test_away_from_singularities_both_ways_of_steering_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
-    plain, robust = (pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0] for name in STEERING)
+    plain, robust = (
+        pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0] for name in STEERING
+    )
     lambda_ = 0.01 * math.exp(-10 * 32 / 27)
     assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()
 
 
 def test_the_robust_inverse_is_wie_s_at_any_time():
     """A^T (A A^T + lambda E)^-1: E is 1 on the diagonal, e_i = 0.01 sin(pi t / 2 + phase_i) off it."""
-    plain, rng = interpreted("skysim.dynamics.multibody.actuators.cmgs"), np.random.default_rng(4)
+    plain = interpreted("skysim.dynamics.multibody.actuators.cmgs")
+    rng = np.random.default_rng(4)
     for t_s in (0.0, 0.3, 1.1, 2.6):
-        jacobian, asked = 0.3 * rng.normal(size=(3, 4)), rng.normal(size=3)
+        jacobian = 0.3 * rng.normal(size=(3, 4))
+        asked = rng.normal(size=3)
         e_1, e_2, e_3 = 0.01 * np.sin(np.pi * t_s / 2 + np.array([0, np.pi / 2, np.pi]))
         gram = jacobian @ jacobian.T
-        damping = 0.01 * np.exp(-10 * np.linalg.det(gram)) * np.array([[1, e_3, e_2], [e_3, 1, e_1], [e_2, e_1, 1]])
+        damping = (
+            0.01
+            * np.exp(-10 * np.linalg.det(gram))
+            * np.array([[1, e_3, e_2], [e_3, 1, e_1], [e_2, e_1, 1]])
+        )
         wanted = jacobian.T @ np.linalg.solve(gram + damping, asked)
-        np.testing.assert_allclose(plain.singularity_robust(jacobian, asked, t_s), wanted, rtol=1e-9)
+        np.testing.assert_allclose(
+            plain.singularity_robust(jacobian, asked, t_s), wanted, rtol=1e-9
+        )
 
 
 @pytest.mark.slow
@@ -298,17 +331,24 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
     assert np.abs(rate).max() == pytest.approx(0.1, rel=1e-12)
     given = -set_.jacobian(np.zeros(4), SPEED) @ rate
     # The robust inverse is off by lambda, 5e-8 there, over the smallest eigenvalue 2/3.
-    np.testing.assert_allclose(given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6
+    )
     assert np.linalg.norm(given) < 0.5 * np.linalg.norm(torque)
 
 
 def test_a_gyro_may_lie_at_any_angle():
     """Gimbal and rotor at 45 deg between x and y: at right angles, though no product of their components is zero."""
     one = CmgSet(
-        np.sqrt([[0.5], [0.5], [0.0]]), np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]], np.array([0.01]), 1.0
+        np.sqrt([[0.5], [0.5], [0.0]]),
+        np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]],
+        np.array([0.01]),
+        1.0,
     )
     np.testing.assert_allclose(
-        one.momentum(np.zeros(1), np.array([100.0])), np.sqrt([0.5, 0.5, 0.0]) * [1, -1, 1], rtol=1e-12
+        one.momentum(np.zeros(1), np.array([100.0])),
+        np.sqrt([0.5, 0.5, 0.0]) * [1, -1, 1],
+        rtol=1e-12,
     )
 
 
@@ -333,14 +373,18 @@ def test_the_pyramid_saturates_where_every_rotor_points_its_best():
 
 @pytest.mark.slow
 def test_in_a_singularity_the_pseudo_inverse_still_does_the_rest():
-    set_, angles = pyramid_set("pseudo_inverse"), np.radians([-90, 0, 90, 0])
+    set_ = pyramid_set("pseudo_inverse")
+    angles = np.radians([-90, 0, 90, 0])
     rate, _ = set_.drive(np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
-    np.testing.assert_allclose(-set_.jacobian(angles, SPEED) @ rate, [0, 0.1, -0.2], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        -set_.jacobian(angles, SPEED) @ rate, [0, 0.1, -0.2], rtol=0, atol=1e-14
+    )
 
 
 def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Momentum (N, 3), gimbal rates and angles (N, 4) from rest, momentum wanted to grow by 0.1 N m along +x."""
-    angle, story = np.zeros(4), []
+    angle = np.zeros(4)
+    story = []
     for k in range(round(seconds / 0.01)):
         rate, _ = set_.drive(np.array([-0.1, 0, 0]), STILL, angle, SPEED, 0.01 * k)
         angle = angle + 0.01 * rate
@@ -355,12 +399,16 @@ def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
     reached = 2 * SLANT
     before = round(0.99 * reached / 0.1 / 0.01)
-    grown = 0.001 * np.arange(1, before)  # until then all is well; Euler's steps of 10 ms are good to a percent
+    grown = 0.001 * np.arange(
+        1, before
+    )  # until then all is well; Euler's steps of 10 ms are good to a percent
     np.testing.assert_allclose(momentum[: before - 1, 0], grown, rtol=0, atol=0.01 * reached)
     assert momentum[:, 0].max() <= reached * (1 + 1e-12)
     assert momentum[2000:, 0].min() > 0.999 * reached
     np.testing.assert_allclose(np.degrees(angles[2000:]), [[-90, 0, 90, 0]] * 4000, rtol=0, atol=2)
-    assert np.abs(rates[2000:]).max() == pytest.approx(1, rel=1e-12)  # at the limit, to and fro, for nothing
+    assert np.abs(rates[2000:]).max() == pytest.approx(
+        1, rel=1e-12
+    )  # at the limit, to and fro, for nothing
 
 
 @pytest.mark.slow
@@ -372,7 +420,9 @@ def test_the_robust_inverse_passes_it_and_comes_to_saturation():
     assert np.abs(rates).max() < 0.9
     assert np.abs(momentum[:, 1:]).max() < 0.05 * full
     inside = (momentum[:, 0] > 0.999 * 2 * SLANT) & (momentum[:, 0] < 1.001 * 2 * SLANT)
-    assert np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1  # it went through there
+    assert (
+        np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1
+    )  # it went through there
     folded = np.degrees(np.mod(angles[-1] + 0.5, 2 * np.pi) - 0.5)
     np.testing.assert_allclose(folded, [270, 180, 90, 0], rtol=0, atol=5)
 
@@ -382,7 +432,9 @@ def test_the_robust_inverse_passes_it_and_comes_to_saturation():
 
 def variable(rotor_torque_limit_nm: float = 0.5) -> CmgSet:
     """Three about the axes of the body, one N m s each at 100 rad/s; at angle zero d(h)/d(angle) is diagonal."""
-    return CmgSet(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0, rotor_torque_limit_nm)
+    return CmgSet(
+        np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0, rotor_torque_limit_nm
+    )
 
 
 THREE = np.full(3, 100.0)
@@ -396,15 +448,22 @@ def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_rotors_deliver_what_singular_gimbals_cannot():
-    set_, along = variable(), np.array([2.0, 1.0, -2.0]) / 3
+    set_ = variable()
+    along = np.array([2.0, 1.0, -2.0]) / 3
     angles = singular_angles(set_, along)
-    np.testing.assert_allclose(along @ set_.jacobian(angles, THREE), np.zeros(3), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        along @ set_.jacobian(angles, THREE), np.zeros(3), rtol=0, atol=1e-15
+    )
     torque = 0.3 * along + 0.2 * np.array([1.0, 0, 1.0])
     rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
     assert np.abs(motor).max() < 0.5
-    body = Body.start(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL)
+    body = Body.start(
+        set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL
+    )
     np.testing.assert_allclose(torque_felt(body, rate, motor), torque, rtol=0, atol=3e-7)
-    assert along @ (body.axles(angles) @ motor) == pytest.approx(-along @ torque, rel=1e-12)  # all by the rotors
+    assert along @ (body.axles(angles) @ motor) == pytest.approx(
+        -along @ torque, rel=1e-12
+    )  # all by the rotors
     fixed = CmgSet(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, 1.0)
     stuck, _ = fixed.drive(along, STILL, angles, THREE, 0.0)
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
@@ -413,17 +472,21 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
 @pytest.mark.slow
 def test_rotors_idle_where_gimbals_can():
     """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
-    set_, torque = variable(), np.array([0.3, -0.2, 0.1])
+    set_ = variable()
+    torque = np.array([0.3, -0.2, 0.1])
     rate, motor = set_.drive(torque, STILL, np.zeros(3), THREE, 0.0)
     axles = set_.spin_axes
-    np.testing.assert_allclose(-set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        -set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0
+    )
     assert 0 < np.linalg.norm(motor) < 2 * 0.25 * math.exp(-10) * np.linalg.norm(torque)
 
 
 @pytest.mark.slow
 def test_variable_speed_gyros_do_as_asked_at_any_angle():
     """800 random attitudes of the gimbals: exact to rounding wherever nothing is at its limit."""
-    set_, rng = variable(rotor_torque_limit_nm=5.0), np.random.default_rng(4)
+    set_ = variable(rotor_torque_limit_nm=5.0)
+    rng = np.random.default_rng(4)
     for angles in rng.uniform(-np.pi, np.pi, (800, 3)):
         torque = 0.1 * rng.standard_normal(3)
         rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
@@ -434,7 +497,8 @@ def test_variable_speed_gyros_do_as_asked_at_any_angle():
 
 @pytest.mark.slow
 def test_variable_speed_gyros_at_their_limits_keep_the_direction():
-    set_, along = variable(rotor_torque_limit_nm=0.05), np.array([2.0, 1.0, -2.0]) / 3
+    set_ = variable(rotor_torque_limit_nm=0.05)
+    along = np.array([2.0, 1.0, -2.0]) / 3
     angles = singular_angles(set_, along)
     for torque in (3.0 * along, 10 * np.array([1.0, 0, 1]) + 0.01 * along):
         rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
@@ -448,7 +512,8 @@ def test_variable_speed_gyros_at_their_limits_keep_the_direction():
 
 @pytest.mark.slow
 def test_rotors_at_rest_work_as_wheels():
-    set_, torque = variable(), np.array([0.1, 0.2, -0.1])
+    set_ = variable()
+    torque = np.array([0.1, 0.2, -0.1])
     rate, motor = set_.drive(torque, STILL, np.zeros(3), np.zeros(3), 0.0)
     np.testing.assert_allclose(-set_.spin_axes @ motor, torque, rtol=1e-12, atol=0)
     np.testing.assert_array_equal(rate, np.zeros(3))
@@ -467,15 +532,22 @@ def test_desaturation_has_its_hysteresis():
 
 
 def test_the_torque_is_the_momentum_over_the_time_against_it():
-    np.testing.assert_allclose(Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0)
+    np.testing.assert_allclose(
+        Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
+    )
 
 
 @pytest.mark.slow
 def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     """h falls as exp(-t / 8 s), from 1.5 to 0.2 N m s in 8 ln 7.5 = 16.1 s, and the body comes to rest where it was."""
-    set_, fan, blow = wheels(3), Desaturator(PART), fans(limit_n=1.0)
+    set_ = wheels(3)
+    fan = Desaturator(PART)
+    blow = fans(limit_n=1.0)
     body = Body.start(np.eye(3), np.eye(3), set_.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL)
-    period, stored, turned, fanned = 0.1, [], [], []
+    period = 0.1
+    stored = []
+    turned = []
+    fanned = []
     for _ in range(300):
         held = set_.momentum(body.speed)
         outside = blow.torque(blow.drive(fan.torque(held)))
@@ -490,8 +562,12 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     # The loop of 2 rad/s follows the fans by 2 damping / bandwidth = 0.8 s.
     assert stopped * period == pytest.approx(8 * math.log(7.5), abs=1.0)
     assert stored[stopped] < 0.2
-    assert stored[stopped + 80] == pytest.approx(stored[-1], abs=0.001)  # stays, once the loop has settled
-    assert max(turned) < 0.2 / 3 / 4 * 1.2  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
+    assert stored[stopped + 80] == pytest.approx(
+        stored[-1], abs=0.001
+    )  # stays, once the loop has settled
+    assert (
+        max(turned) < 0.2 / 3 / 4 * 1.2
+    )  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
     assert turned[-1] < 1e-3 * max(turned)
 
 
@@ -501,13 +577,19 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: WheelSet(2 * np.eye(3), np.ones(3), 1.0, 1.0), r"wheel axes: lengths .*allowed: unit"),
+        (
+            lambda: WheelSet(2 * np.eye(3), np.ones(3), 1.0, 1.0),
+            r"wheel axes: lengths .*allowed: unit",
+        ),
         (
             lambda: WheelSet(np.ones((4, 3)), np.ones(3), 1.0, 1.0),
             r"wheel axes: shape \(4, 3\); allowed: \(3, n\)",
         ),
         (lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0), r"wheel axes: shape \(3, 0\)"),
-        (lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
+        (
+            lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0),
+            r"inertia.*allowed: 3 positive",
+        ),
         (lambda: WheelSet(np.eye(3), np.ones(2), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
         (
             lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0),

@@ -53,15 +53,21 @@ def closed(
     inverse = np.linalg.inv(law.inertia_kg_m2)
 
     def slope(t_s: float, y: Floats) -> Floats:
-        R, w = y[:9].reshape(3, 3), y[9:12]
+        R = y[:9].reshape(3, 3)
+        w = y[9:12]
         law.error_sum_rad_s = y[12:].copy()
-        torque = law.torque_nm(t_s, quaternion.from_rotation(Rotation.from_matrix(R)), w, stored_nms) + disturbance_nm
+        torque = (
+            law.torque_nm(t_s, quaternion.from_rotation(Rotation.from_matrix(R)), w, stored_nms)
+            + disturbance_nm
+        )
         moves = inverse @ (torque - np.cross(w, law.inertia_kg_m2 @ w + stored_nms))
         return np.concatenate([np.cross(R, w).ravel(), moves, law.error_rad])
 
     begin = np.concatenate([lab_from_start.as_matrix().ravel(), rate, NONE])
     until = np.concatenate([[0.0], until_s])
-    run = solve_ivp(slope, (0, until[-1]), begin, t_eval=until[1:], method="DOP853", rtol=1e-9, atol=1e-11)
+    run = solve_ivp(
+        slope, (0, until[-1]), begin, t_eval=until[1:], method="DOP853", rtol=1e-9, atol=1e-11
+    )
     return Rotation.from_matrix(run.y[:9].T.reshape(-1, 3, 3)), run.y[9:12].T
 
 
@@ -85,7 +91,8 @@ def test_error_decays_by_the_placed_poles() -> None:
 
 def test_poles_are_the_roots_of_what_the_gains_make() -> None:
     """s^3 + kd s^2 + kp s + ki, of which pd has no last one and s^2 + 2 z b s + b^2 left."""
-    pid, pd = holding(**PLACED), holding(**PLACED, law="pd")
+    pid = holding(**PLACED)
+    pd = holding(**PLACED, law="pd")
     np.testing.assert_allclose([1, pid.kd, pid.kp, pid.ki], POLES, rtol=1e-15, atol=0)
     np.testing.assert_allclose([1, pd.kd, pd.kp, pd.ki], [1, 2.8, 4.0, 0.0], rtol=1e-15, atol=0)
 
@@ -93,7 +100,9 @@ def test_poles_are_the_roots_of_what_the_gains_make() -> None:
 def test_error_is_counted_by_the_shorter_way() -> None:
     """At 200 deg of yaw it is wrong by -160: the torque goes on in the positive sense."""
     law = holding(law="pd", **PLACED)
-    torque = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_euler("z", 200, degrees=True)), NONE, NONE)
+    torque = law.torque_nm(
+        0.0, quaternion.from_rotation(Rotation.from_euler("z", 200, degrees=True)), NONE, NONE
+    )
     np.testing.assert_allclose(torque, [0, 0, 9.0 * 4.0 * math.radians(160)], rtol=0, atol=1e-12)
 
 
@@ -102,7 +111,9 @@ def late(period_s: float) -> float:
 
     A body on one axis is integrated exactly between the calls.
     """
-    law, angle, rate = holding(**PLACED), 0.01, 0.0
+    law = holding(**PLACED)
+    angle = 0.01
+    rate = 0.0
     for k in range(round(1.6 / period_s)):
         here = quaternion.from_rotation(Rotation.from_rotvec([angle, 0, 0]))
         torque = law.torque_nm(k * period_s, here, np.array([rate, 0, 0]), NONE)
@@ -125,7 +136,9 @@ def test_a_held_torque_is_late_by_half_a_period() -> None:
 def test_what_a_constant_torque_leaves(law: str) -> None:
     """pd: J^-1 T / b^2, at which the spring holds against it; pid: nothing."""
     push = np.array([0.3, -0.2, 0.1])
-    there, rate = closed(holding(TENSOR, **PLACED, law=law), Rotation.identity(), NONE, np.array([50.0]), push)
+    there, rate = closed(
+        holding(TENSOR, **PLACED, law=law), Rotation.identity(), NONE, np.array([50.0]), push
+    )
     left = {"pd": np.linalg.solve(TENSOR, push) / 2.0**2, "pid": NONE}[law]
     np.testing.assert_allclose(there[0].as_rotvec(), left, rtol=0, atol=1e-8)
     np.testing.assert_allclose(rate[0], NONE, rtol=0, atol=1e-8)
@@ -156,7 +169,8 @@ def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
 
 def test_integral_does_not_wind_up() -> None:
     """Held off its target for a minute at full torque, it lets go at once when the target is crossed."""
-    law, away = holding(), quaternion.from_rotation(Rotation.from_rotvec([0.2, 0, 0]))
+    law = holding()
+    away = quaternion.from_rotation(Rotation.from_rotvec([0.2, 0, 0]))
     for k in range(6000):
         wanted = law.torque_nm(k * 0.01, away, NONE, NONE)
         law.integrate(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
@@ -167,7 +181,9 @@ def test_integral_does_not_wind_up() -> None:
 def test_integral_counts_on_every_axis_that_gets_what_it_wants() -> None:
     """Half of what is wanted about x; all about y; about z a little less than all, as a steering law's rounding."""
     law = holding()
-    wanted = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_rotvec([0.2, 0.2, 0.2])), NONE, NONE)
+    wanted = law.torque_nm(
+        0.0, quaternion.from_rotation(Rotation.from_rotvec([0.2, 0.2, 0.2])), NONE, NONE
+    )
     law.integrate(wanted, wanted * [0.5, 1.0, 0.999], 0.01)
     np.testing.assert_allclose(law.error_sum_rad_s, [0, 2e-3, 2e-3], rtol=1e-12, atol=0)
 
@@ -176,7 +192,9 @@ def test_integral_lets_go_of_a_limit() -> None:
     """Stuck at the positive limit for what it has summed up, with a positive error, which asks for less: it counts."""
     law = holding()
     law.error_sum_rad_s = np.array([-5.0, 0, 0])
-    wanted = law.torque_nm(0.0, quaternion.from_rotation(Rotation.from_rotvec([0.1, 0, 0])), NONE, NONE)
+    wanted = law.torque_nm(
+        0.0, quaternion.from_rotation(Rotation.from_rotvec([0.1, 0, 0])), NONE, NONE
+    )
     assert wanted[0] > 0.5
     law.integrate(wanted, np.clip(wanted, -0.5, 0.5), 0.01)
     assert law.error_sum_rad_s[0] == pytest.approx(-5.0 + 1e-3, abs=1e-12)
@@ -186,7 +204,9 @@ def test_integral_lets_go_of_a_limit() -> None:
 
 
 @pytest.mark.parametrize(("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)])
-def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(fastest: float, expected: float) -> None:
+def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(
+    fastest: float, expected: float
+) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
     config = ControlConfig.model_validate(PLACED)
     law = build_controller(told(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
@@ -221,7 +241,8 @@ def test_a_great_step_is_taken_without_swinging() -> None:
 
 # --- flown --------------------------------------------------------------------------------------------------
 
-OFFSET_M, WEIGHT_N = 0.05e-3, 80 * 9.80665
+OFFSET_M = 0.05e-3
+WEIGHT_N = 80 * 9.80665
 SOFT_RAD_S = math.sqrt(WEIGHT_N * OFFSET_M / (6.0 * math.radians(1.03)))  # 0.603
 
 
@@ -246,4 +267,6 @@ def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
     expected = {"pd": -1.03 * math.cos(tilt), "pid": 0.0}[law]  # towards the heavy side
     np.testing.assert_allclose(left_deg, [expected, 0, 0], rtol=0, atol=1e-4)
     torque = telemetry.torque_nm[-1]
-    np.testing.assert_allclose(torque, [WEIGHT_N * OFFSET_M * math.cos(expected * tilt), 0, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        torque, [WEIGHT_N * OFFSET_M * math.cos(expected * tilt), 0, 0], atol=1e-5
+    )

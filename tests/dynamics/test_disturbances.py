@@ -19,9 +19,15 @@ from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig, 
 from skysim.simulation.flight import Flight, simulate_motion
 
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
-TENSOR = AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T  # of a vehicle whose principal axes are not the body's
+TENSOR = (
+    AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T
+)  # of a vehicle whose principal axes are not the body's
 NONE = np.zeros(3)
-BALANCED = {"vehicle.center_of_mass": "[0 m, 0 m, 0 m]", "motion.control": "none", "motion.maneuver": "[]"}
+BALANCED = {
+    "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
+    "motion.control": "none",
+    "motion.maneuver": "[]",
+}
 QUIET = DisturbancesConfig()
 
 
@@ -35,13 +41,17 @@ def flown(duration_s: float, **changes: str) -> Flight:
 def room(
     config: DisturbancesConfig = QUIET, earth: Floats = NONE, knocks: tuple[Impulse, ...] = ()
 ) -> DisturbanceModel:
-    return DisturbanceModel.from_config(config, earth, knocks, TENSOR, 0.01, np.random.default_rng(1))
+    return DisturbanceModel.from_config(
+        config, earth, knocks, TENSOR, 0.01, np.random.default_rng(1)
+    )
 
 
 # --- the air ------------------------------------------------------------------------------------------------
 
 RMS_NM = np.array([1e-3, 2e-3, 5e-4])
-AIR_CURRENT = AirCurrentConfig.model_validate({"rms": ["1 mN m", "2 mN m", "0.5 mN m"], "correlation": "50 ms"})
+AIR_CURRENT = AirCurrentConfig.model_validate(
+    {"rms": ["1 mN m", "2 mN m", "0.5 mN m"], "correlation": "50 ms"}
+)
 PERIOD_S = 0.01
 
 
@@ -56,16 +66,20 @@ def gusts() -> Floats:
 def test_gusts_have_their_rms_and_no_mean(gusts: Floats) -> None:
     """Of N samples of an Ornstein-Uhlenbeck process, a = exp(-period / time): the mean's variance is rms^2 / N
     (1 + a) / (1 - a), the mean square's 2 rms^4 / N (1 + a^2) / (1 - a^2). Four sigma."""
-    a, n = math.exp(-PERIOD_S / 0.05), len(gusts)
+    a = math.exp(-PERIOD_S / 0.05)
+    n = len(gusts)
     assert (np.abs(gusts.mean(axis=0)) < 4 * RMS_NM * math.sqrt((1 + a) / (1 - a) / n)).all()
     square = (gusts**2).mean(axis=0) / RMS_NM**2
-    np.testing.assert_allclose(square, 1, rtol=0, atol=4 * math.sqrt(2 * (1 + a**2) / (1 - a**2) / n))
+    np.testing.assert_allclose(
+        square, 1, rtol=0, atol=4 * math.sqrt(2 * (1 + a**2) / (1 - a**2) / n)
+    )
 
 
 @pytest.mark.parametrize("lag", [1, 3, 10, 30])
 def test_gusts_forget_themselves_with_their_correlation_time(gusts: Floats, lag: int) -> None:
     """exp(-lag / time) about each axis, nothing between axes; four sigma of Bartlett's formula for such a process."""
-    a, n = math.exp(-PERIOD_S / 0.05), len(gusts)
+    a = math.exp(-PERIOD_S / 0.05)
+    n = len(gusts)
     x = gusts / RMS_NM
     found = x[:-lag].T @ x[lag:] / (n - lag)
     b = a**2
@@ -77,8 +91,12 @@ def test_gusts_forget_themselves_with_their_correlation_time(gusts: Floats, lag:
 
 def test_gusts_begin_as_they_go_on() -> None:
     """The first torque of 4,000 flights has the rms already: 4 sigma of a variance, sqrt(2 / 4000)."""
-    first = np.array([AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample() for k in range(4000)])
-    np.testing.assert_allclose((first**2).mean(axis=0) / RMS_NM**2, 1, rtol=0, atol=4 * math.sqrt(2 / 4000))
+    first = np.array(
+        [AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample() for k in range(4000)]
+    )
+    np.testing.assert_allclose(
+        (first**2).mean(axis=0) / RMS_NM**2, 1, rtol=0, atol=4 * math.sqrt(2 / 4000)
+    )
 
 
 @pytest.mark.slow
@@ -99,7 +117,8 @@ def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
 def test_turbine_spins_a_vehicle_up() -> None:
     """w = T t / J about z: 2e-3 N m for 4 s on 9 kg m2."""
     flight = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
-    motion, telemetry = flight.trajectory(), flight.telemetry()
+    motion = flight.trajectory()
+    telemetry = flight.telemetry()
     expected = 2e-3 / 9 * motion.t_s[-1]
     np.testing.assert_allclose(motion.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
     wanted = np.tile([0, 0, 2e-3], (400, 1))[: len(telemetry.t_s)]
@@ -109,11 +128,14 @@ def test_turbine_spins_a_vehicle_up() -> None:
 # --- the Earth ----------------------------------------------------------------------------------------------
 
 
-def integrated(slope: object, attitude: Rotation, rate: Floats, t_s: Floats) -> tuple[Rotation, Floats]:
+def integrated(
+    slope: object, attitude: Rotation, rate: Floats, t_s: Floats
+) -> tuple[Rotation, Floats]:
     """Attitudes and rates at times of dR/dt = R [w], dw/dt = slope(R, w)."""
 
     def both(_: float, y: Floats) -> Floats:
-        R, w = y[:9].reshape(3, 3), y[9:]
+        R = y[:9].reshape(3, 3)
+        w = y[9:]
         return np.concatenate([np.cross(R, w).ravel(), slope(R, w)])  # type: ignore[operator]
 
     begin = np.concatenate([attitude.as_matrix().ravel(), rate])
@@ -130,8 +152,10 @@ def test_a_free_vehicle_in_a_turning_lab(stored: Floats) -> None:
     and what it does is then of order one.
     """
     earth = np.array([0.02, -0.03, 0.035])
-    start, rate = Rotation.from_rotvec([0.3, 0.1, -0.5]), np.array([0.05, -0.08, 0.11])
-    inverse, t_s = np.linalg.inv(TENSOR), np.linspace(1, 60, 20)
+    start = Rotation.from_rotvec([0.3, 0.1, -0.5])
+    rate = np.array([0.05, -0.08, 0.11])
+    inverse = np.linalg.inv(TENSOR)
+    t_s = np.linspace(1, 60, 20)
 
     def among_stars(_: Floats, w: Floats) -> Floats:
         return inverse @ -np.cross(w, TENSOR @ w + stored)
@@ -148,14 +172,18 @@ def test_a_free_vehicle_in_a_turning_lab(stored: Floats) -> None:
     assert np.linalg.norm((expected.inv() * lab_from_body).as_rotvec(), axis=1).max() < 1e-9
     np.testing.assert_allclose(found, fast - expected.inv().apply(earth), rtol=0, atol=1e-9)
     ignored, _ = integrated(lambda _, w: among_stars(_, w), start, rate, t_s)
-    assert (expected.inv() * ignored).magnitude().max() > 0.5  # without the torque it is somewhere else
+    assert (
+        expected.inv() * ignored
+    ).magnitude().max() > 0.5  # without the torque it is somewhere else
 
 
 def test_a_vehicle_that_stands_still_among_the_stars_turns_with_them() -> None:
     """With dw/dt = 0, in any attitude, whatever its inertia: J dw/dt = T - w x J w, w = -W."""
     earth_body = Rotation.from_rotvec([0.3, 1.0, -0.5]).apply([3e-5, 0, 5e-5])
     torque = earth_torque_nm(TENSOR, NONE, -earth_body, earth_body)
-    np.testing.assert_allclose(torque, np.cross(earth_body, TENSOR @ earth_body), rtol=0, atol=1e-23)
+    np.testing.assert_allclose(
+        torque, np.cross(earth_body, TENSOR @ earth_body), rtol=0, atol=1e-23
+    )
 
 
 def test_a_spinning_wheel_is_a_gyrocompass() -> None:
@@ -163,7 +191,8 @@ def test_a_spinning_wheel_is_a_gyrocompass() -> None:
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     torque = earth_torque_nm(np.zeros((3, 3)), np.array([2.0, 0, 0]), NONE, earth)
     w = 7.292115e-5
-    up, north = w * math.sin(math.radians(39.8)), w * math.cos(math.radians(39.8))
+    up = w * math.sin(math.radians(39.8))
+    north = w * math.cos(math.radians(39.8))
     np.testing.assert_allclose(torque, [0, -2 * up, 2 * north], rtol=0, atol=1e-15)
 
 
@@ -172,12 +201,18 @@ def test_a_flown_vehicle_feels_the_earth_turn() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     rate = str((-np.degrees(earth)).tolist())
-    motion = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate).trajectory()
+    motion = flown(
+        20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate
+    ).trajectory()
     t_s = motion.t_s[-1]
     turned = motion.lab_from_body[-1].as_rotvec()
-    np.testing.assert_allclose(turned, -earth * t_s, rtol=0, atol=1e-6 * np.linalg.norm(earth) * t_s)
+    np.testing.assert_allclose(
+        turned, -earth * t_s, rtol=0, atol=1e-6 * np.linalg.norm(earth) * t_s
+    )
     spinning = '{start_rpm: [3000, 0, 0], torque_limit: "0.5 N m"}'
-    pushed = flown(2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning).telemetry()
+    pushed = flown(
+        2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning
+    ).telemetry()
     # At rest in the lab the momentum among the stars, nearly all of it the wheel's, makes the torque.
     whole = pushed.momentum_nms[0] + np.diag([6.0, 6.5, 9.0]) @ earth
     expected = -np.cross(earth, whole)
@@ -211,13 +246,17 @@ def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
     rate = (5.0 * np.eye(3)[axis]).tolist()
-    motion = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]').trajectory()
+    motion = flown(
+        0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]'
+    ).trajectory()
     np.testing.assert_allclose(np.degrees(motion.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
 
 
 def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
     """Turned by rate times the time between the knocks: 14.5 deg/s for 0.2 s, 2.9 deg."""
-    motion = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE).trajectory()
+    motion = flown(
+        0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE
+    ).trajectory()
     assert np.degrees(np.abs(motion.rate_body_rad_s[-1])).max() < 1e-6
     turned = np.degrees(motion.lab_from_body[-1].as_rotvec())
     np.testing.assert_allclose(turned, np.array([3, -2, 14]) * 0.2, rtol=1e-6, atol=0)
@@ -233,9 +272,14 @@ def test_a_room_is_quiet_where_nothing_is_switched_on() -> None:
     assert room(earth=earth).inactive  # which does not count unless the scene says so
     assert not room(DisturbancesConfig(earth_rotation=True), earth).inactive
     assert not room(knocks=(knock,)).inactive
-    for part in ({"turbine": ["0 N m", "1 uN m", "0 N m"]}, {"air_current": {"rms": ["1 uN m"] * 3}}):
+    for part in (
+        {"turbine": ["0 N m", "1 uN m", "0 N m"]},
+        {"air_current": {"rms": ["1 uN m"] * 3}},
+    ):
         assert not room(DisturbancesConfig.model_validate(part)).inactive
-    assert room(DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})).inactive  # it is MuJoCo's
+    assert room(
+        DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})
+    ).inactive  # it is MuJoCo's
 
 
 def test_a_quiet_room_gives_nothing() -> None:

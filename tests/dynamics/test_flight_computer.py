@@ -73,7 +73,11 @@ def told(flight_computer: FlightComputer, flight: multibody.Simulation) -> Float
     """(nu,) controls of the present tick."""
     stored = flight_computer.momentum_nms(flight.angles_rad, flight.speeds_rad_s)
     now = ControlInput(
-        flight.now_s, flight_computer.period_s, flight.rate_body_rad_s, flight.angles_rad, flight.speeds_rad_s
+        flight.now_s,
+        flight_computer.period_s,
+        flight.rate_body_rad_s,
+        flight.angles_rad,
+        flight.speeds_rad_s,
     )
     return flight_computer.compute_controls(now, flight.lab_from_body_wxyz, stored)
 
@@ -89,7 +93,13 @@ def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
 
 @pytest.mark.parametrize(
     ("name", "within"),
-    [("ideal", 1e-9), ("wheels", 1e-4), ("fans", 1e-3), ("cmgs", 1e-2), ("cmgs of variable speed", 1e-2)],
+    [
+        ("ideal", 1e-9),
+        ("wheels", 1e-4),
+        ("fans", 1e-3),
+        ("cmgs", 1e-2),
+        ("cmgs of variable speed", 1e-2),
+    ],
 )
 def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> None:
     """The body's momentum over twenty ticks, once fans and gimbals have followed: it changes by the wanted T t.
@@ -100,7 +110,8 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
     flight_computer, flight = manned(name)
     wanted = np.array([0.15, -0.1, 0.12])
     flight_computer.law = Asks(wanted)  # type: ignore[assignment]
-    inertia, held = bodys_inertia(flight.vehicle), []
+    inertia = bodys_inertia(flight.vehicle)
+    held = []
     for _ in range(40):
         turn = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
         held.append(turn.apply(inertia @ flight.rate_body_rad_s))
@@ -145,7 +156,9 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
     largest["cmgs of variable speed"] = math.radians(60)
     assert np.abs(control[motors]).max() == pytest.approx(largest[name], rel=1e-9)
     about_y = {"ideal": 1e-4 * 0.01}.get(name, 0.0)
-    np.testing.assert_allclose(flight_computer.law.error_sum_rad_s, [0, about_y, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        flight_computer.law.error_sum_rad_s, [0, about_y, 0], rtol=0, atol=1e-12
+    )
 
 
 def test_controls_of_nobody_are_zeros() -> None:
@@ -181,7 +194,9 @@ def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
 def test_momentum_is_mujocos_own(name: str) -> None:
     """`mj_subtreeVel` of a body at rest in any attitude, its gimbals at any angle, its rotors at any speed."""
     flight_computer, flight = manned(name)
-    vehicle, data, rng = flight.vehicle, flight.data, np.random.default_rng(3)
+    vehicle = flight.vehicle
+    data = flight.data
+    rng = np.random.default_rng(3)
     there = Rotation.from_rotvec([0.3, -0.7, 1.1])
     data.qpos[:4] = there.as_quat(scalar_first=True)
     data.qpos[vehicle.gimbals.qpos] = rng.uniform(-2, 2, len(vehicle.gimbals))
@@ -199,10 +214,16 @@ def test_momentum_is_mujocos_own(name: str) -> None:
 @pytest.mark.parametrize("control", ["none", "{law: pid, actuators: ideal}"])
 def test_momentum_is_in_the_telemetry_whether_somebody_flies_or_not(control: str) -> None:
     """Wheels without friction keep what they had, 0.010125 kg m2 at 300, -500 and 800 rpm."""
-    changes = FREE | WHEELS | {"motion.control": control, "exposure.frames": "1", "exposure.first": "0.2 s"}
+    changes = (
+        FREE
+        | WHEELS
+        | {"motion.control": control, "exposure.frames": "1", "exposure.first": "0.2 s"}
+    )
     telemetry = simulate_motion(loader.load("afit_simsat", changes)).telemetry()
     expected = 0.010125 * np.array([300, -500, 800]) * math.pi / 30
-    np.testing.assert_allclose(telemetry.momentum_nms, np.tile(expected, (len(telemetry.t_s), 1)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        telemetry.momentum_nms, np.tile(expected, (len(telemetry.t_s), 1)), rtol=0, atol=1e-6
+    )
 
 
 # --- desaturation -------------------------------------------------------------------------------------------
@@ -225,13 +246,17 @@ def relieved() -> Telemetry:
 def test_desaturation_follows_the_fans_lag(relieved: Telemetry) -> None:
     """dh/dt = T, dT/dt = (-h / time - T) / lag: the wheels hold against the fans' torque, and slow down."""
     h0 = 0.010125 * 1800 * math.pi / 30
-    run = solve_ivp(lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2], (0, 4), [h0, 0], rtol=1e-9, dense_output=True)
+    run = solve_ivp(
+        lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2], (0, 4), [h0, 0], rtol=1e-9, dense_output=True
+    )
     t_s = np.arange(0.5, 4, 0.5)
     held = np.interp(t_s, relieved.t_s, relieved.momentum_nms[:, 2])
     np.testing.assert_allclose(held, run.sol(t_s)[0], rtol=2e-3, atol=0)
 
 
-def test_desaturation_ends_below_its_stop_and_the_vehicle_stays_where_it_is(relieved: Telemetry) -> None:
+def test_desaturation_ends_below_its_stop_and_the_vehicle_stays_where_it_is(
+    relieved: Telemetry,
+) -> None:
     size = np.linalg.norm(relieved.momentum_nms, axis=1)
     assert size[0] > 1.7
     assert 0.7 < size[-1] < 0.8

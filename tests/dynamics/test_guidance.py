@@ -31,7 +31,13 @@ STEP = {"kind": "step", "roll_deg": 5, "pitch_deg": -9, "yaw_deg": 30, "duration
 RATE = {"kind": "rate", "rate_deg_s": [3, -5, 20], "duration": "4 s"}
 SPIN = {"kind": "spin_up", "rate_deg_s": [-10, 4, 30], "duration": "3 s"}
 SINE = {"kind": "sine", "amplitude_deg": [4, -2, 1], "frequency_hz": 0.7, "duration": "5 s"}
-CHIRP = {"kind": "chirp", "amplitude_deg": [2, -1, 3], "from_hz": 0.5, "to_hz": 3.0, "duration": "8 s"}
+CHIRP = {
+    "kind": "chirp",
+    "amplitude_deg": [2, -1, 3],
+    "from_hz": 0.5,
+    "to_hz": 3.0,
+    "duration": "8 s",
+}
 SHAKE = {
     "kind": "jitter",
     "duration": "3 s",
@@ -45,7 +51,9 @@ def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str,
 
 
 def told(*maneuver: object, **motion: object) -> MotionConfig:
-    return MotionConfig.model_validate({"control": "pid", "maneuver": maneuver, "start": START} | motion)
+    return MotionConfig.model_validate(
+        {"control": "pid", "maneuver": maneuver, "start": START} | motion
+    )
 
 
 def reference(*maneuver: object, **motion: object) -> Reference:
@@ -83,7 +91,9 @@ def sampled(ref: Reference, t_s: np.ndarray) -> tuple[Rotation, np.ndarray, np.n
 
 
 def euler(roll: float, pitch: float, yaw: float) -> Rotation:
-    return attitude(AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}))
+    return attitude(
+        AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
+    )
 
 
 def between(a: Rotation, b: Rotation) -> np.ndarray:
@@ -100,11 +110,19 @@ def there(ref: Reference, t_s: float) -> Rotation:
 
 def test_euler_angles_are_yaw_then_pitch_then_roll() -> None:
     """Rz(yaw) Ry(pitch) Rx(roll) written out by hand."""
-    roll, pitch, yaw = 0.3, -0.5, 1.1
+    roll = 0.3
+    pitch = -0.5
+    yaw = 1.1
     about_x = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
-    about_y = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
+    about_y = [
+        [math.cos(pitch), 0, math.sin(pitch)],
+        [0, 1, 0],
+        [-math.sin(pitch), 0, math.cos(pitch)],
+    ]
     about_z = [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
-    angles = dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees([roll, pitch, yaw]), strict=True))
+    angles = dict(
+        zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees([roll, pitch, yaw]), strict=True)
+    )
     expected = np.array(about_z) @ about_y @ about_x
     slew = SlewConfig.model_validate(angles | {"kind": "slew"})
     step = StepConfig.model_validate(angles | {"kind": "step", "duration": "1 s"})
@@ -120,7 +138,8 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude(name: str) ->
     Where a law's third derivative jumps (the end of a ramp) the difference would be off by h times the jump; such
     moments are 4 h wide, and this seed draws none of them.
     """
-    ref, h = reference(*EVERY[name]), 1e-4
+    ref = reference(*EVERY[name])
+    h = 1e-4
     begin, end = ref.start_s[-2:]
     t = np.random.default_rng(1).uniform(begin + 3 * h, end - 3 * h, 200)
     here, rate, acceleration = sampled(ref, t)
@@ -149,7 +168,9 @@ def test_slews_keep_their_limits_and_use_them(tour: Reference) -> None:
     assert acceleration_deg_s2.max() <= 0.5 + 1e-12
     assert acceleration_deg_s2.max() > 0.4999
     # The last slew, 6 degrees of roll, has no time to cruise: it peaks at sqrt(a angle / 1.5).
-    assert rate_deg_s[t > tour.start_s[-2]].max() == pytest.approx(math.sqrt(0.5 * 6 / 1.5), abs=1e-4)
+    assert rate_deg_s[t > tour.start_s[-2]].max() == pytest.approx(
+        math.sqrt(0.5 * 6 / 1.5), abs=1e-4
+    )
 
 
 def test_slew_takes_the_time_of_its_profile() -> None:
@@ -159,7 +180,9 @@ def test_slew_takes_the_time_of_its_profile() -> None:
 
 def test_slew_goes_the_shorter_way_round() -> None:
     ref = reference(turn_to(0, 0, -170), start={"yaw_deg": 170})
-    assert there(ref, ref.duration_s / 2).as_euler("ZYX", degrees=True)[0] == pytest.approx(180, abs=1e-9)
+    assert there(ref, ref.duration_s / 2).as_euler("ZYX", degrees=True)[0] == pytest.approx(
+        180, abs=1e-9
+    )
 
 
 def test_slew_to_where_it_stands_takes_no_time() -> None:
@@ -179,7 +202,8 @@ def test_step_jumps_and_asks_for_no_rate() -> None:
 
 def test_rate_is_the_exponential_of_the_time() -> None:
     """lab_from_ref = start exp(w t) with the matrix exponential's series; from the first moment to long after."""
-    ref, w = reference(RATE), np.radians([3, -5, 20])
+    ref = reference(RATE)
+    w = np.radians([3, -5, 20])
     for t in (0.0, 1.234, 4.0, 50.0):
         wanted = euler(*START.values()) * Rotation.from_rotvec(w * t)
         assert between(there(ref, t), wanted) < 2e-14
@@ -203,7 +227,8 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
         {"kind": "rate", "rate_deg_s": begin, "duration": "1 s"},
         {"kind": "spin_up", "rate_deg_s": end, "duration": f"{lasts_s} s"},
     )
-    w0, w1 = np.radians(begin), np.radians(end)
+    w0 = np.radians(begin)
+    w1 = np.radians(end)
 
     def rate(t_s: float) -> np.ndarray:
         x = t_s / lasts_s
@@ -217,7 +242,9 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
     run = solve_ivp(slope, (0, lasts_s), ref.state_at(1.0)[0], "DOP853", at, rtol=1e-13, atol=1e-13)
     wanted = Rotation.from_quat(run.y.T, scalar_first=True)
     assert between(ref.attitudes(1.0 + at), wanted).max() < 1e-9
-    np.testing.assert_allclose([ref.state_at(1.0 + t)[1] for t in at], [rate(t) for t in at], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        [ref.state_at(1.0 + t)[1] for t in at], [rate(t) for t in at], rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -242,7 +269,9 @@ def test_first_spin_up_begins_at_the_vehicles_own_rate() -> None:
 
 def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
     fast = {"kind": "spin_up", "rate_deg_s": [0, 360, 0], "duration": "1 h"}
-    with pytest.raises(InputError, match=r"^motion\.maneuver: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$"):
+    with pytest.raises(
+        InputError, match=r"^motion\.maneuver: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$"
+    ):
         reference(RATE, fast | {"duration": "10 h"})
     reference(HOLD, fast | {"duration": "10 h"})  # one axis needs no knots
 
@@ -250,7 +279,8 @@ def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_sine_swings_by_its_amplitude_about_the_attitude_it_started_from() -> None:
     """Between the first and the last period phi(t) is amplitude sin(2 pi f t), exactly."""
-    ref, amplitude = reference(HOLD, SINE), np.radians([4, -2, 1])
+    ref = reference(HOLD, SINE)
+    amplitude = np.radians([4, -2, 1])
     t = np.linspace(1 / 0.7, 5 - 1 / 0.7, 300)
     phi = (euler(*START.values()).inv() * ref.attitudes(2.0 + t)).as_rotvec()
     wanted = np.sin(2 * np.pi * 0.7 * t)[:, None] * amplitude
@@ -263,21 +293,33 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
     ref = reference(HOLD, SINE | {"duration": f"{duration_s} s"}, HOLD)
     for t in ref.start_s[1:3]:
         assert between(there(ref, t), euler(*START.values())) < 1e-15
-        for near in (t - 1e-9, t, t + 1e-9):  # a ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3
+        for near in (
+            t - 1e-9,
+            t,
+            t + 1e-9,
+        ):  # a ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3
             np.testing.assert_allclose(ref.state_at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6)
     inside = np.linspace(2.0, 2.0 + duration_s, 100)
-    assert between(ref.attitudes(inside), euler(*START.values())).max() <= np.radians(math.sqrt(21)) + 1e-15
+    assert (
+        between(ref.attitudes(inside), euler(*START.values())).max()
+        <= np.radians(math.sqrt(21)) + 1e-15
+    )
 
 
 def test_envelope_has_the_derivatives_it_says() -> None:
-    t, h = np.random.default_rng(3).uniform(-0.5, 3.5, 300), 1e-5
+    t = np.random.default_rng(3).uniform(-0.5, 3.5, 300)
+    h = 1e-5
     e, before, after = (np.array([envelope(s, 3.0, 0.7, 0.7) for s in t + d]) for d in (0, -h, h))
     # Within a step of a corner, where the third derivative jumps by 60 / growth^3, off by a quarter of h times that.
-    np.testing.assert_allclose((after - before)[:, :2] / (2 * h), e[:, 1:], rtol=0, atol=60 / 0.7**3 * h / 4)
+    np.testing.assert_allclose(
+        (after - before)[:, :2] / (2 * h), e[:, 1:], rtol=0, atol=60 / 0.7**3 * h / 4
+    )
     middle = (t > 0.7) & (t < 2.3)
     np.testing.assert_array_equal(e[middle], np.tile([1.0, 0.0, 0.0], (middle.sum(), 1)))
     np.testing.assert_array_equal(e[(t < 0) | (t > 3)], 0.0)
-    assert [envelope(s, 3.0, 0.7, 0.7)[0] for s in (0.35, 2.65)] == pytest.approx([0.5, 0.5], abs=1e-15)
+    assert [envelope(s, 3.0, 0.7, 0.7)[0] for s in (0.35, 2.65)] == pytest.approx(
+        [0.5, 0.5], abs=1e-15
+    )
 
 
 @pytest.mark.parametrize("element", [HOLD, SHAKE, BUMP, BUMP | {"caught_after": "1 s"}])
@@ -303,7 +345,8 @@ def test_attitude_is_continuous_over_every_joint_but_a_steps(first: str, second:
     joints = ref.start_s[1:]
     assert len(joints) == len(EVERY[first]) + len(later) + 1
     for joint in joints:
-        before, after = there(ref, joint - 1e-9), there(ref, joint)
+        before = there(ref, joint - 1e-9)
+        after = there(ref, joint)
         assert between(before, after) < 1e-8 * 2  # a ns at up to 1.5 rad/s, and rounding
     durations = [leg.duration_s for leg in ref.legs[:-1]]
     np.testing.assert_allclose(joints, np.cumsum(durations), rtol=1e-15)
@@ -321,15 +364,20 @@ def test_slews_join_without_a_jump_of_rate_or_torque(tour: Reference) -> None:
 
 
 def test_spin_ups_join_without_a_jump_of_rate() -> None:
-    ref = reference(HOLD, SPIN, SPIN | {"rate_deg_s": [50, 0, -40]}, RATE | {"rate_deg_s": [50, 0, -40]})
+    ref = reference(
+        HOLD, SPIN, SPIN | {"rate_deg_s": [50, 0, -40]}, RATE | {"rate_deg_s": [50, 0, -40]}
+    )
     for joint in ref.start_s[1:]:
-        np.testing.assert_allclose(ref.state_at(joint - 1e-9)[1:], ref.state_at(joint + 1e-9)[1:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            ref.state_at(joint - 1e-9)[1:], ref.state_at(joint + 1e-9)[1:], rtol=0, atol=1e-8
+        )
 
 
 @pytest.mark.parametrize("kind", ["rate", "spin_up", "spin_up of a moving axis"])
 def test_a_vehicle_that_was_spun_up_keeps_spinning(kind: str) -> None:
     ref = reference(*EVERY[kind])
-    end, rate = ref.duration_s, np.radians(EVERY[kind][-1]["rate_deg_s"])
+    end = ref.duration_s
+    rate = np.radians(EVERY[kind][-1]["rate_deg_s"])
     for later in (0.0, 1.0, 77.0):
         wanted = there(ref, end) * Rotation.from_rotvec(rate * later)
         assert between(there(ref, end + later), wanted) < 1e-13
@@ -360,7 +408,8 @@ def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
     """Whatever those are called: with the ICRS for lab, the angles are still counted from the start."""
     motion = told(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
     lab_from_start = Rotation.from_rotvec([0.4, -1.0, 2.0])
-    own, icrs = plan(motion), plan(motion, lab_from_start)
+    own = plan(motion)
+    icrs = plan(motion, lab_from_start)
     assert between(there(own, 0.0), Rotation.identity()) == 0
     assert between(there(own, own.start_s[2] - 1e-9), euler(3, -5, 30)) < 1e-12
     np.testing.assert_allclose(own.start_s, icrs.start_s, rtol=1e-14)
@@ -394,7 +443,10 @@ def test_reference_is_quick_enough_for_every_control_tick() -> None:
     for name in EVERY:
         ref = reference(*EVERY[name])
         t = ref.start_s[-2] + 0.3 * (ref.duration_s - ref.start_s[-2])
-        assert min(timeit.repeat(lambda ref=ref, t=t: ref.state_at(t), number=20, repeat=200)) / 20 < 12e-6
+        assert (
+            min(timeit.repeat(lambda ref=ref, t=t: ref.state_at(t), number=20, repeat=200)) / 20
+            < 12e-6
+        )
 
 
 # Knocks and vibration
@@ -404,19 +456,25 @@ def test_a_knock_is_a_half_sine_of_torque() -> None:
     """Shares against the integral of sin(pi x) pi / 2 by scipy's quadrature, cut at the knock's ends."""
     knock = Impulse(2.0, 0.05, np.zeros(3))
     x = np.linspace(0, 1, 20_001)
-    impulse = np.concatenate([[0], np.cumsum(np.sin(np.pi * (x[1:] + x[:-1]) / 2)) * np.pi / 2 / 20_000])
+    impulse = np.concatenate(
+        [[0], np.cumsum(np.sin(np.pi * (x[1:] + x[:-1]) / 2)) * np.pi / 2 / 20_000]
+    )
     for a, b in np.random.default_rng(4).uniform(1.97, 2.08, (50, 2)):
         wanted = np.interp([a, b], 2.0 + 0.05 * x, impulse)
         assert knock.fraction(a, b) == pytest.approx(wanted[1] - wanted[0], abs=1e-8)
     assert knock.fraction(0.0, 2.0) == knock.fraction(2.05, 9.0) == 0
     ticks = np.arange(1.9, 2.2, 1e-3)
-    assert sum(knock.fraction(a, b) for a, b in itertools.pairwise(ticks)) == pytest.approx(1, abs=1e-14)
+    assert sum(knock.fraction(a, b) for a, b in itertools.pairwise(ticks)) == pytest.approx(
+        1, abs=1e-14
+    )
 
 
 def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None:
     motion = told(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
     first, second, third = impulses(motion, plan(motion))
-    assert [k.begin_s for k in (first, second, third)] == pytest.approx([2.0, 5.05, 5.13], abs=1e-12)
+    assert [k.begin_s for k in (first, second, third)] == pytest.approx(
+        [2.0, 5.05, 5.13], abs=1e-12
+    )
     assert [k.duration_s for k in (first, second, third)] == [0.05] * 3
     for knock in (first, second):
         np.testing.assert_allclose(np.degrees(knock.rate_rad_s), [30, -60, 10], rtol=1e-14)
@@ -431,5 +489,7 @@ def test_vibration_sounds_while_its_element_lasts() -> None:
     (begin, end, parts), (later, last, _) = vibration_intervals(motion, plan(motion))
     assert (begin, end) == (2.0, 5.0)
     assert parts[0].frequency_hz == 30
-    assert (later, last) == pytest.approx((plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12)
+    assert (later, last) == pytest.approx(
+        (plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12
+    )
     assert vibration_intervals(told(HOLD, BUMP), reference(HOLD, BUMP)) == ()

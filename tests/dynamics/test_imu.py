@@ -67,7 +67,9 @@ def euler_deg(navigator: Navigator) -> np.ndarray:
     return attitude.as_euler("ZYX", degrees=True)[::-1]
 
 
-def part(gyro: dict[str, Any] | None = None, accelerometer: dict[str, Any] | None = None, seed: int = 200) -> ImuConfig:
+def part(
+    gyro: dict[str, Any] | None = None, accelerometer: dict[str, Any] | None = None, seed: int = 200
+) -> ImuConfig:
     """A unit without errors but for those named."""
     return ImuConfig.model_validate(
         {
@@ -103,7 +105,9 @@ def still(attitude: Rotation, seconds: float, step_s: float, earth: Floats) -> I
     knots = np.arange(0, seconds + 1.5, 1.0)
     ends = step_s * np.arange(1, round(seconds / step_s) + 1)
     attitudes = np.tile(wxyz(attitude), (len(knots), 1))
-    return ideal_increments(knots, attitudes, np.zeros((len(knots), 3)), ends, step_s, PLACE, G, earth)
+    return ideal_increments(
+        knots, attitudes, np.zeros((len(knots), 3)), ends, step_s, PLACE, G, earth
+    )
 
 
 class Cone:
@@ -112,28 +116,43 @@ class Cone:
     2 conj(q) dq/dt is its rate in its own axes: w (-sin a sin wt, sin a cos wt, cos a - 1).
     """
 
-    half, w = 0.3, 25.0
+    half = 0.3
+    w = 25.0
 
     def attitude(self, t: Any) -> Rotation:
         t = np.asarray(t)
-        return Rotation.from_rotvec(self.half * np.stack([np.cos(self.w * t), np.sin(self.w * t), 0 * t], axis=-1))
+        return Rotation.from_rotvec(
+            self.half * np.stack([np.cos(self.w * t), np.sin(self.w * t), 0 * t], axis=-1)
+        )
 
     def rate(self, t: Any) -> Floats:
         t = np.asarray(t)
-        flat, along = np.sin(self.half), np.cos(self.half) - 1
-        return self.w * np.stack([-flat * np.sin(self.w * t), flat * np.cos(self.w * t), along + 0 * t], axis=-1)
+        flat = np.sin(self.half)
+        along = np.cos(self.half) - 1
+        return self.w * np.stack(
+            [-flat * np.sin(self.w * t), flat * np.cos(self.w * t), along + 0 * t], axis=-1
+        )
 
     def angle(self, t: Any) -> Floats:
         t = np.asarray(t)
-        flat, along = np.sin(self.half), np.cos(self.half) - 1
-        return np.stack([flat * np.cos(self.w * t), flat * np.sin(self.w * t), along * self.w * t], axis=-1)
+        flat = np.sin(self.half)
+        along = np.cos(self.half) - 1
+        return np.stack(
+            [flat * np.cos(self.w * t), flat * np.sin(self.w * t), along * self.w * t], axis=-1
+        )
 
     def acceleration(self, t: Any) -> Floats:
         t = np.asarray(t)
-        return -np.sin(self.half) * self.w**2 * np.stack([np.cos(self.w * t), np.sin(self.w * t), 0 * t], axis=-1)
+        return (
+            -np.sin(self.half)
+            * self.w**2
+            * np.stack([np.cos(self.w * t), np.sin(self.w * t), 0 * t], axis=-1)
+        )
 
     def felt(self, knots: Floats, ends: Floats, earth: Floats, step_s: float = STEP) -> Increments:
-        return ideal_increments(knots, wxyz(self.attitude(knots)), self.rate(knots), ends, step_s, PLACE, G, earth)
+        return ideal_increments(
+            knots, wxyz(self.attitude(knots)), self.rate(knots), ends, step_s, PLACE, G, earth
+        )
 
 
 CONE = Cone()
@@ -144,10 +163,15 @@ CONE = Cone()
 
 def test_earth_rate_by_hand() -> None:
     """sin and cos of 39.8 deg of 15.041 deg/h: 9.63 up, 11.56 north."""
-    up_north_of = {90.0: (2, 1, 0), 0.0: (2, 0, 1)}  # with x east, y is north; with x north, y is west
+    up_north_of = {
+        90.0: (2, 1, 0),
+        0.0: (2, 0, 1),
+    }  # with x east, y is north; with x north, y is west
     for azimuth, (up, north, across) in up_north_of.items():
         rate = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=azimuth)) / DEG_H
-        np.testing.assert_allclose(rate[[up, north, across]], [9.63, 11.56, 0.0], rtol=0, atol=0.005)
+        np.testing.assert_allclose(
+            rate[[up, north, across]], [9.63, 11.56, 0.0], rtol=0, atol=0.005
+        )
         np.testing.assert_allclose(np.linalg.norm(rate), 15.041, rtol=0, atol=5e-4)
 
 
@@ -155,9 +179,11 @@ def test_earth_rate_by_hand() -> None:
 @pytest.mark.parametrize("azimuth", [0.0, 37.0, 90.0, -120.0])
 def test_earth_turns_about_its_pole(latitude: float, azimuth: float) -> None:
     """Lab axes made in the Earth's own frame, z to the pole: x, up and their product, at longitude 0."""
-    phi, a = np.radians(latitude), np.radians(azimuth)
+    phi = np.radians(latitude)
+    a = np.radians(azimuth)
     up = np.array([np.cos(phi), 0, np.sin(phi)])
-    north, east = np.array([-np.sin(phi), 0, np.cos(phi)]), np.array([0.0, 1.0, 0.0])
+    north = np.array([-np.sin(phi), 0, np.cos(phi)])
+    east = np.array([0.0, 1.0, 0.0])
     x = np.cos(a) * north + np.sin(a) * east
     pole_lab = np.stack([x, np.cross(up, x), up]) @ [0, 0, 1]
     rate = earth_rate_lab_rad_s(SiteConfig(latitude_deg=latitude, x_azimuth_deg=azimuth))
@@ -194,10 +220,16 @@ def test_compensation_holds_on_a_turning_vehicle() -> None:
 
     Taken away in the axes of each sample's start it would be w dt / 2 of the Earth rate, 1e-7.
     """
-    knots, ends, rate = np.arange(0, 20.0005, 1e-3), STEP * np.arange(1, 8001), np.array([0.2, -0.2, 0.2])
+    knots = np.arange(0, 20.0005, 1e-3)
+    ends = STEP * np.arange(1, 8001)
+    rate = np.array([0.2, -0.2, 0.2])
     attitude = TILTED * Rotation.from_rotvec(knots[:, None] * rate)
     navigator = Navigator(wxyz(TILTED), EARTH)
-    navigator.add(ideal_increments(knots, wxyz(attitude), np.tile(rate, (20001, 1)), ends, STEP, PLACE, G, EARTH))
+    navigator.add(
+        ideal_increments(
+            knots, wxyz(attitude), np.tile(rate, (20001, 1)), ends, STEP, PLACE, G, EARTH
+        )
+    )
     believed = Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True)
     assert (believed * attitude[-1].inv()).magnitude() < 5e-10
 
@@ -214,10 +246,17 @@ def test_the_thesiss_error_takes_minutes_of_uncompensated_earth() -> None:
 
 
 def test_an_even_turn_is_counted_off_the_knots() -> None:
-    rate, knots = np.array([0.3, -0.2, 0.5]), np.arange(0, 0.101, 1e-3)
+    rate = np.array([0.3, -0.2, 0.5])
+    knots = np.arange(0, 0.101, 1e-3)
     attitude = TILTED * Rotation.from_rotvec(knots[:, None] * rate)
     got = ideal_increments(
-        knots, wxyz(attitude), np.tile(rate, (101, 1)), np.array([0.0033, 0.05, 0.0999]), 0.0031, PLACE, G
+        knots,
+        wxyz(attitude),
+        np.tile(rate, (101, 1)),
+        np.array([0.0033, 0.05, 0.0999]),
+        0.0031,
+        PLACE,
+        G,
     )
     np.testing.assert_allclose(got.angle_rad, np.tile(rate * 0.0031, (3, 1)), rtol=1e-13)
     assert not got.saturated.any()
@@ -228,7 +267,9 @@ def test_a_cone_is_counted_as_its_closed_form() -> None:
     knots = np.arange(0, 1.0005, 1e-3)
     ends = np.arange(1, 400) * STEP + 0.0004
     got = CONE.felt(knots, ends, np.zeros(3))
-    np.testing.assert_allclose(got.angle_rad, CONE.angle(ends) - CONE.angle(ends - STEP), rtol=0, atol=2e-10)
+    np.testing.assert_allclose(
+        got.angle_rad, CONE.angle(ends) - CONE.angle(ends - STEP), rtol=0, atol=2e-10
+    )
 
 
 def cone_by_quadrature(ends: Floats, earth: Floats) -> tuple[Floats, Floats]:
@@ -239,14 +280,22 @@ def cone_by_quadrature(ends: Floats, earth: Floats) -> tuple[Floats, Floats]:
         turning = body_from_lab.apply(earth)
         w = CONE.rate(t) + turning
         alpha = CONE.acceleration(t) - np.cross(CONE.rate(t), turning)
-        force = np.cross(alpha, PLACE) + np.cross(w, np.cross(w, PLACE)) + body_from_lab.apply([0, 0, G])
+        force = (
+            np.cross(alpha, PLACE)
+            + np.cross(w, np.cross(w, PLACE))
+            + body_from_lab.apply([0, 0, G])
+        )
         return np.concatenate([w, force])
 
-    total = np.array([quad_vec(both, end - STEP, end, epsabs=1e-15, epsrel=1e-13)[0] for end in ends])
+    total = np.array(
+        [quad_vec(both, end - STEP, end, epsabs=1e-15, epsrel=1e-13)[0] for end in ends]
+    )
     return total[:, :3], total[:, 3:]
 
 
-@pytest.mark.parametrize("earth", [np.zeros(3), EARTH, 1e4 * EARTH], ids=["space", "Earth", "a faster Earth"])
+@pytest.mark.parametrize(
+    "earth", [np.zeros(3), EARTH, 1e4 * EARTH], ids=["space", "Earth", "a faster Earth"]
+)
 def test_a_cone_is_felt_as_by_quadrature(earth: Floats) -> None:
     """An Earth ten thousand times faster shows what the lab's turning does to the force.
 
@@ -261,11 +310,14 @@ def test_a_cone_is_felt_as_by_quadrature(earth: Floats) -> None:
 
 def test_it_is_of_fourth_order_in_the_knots() -> None:
     """Half the spacing, a sixteenth of the error; half a power is left to chance."""
-    ends, errors = np.array([0.0671, 0.12, 0.1333, 0.1499]), []
+    ends = np.array([0.0671, 0.12, 0.1333, 0.1499])
+    errors = []
     angle, velocity = cone_by_quadrature(ends, 1e4 * EARTH)
     for spacing in (8e-3, 4e-3, 2e-3):
         got = CONE.felt(np.arange(0, 0.2, spacing), ends, 1e4 * EARTH)
-        errors.append([np.abs(got.angle_rad - angle).max(), np.abs(got.velocity_m_s - velocity).max()])
+        errors.append(
+            [np.abs(got.angle_rad - angle).max(), np.abs(got.velocity_m_s - velocity).max()]
+        )
     order = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert (order > 3.5).all()
 
@@ -276,11 +328,16 @@ def test_few_knots_or_uneven_ones_serve(count: int) -> None:
     knots = np.array([0.0, 0.3, 0.45, 1.1, 1.2, 1.9, 2.0])[:count]
     degree = min(count, 4) - 1
     rate = np.polynomial.Polynomial(np.array([0.3, -0.7, 1.1, 0.9])[: degree + 1])
-    ends, step_s = knots[-1] * np.array([0.4, 0.73, 1.0]), 0.35 * float(knots[-1])
+    ends = knots[-1] * np.array([0.4, 0.73, 1.0])
+    step_s = 0.35 * float(knots[-1])
     rates = rate(knots)[:, None] * np.array([1.0, -2.0, 0.5])
-    got = ideal_increments(knots, np.tile([1.0, 0, 0, 0], (count, 1)), rates, ends, step_s, PLACE, G)
+    got = ideal_increments(
+        knots, np.tile([1.0, 0, 0, 0], (count, 1)), rates, ends, step_s, PLACE, G
+    )
     whole = rate.integ()
-    np.testing.assert_allclose(got.angle_rad[:, 0], whole(ends) - whole(ends - step_s), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        got.angle_rad[:, 0], whole(ends) - whole(ends - step_s), rtol=0, atol=1e-14
+    )
 
 
 def test_a_flight_in_ticks_is_the_flight_at_once() -> None:
@@ -288,7 +345,9 @@ def test_a_flight_in_ticks_is_the_flight_at_once() -> None:
     knots = np.arange(0, 501) * 1e-3
     ends = np.arange(1, 201) * STEP
     whole = CONE.felt(knots, ends, EARTH)
-    ticks = [CONE.felt(knots[10 * k : 10 * k + 11], ends[4 * k : 4 * k + 4], EARTH) for k in range(50)]
+    ticks = [
+        CONE.felt(knots[10 * k : 10 * k + 11], ends[4 * k : 4 * k + 4], EARTH) for k in range(50)
+    ]
     for name, bar in (("angle_rad", 2.5e-10), ("velocity_m_s", 5e-9)):
         joined = np.concatenate([getattr(tick, name) for tick in ticks])
         np.testing.assert_allclose(joined, getattr(whole, name), rtol=0, atol=bar)
@@ -296,7 +355,8 @@ def test_a_flight_in_ticks_is_the_flight_at_once() -> None:
 
 def test_a_jump_of_the_torque_costs_what_is_said() -> None:
     """Acceleration 2 rad/s2 sets in at a knot: the two cubics over the corner give h^2 / 12 of it too little."""
-    knots, h = np.arange(0, 21) * 1e-3, 1e-3
+    knots = np.arange(0, 21) * 1e-3
+    h = 1e-3
     rate = 2.0 * np.maximum(knots - 0.01, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
     none = np.tile([1.0, 0.0, 0.0, 0.0], (21, 1))
     got = ideal_increments(knots, none, rate, np.array([0.02]), 0.02, PLACE, G)
@@ -307,7 +367,9 @@ def test_at_rest_the_force_is_g_upwards() -> None:
     for attitude in ATTITUDES:
         got = still(attitude, 2.0, 0.1, np.zeros(3))
         up_body = attitude.inv().apply([0, 0, 1])
-        np.testing.assert_allclose(got.velocity_m_s / 0.1, np.tile(G * up_body, (20, 1)), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            got.velocity_m_s / 0.1, np.tile(G * up_body, (20, 1)), rtol=0, atol=1e-12
+        )
         np.testing.assert_array_equal(got.angle_rad, 0)
 
 
@@ -325,14 +387,17 @@ def test_the_lever_feels_the_angular_acceleration() -> None:
     knots = np.arange(0, 0.0105, 1e-3)
     spin = knots[:, None] * np.array([0.0, 0.0, 1.0])
     attitude = Rotation.from_rotvec(knots[:, None] * spin / 2)
-    got = ideal_increments(knots, wxyz(attitude), spin, np.array([0.0093]), STEP, (0.2, 0.0, 0.0), G)
+    got = ideal_increments(
+        knots, wxyz(attitude), spin, np.array([0.0093]), STEP, (0.2, 0.0, 0.0), G
+    )
     np.testing.assert_allclose(got.velocity_m_s[0, 1] / STEP, 0.2, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ends", [[0.0024], [0.0101], [0.005, np.nan], [0.005, 0.02]])
 def test_samples_outside_the_flight_are_refused(ends: list[float]) -> None:
     with pytest.raises(
-        InputError, match=r"^imu: samples from .* allowed: within the motion, 0\.000000 to 0\.010000 s$"
+        InputError,
+        match=r"^imu: samples from .* allowed: within the motion, 0\.000000 to 0\.010000 s$",
     ):
         CONE.felt(np.arange(11) * 1e-3, np.array(ends), np.zeros(3))
 
@@ -364,28 +429,45 @@ def test_a_run_in_pieces_is_the_run_at_once(pieces: int) -> None:
     again = Imu.from_config(ImuConfig(), np.random.default_rng(5))
     got = [
         again.measure(
-            replace(ideal, t_s=ideal.t_s[k], angle_rad=ideal.angle_rad[k], velocity_m_s=ideal.velocity_m_s[k])
+            replace(
+                ideal,
+                t_s=ideal.t_s[k],
+                angle_rad=ideal.angle_rad[k],
+                velocity_m_s=ideal.velocity_m_s[k],
+            )
         )
         for k in np.array_split(np.arange(1200), pieces)
     ]
     for name in ("angle_rad", "velocity_m_s", "saturated"):
-        np.testing.assert_array_equal(np.concatenate([getattr(one, name) for one in got]), getattr(whole, name))
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(one, name) for one in got]), getattr(whole, name)
+        )
 
 
 def test_generator_and_hardware_are_two_things() -> None:
     """The same unit with other noise keeps its axes and turn-on bias; another unit with the same noise does not."""
-    first, noisy, other = unit(scale_etc(), 200, 1), unit(scale_etc(), 200, 2), unit(scale_etc(), 201, 1)
+    first = unit(scale_etc(), 200, 1)
+    noisy = unit(scale_etc(), 200, 2)
+    other = unit(scale_etc(), 201, 1)
     still_run = steady([0, 0, 0], 1000)
     np.testing.assert_array_equal(first.gyro.matrix, noisy.gyro.matrix)
     np.testing.assert_array_equal(first.gyro.turn_on_bias, noisy.gyro.turn_on_bias)
     assert not np.isclose(first.gyro.matrix, other.gyro.matrix, rtol=0, atol=1e-9).any()
-    noise = [one.measure(still_run).angle_rad - STEP * one.gyro.turn_on_bias for one in (first, noisy, other)]
+    noise = [
+        one.measure(still_run).angle_rad - STEP * one.gyro.turn_on_bias
+        for one in (first, noisy, other)
+    ]
     np.testing.assert_allclose(noise[0], noise[2], rtol=0, atol=1e-18)
     assert np.abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 4 / np.sqrt(3000)
 
 
 def scale_etc() -> dict[str, Any]:
-    return {"scale_ppm": 100, "misalignment_arcsec": 20, "turn_on_bias_deg_h": 1, "arw_deg_sqrt_h": 0.07}
+    return {
+        "scale_ppm": 100,
+        "misalignment_arcsec": 20,
+        "turn_on_bias_deg_h": 1,
+        "arw_deg_sqrt_h": 0.07,
+    }
 
 
 def test_one_error_more_leaves_the_noise_as_it_was() -> None:
@@ -398,11 +480,17 @@ def test_one_error_more_leaves_the_noise_as_it_was() -> None:
 @pytest.mark.slow
 def test_units_off_the_line_scatter_as_declared() -> None:
     """2000 units: a standard deviation is sure to 1/sqrt(2 n), a mean to sigma/sqrt(n); 4 sigma of each."""
-    many = [Imu.from_config(ImuConfig(hardware_seed=seed), np.random.default_rng(0)) for seed in range(2000)]
+    many = [
+        Imu.from_config(ImuConfig(hardware_seed=seed), np.random.default_rng(0))
+        for seed in range(2000)
+    ]
     turn_on = np.array([one.gyro.turn_on_bias for one in many]) / DEG_H
     axes = np.array([one.gyro.matrix for one in many]) - np.eye(3)
-    scale, tilt = axes[:, np.eye(3) > 0] / 1e-4, axes[:, np.eye(3) == 0] / (20 * ARCSEC)
-    push = np.array([one.accelerometer.turn_on_bias for one in many]) / (300e-6 * STANDARD_GRAVITY_M_S2)
+    scale = axes[:, np.eye(3) > 0] / 1e-4
+    tilt = axes[:, np.eye(3) == 0] / (20 * ARCSEC)
+    push = np.array([one.accelerometer.turn_on_bias for one in many]) / (
+        300e-6 * STANDARD_GRAVITY_M_S2
+    )
     for drawn in (turn_on, scale, tilt, push):
         n = drawn.shape[0]
         assert (np.abs(drawn.std(axis=0) - 1) < 4 / np.sqrt(2 * n)).all()
@@ -438,7 +526,9 @@ def test_bias_is_the_rate_at_rest() -> None:
     one = unit({"turn_on_bias_deg_h": 5.0, "bias_deg_h": 2.0})
     count = one.measure(steady([0, 0, 0], 1))
     np.testing.assert_allclose(count.angle_rad[0] / STEP, one.gyro_bias_rad_s, rtol=1e-14)
-    np.testing.assert_allclose(one.gyro_bias_rad_s - one.gyro.turn_on_bias, one.gyro.markov_bias, rtol=0, atol=1e-18)
+    np.testing.assert_allclose(
+        one.gyro_bias_rad_s - one.gyro.turn_on_bias, one.gyro.markov_bias, rtol=0, atol=1e-18
+    )
 
 
 def test_accelerometers_have_their_own_errors() -> None:
@@ -452,15 +542,20 @@ def test_accelerometers_have_their_own_errors() -> None:
     np.testing.assert_array_equal(wanted, np.eye(3))
     mean = got.velocity_m_s.mean(axis=0) / STEP
     up = one.accelerometer.matrix[2, 2] * G * np.array([0, 0, 1])
-    np.testing.assert_allclose(mean - up, one.accelerometer.turn_on_bias + one.accelerometer.markov_bias, rtol=1e-5)
+    np.testing.assert_allclose(
+        mean - up, one.accelerometer.turn_on_bias + one.accelerometer.markov_bias, rtol=1e-5
+    )
     assert abs(one.accelerometer.matrix[2, 2] - 1) < 4 * 300e-6
 
 
 def test_a_turn_beyond_the_limit_reads_the_limit_and_the_attitude_stays_wrong() -> None:
     """A second of 20 deg/s with a limit of 10, then a second of 5: ten of the 25 degrees are lost for good."""
-    one, navigator = unit({"rate_limit_deg_s": 10}), Navigator(wxyz(Rotation.identity()))
-    fast, slow = steady(np.radians([0, 0, 20]), 400), steady(np.radians([0, 0, 5]), 400)
-    cut, after = one.measure(fast), one.measure(slow)
+    one = unit({"rate_limit_deg_s": 10})
+    navigator = Navigator(wxyz(Rotation.identity()))
+    fast = steady(np.radians([0, 0, 20]), 400)
+    slow = steady(np.radians([0, 0, 5]), 400)
+    cut = one.measure(fast)
+    after = one.measure(slow)
     np.testing.assert_array_equal(cut.angle_rad, np.tile([0, 0, np.radians(10) * STEP], (400, 1)))
     assert cut.saturated.all()
     assert not after.saturated.any()
@@ -468,17 +563,24 @@ def test_a_turn_beyond_the_limit_reads_the_limit_and_the_attitude_stays_wrong() 
     navigator.add(cut)
     navigator.add(after)
     np.testing.assert_allclose(euler_deg(navigator), [0, 0, 15], rtol=0, atol=1e-10)
-    assert (unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([0, -20, 0]), 3)).angle_rad[:, 1] < 0).all()
+    assert (
+        unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([0, -20, 0]), 3)).angle_rad[:, 1]
+        < 0
+    ).all()
 
 
 def test_a_limit_is_of_the_rate_and_of_either_kind() -> None:
     below = unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([9.99, -9.99, 0]), 5))
     assert not below.saturated.any()
     push = np.array([[0, 0, 0.5 * G], [0, 0, 3 * G], [0, -3 * G, 0]]) * STEP
-    got = Imu.from_config(part(None, {"limit_g": 2}), np.random.default_rng(1)).measure(samples(0 * push, push))
+    got = Imu.from_config(part(None, {"limit_g": 2}), np.random.default_rng(1)).measure(
+        samples(0 * push, push)
+    )
     np.testing.assert_array_equal(got.overloaded, [False, True, True])
     assert not got.saturated.any()
-    np.testing.assert_allclose(got.velocity_m_s[1:, [2, 1]].diagonal(), [2 * G * STEP, -2 * G * STEP], rtol=1e-15)
+    np.testing.assert_allclose(
+        got.velocity_m_s[1:, [2, 1]].diagonal(), [2 * G * STEP, -2 * G * STEP], rtol=1e-15
+    )
 
 
 def test_the_counter_loses_no_angle() -> None:
@@ -491,12 +593,16 @@ def test_the_counter_loses_no_angle() -> None:
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-8)
     missed = np.cumsum(got - np.tile(ideal.angle_rad, (2, 1)), axis=0)
     assert np.abs(missed).max() < 0.5001 * quantum
-    np.testing.assert_allclose(missed.std(), quantum / np.sqrt(12), rtol=0.02)  # evenly spread, of 12,000
+    np.testing.assert_allclose(
+        missed.std(), quantum / np.sqrt(12), rtol=0.02
+    )  # evenly spread, of 12,000
 
 
 def test_a_turn_slower_than_the_counter_is_counted_in_the_end() -> None:
     """1 deg/h is 0.0025 arcsec a sample, a count is 0.4 arcsec: one in 160 samples, 25 in 4000."""
-    counted = unit({"quantum_arcsec": 0.4}).measure(steady([DEG_H, 0, 0], 4000)).angle_rad[:, 0] / (0.4 * ARCSEC)
+    counted = unit({"quantum_arcsec": 0.4}).measure(steady([DEG_H, 0, 0], 4000)).angle_rad[:, 0] / (
+        0.4 * ARCSEC
+    )
     assert np.count_nonzero(counted) == 25
     np.testing.assert_allclose(np.diff(np.flatnonzero(counted)), 160, rtol=0, atol=1)
 
@@ -507,7 +613,8 @@ def test_white_noise_of_the_rate() -> None:
         told = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
         run = steady([0, 0, 0], 100_000, step_s)
         got = Imu.from_config(told, np.random.default_rng(7)).measure(run)
-        rate_deg_h, force_ug = got.angle_rad / step_s / DEG_H, got.velocity_m_s / step_s / G * 1e6
+        rate_deg_h = got.angle_rad / step_s / DEG_H
+        force_ug = got.velocity_m_s / step_s / G * 1e6
         np.testing.assert_allclose(rate_deg_h.std(), 0.07 * 60 / np.sqrt(step_s), rtol=6e-3)
         np.testing.assert_allclose(force_ug.std(), 50 / np.sqrt(step_s), rtol=6e-3)
         next_to = (rate_deg_h[1:] * rate_deg_h[:-1]).mean() / rate_deg_h.var()
@@ -517,13 +624,16 @@ def test_white_noise_of_the_rate() -> None:
 @pytest.mark.long
 def test_the_wandering_bias_starts_as_it_goes_on() -> None:
     """Over 4000 starts: variance sigma^2 at once and 300 s later, and exp(-1) of it between the two."""
-    sigma, first, later = DEG_H, [], []
+    sigma = DEG_H
+    first = []
+    later = []
     for draws in range(4000):
         one = unit({"bias_deg_h": 1.0, "bias_time": "300.0 s"}, draws=draws)
         first.append(one.gyro_bias_rad_s)
         one.measure(steady([0, 0, 0], 3, step_s=100.0))  # the law is exact for any step
         later.append(one.gyro_bias_rad_s)
-    a, b = np.array(first) / sigma, np.array(later) / sigma
+    a = np.array(first) / sigma
+    b = np.array(later) / sigma
     bar = 4 / np.sqrt(12_000)
     assert abs(np.mean(a**2) - 1) < bar * np.sqrt(2)
     assert abs(np.mean(b**2) - 1) < bar * np.sqrt(2)
@@ -555,7 +665,9 @@ def declared(gyro: Any, tau_s: float) -> float:
     """Of random walk, wandering bias and counter together, deg/h; the counter's error is white in the angle."""
     walk = gyro.arw_deg_sqrt_h * 60 / np.sqrt(tau_s)
     counter = np.sqrt(3 / 12) * gyro.quantum_arcsec / tau_s  # 1 arcsec/s is 1 deg/h
-    return float(np.sqrt(walk**2 + markov_allan(tau_s, gyro.bias_deg_h, gyro.bias_time_s) ** 2 + counter**2))
+    return float(
+        np.sqrt(walk**2 + markov_allan(tau_s, gyro.bias_deg_h, gyro.bias_time_s) ** 2 + counter**2)
+    )
 
 
 def test_theory_of_the_wandering_bias_peaks_at_0617() -> None:
@@ -577,11 +689,16 @@ def test_allan_deviation_of_an_ln200_is_its_random_walk_at_one_second() -> None:
     """
     gyro = ImuConfig().gyro
     angle = (
-        Imu.from_config(ImuConfig(), np.random.default_rng(11)).measure(steady([0, 0, 0], 1_000_000)).angle_rad / DEG_H
+        Imu.from_config(ImuConfig(), np.random.default_rng(11))
+        .measure(steady([0, 0, 0], 1_000_000))
+        .angle_rad
+        / DEG_H
     )
     np.testing.assert_allclose(allan(angle, STEP, 1.0), 4.20, rtol=0.03)
     for tau_s, scatter in ((0.1, 0.0021), (1.0, 0.0067), (10.0, 0.021)):
-        np.testing.assert_allclose(allan(angle, STEP, tau_s), declared(gyro, tau_s), rtol=4 * scatter)
+        np.testing.assert_allclose(
+            allan(angle, STEP, tau_s), declared(gyro, tau_s), rtol=4 * scatter
+        )
 
 
 @pytest.mark.long
@@ -596,7 +713,9 @@ def test_allan_deviation_of_the_wandering_bias_peaks_as_theory() -> None:
     np.testing.assert_allclose(allan(angle, 1.0, 567.0), 0.617, rtol=0.028)
     for tau_s in (60.0, 300.0, 567.0, 1500.0):
         scatter = 1 / np.sqrt(2 * 3 * 2e6 / tau_s)
-        np.testing.assert_allclose(allan(angle, 1.0, tau_s), markov_allan(tau_s, 1.0, 300.0), rtol=4 * scatter)
+        np.testing.assert_allclose(
+            allan(angle, 1.0, tau_s), markov_allan(tau_s, 1.0, 300.0), rtol=4 * scatter
+        )
 
 
 @pytest.mark.long
@@ -605,16 +724,16 @@ def test_allan_deviation_of_a_long_run_at_400_hz() -> None:
 
     The scatter at 567 s is 1 / sqrt(2 * 3 * 1066) = 1.25 %.
     """
-    one, seconds, run = (
-        Imu.from_config(ImuConfig(), np.random.default_rng(13)),
-        [],
-        steady([0, 0, 0], 400_000),
-    )
+    one = Imu.from_config(ImuConfig(), np.random.default_rng(13))
+    seconds = []
+    run = steady([0, 0, 0], 400_000)
     for _ in range(605):
         seconds.append(one.measure(run).angle_rad.reshape(-1, 400, 3).sum(axis=1) / DEG_H)
     angle = np.concatenate(seconds)
     for tau_s in (1.0, 10.0, 100.0, 567.0):
-        np.testing.assert_allclose(allan(angle, 1.0, tau_s), declared(ImuConfig().gyro, tau_s), rtol=0.05)
+        np.testing.assert_allclose(
+            allan(angle, 1.0, tau_s), declared(ImuConfig().gyro, tau_s), rtol=0.05
+        )
 
 
 # --- the navigator
@@ -625,24 +744,34 @@ def test_a_navigator_follows_an_even_turn_exactly() -> None:
     navigator = Navigator(wxyz(TILTED))
     navigator.add(steady(rate, 4000))
     wanted = TILTED * Rotation.from_rotvec(10 * rate)
-    assert (Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True).inv() * wanted).magnitude() < 1e-12
-    np.testing.assert_allclose(euler_deg(navigator), wanted.as_euler("ZYX", degrees=True)[::-1], rtol=0, atol=1e-10)
+    assert (
+        Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True).inv() * wanted
+    ).magnitude() < 1e-12
+    np.testing.assert_allclose(
+        euler_deg(navigator), wanted.as_euler("ZYX", degrees=True)[::-1], rtol=0, atol=1e-10
+    )
     assert np.linalg.norm(navigator.lab_from_body_wxyz) == pytest.approx(1, abs=1e-14)
 
 
 def test_in_pieces_or_at_once_a_navigator_is_the_same() -> None:
-    whole, pieces = Navigator(wxyz(TILTED), EARTH), Navigator(wxyz(TILTED), EARTH)
+    whole = Navigator(wxyz(TILTED), EARTH)
+    pieces = Navigator(wxyz(TILTED), EARTH)
     run = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
     whole.add(run)
     for k in np.array_split(np.arange(400), 100):
-        pieces.add(replace(run, t_s=run.t_s[k], angle_rad=run.angle_rad[k], velocity_m_s=run.velocity_m_s[k]))
+        pieces.add(
+            replace(
+                run, t_s=run.t_s[k], angle_rad=run.angle_rad[k], velocity_m_s=run.velocity_m_s[k]
+            )
+        )
     np.testing.assert_array_equal(whole.lab_from_body_wxyz, pieces.lab_from_body_wxyz)
 
 
 def test_a_cone_makes_the_navigator_drift_as_theory() -> None:
     """Increments taken for rotation vectors miss half the integral of angle x rate: sin^2(a) (w h - sin(w h)) / 2
     about the cone's axis in each sample, here 1.8e-6 rad, so 7e-3 rad in 10 s; and they miss nothing else."""
-    knots, ends = np.arange(0, 10.0005, 1e-3), STEP * np.arange(1, 4001)
+    knots = np.arange(0, 10.0005, 1e-3)
+    ends = STEP * np.arange(1, 4001)
     navigator = Navigator(wxyz(CONE.attitude(0.0)))
     navigator.add(CONE.felt(knots, ends, np.zeros(3)))
     believed = Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True)
@@ -661,15 +790,20 @@ def test_euler_angles_are_scipys(euler: tuple[float, float, float]) -> None:
 def test_an_error_at_home_stays_in_the_lab() -> None:
     """Home believed level while the vehicle stands 0.5 deg wrong: the error stays with it, in the lab's axes."""
     home_error = Rotation.from_euler("x", 0.5, degrees=True)
-    truth, navigator = home_error, Navigator(wxyz(Rotation.identity()))
+    truth = home_error
+    navigator = Navigator(wxyz(Rotation.identity()))
     navigator.add(steady(np.radians([0, 0, 90]), 400))
     truth = truth * Rotation.from_euler("z", 90, degrees=True)
     np.testing.assert_allclose(euler_deg(navigator), [0, 0, 90], rtol=0, atol=1e-10)
     believed = Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True)
-    np.testing.assert_allclose((truth * believed.inv()).as_rotvec(degrees=True), [0.5, 0, 0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        (truth * believed.inv()).as_rotvec(degrees=True), [0.5, 0, 0], rtol=0, atol=1e-10
+    )
 
 
-@pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0, 0, 40), (25, -20, 70), (-29, 12, -110), (120, 80, 5)])
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw"), [(0, 0, 40), (25, -20, 70), (-29, 12, -110), (120, 80, 5)]
+)
 def test_tilt_from_gravity(roll: float, pitch: float, yaw: float) -> None:
     attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
     got = np.degrees(tilt_rad(still(attitude, 2.0, 0.1, np.zeros(3)).velocity_m_s))

@@ -18,7 +18,9 @@ RMS = (5.0, 2.0, 0.5)
 
 
 def line(frequency_hz: float = 40.0, rms: tuple[float, float, float] = RMS) -> JitterLineConfig:
-    return JitterLineConfig.model_validate({"kind": "line", "frequency_hz": frequency_hz, "rms_arcsec": rms})
+    return JitterLineConfig.model_validate(
+        {"kind": "line", "frequency_hz": frequency_hz, "rms_arcsec": rms}
+    )
 
 
 def band(from_hz: float, to_hz: float, slope: float = 0.0) -> JitterBandConfig:
@@ -27,11 +29,16 @@ def band(from_hz: float, to_hz: float, slope: float = 0.0) -> JitterBandConfig:
     )
 
 
-def turning(end_s: float, rate: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 2) -> Trajectory:
+def turning(
+    end_s: float, rate: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 2
+) -> Trajectory:
     """A body that turns evenly about one axis."""
-    t, rate_rad_s = np.linspace(0, end_s, samples), np.array(rate)
+    t = np.linspace(0, end_s, samples)
+    rate_rad_s = np.array(rate)
     start = Rotation.from_rotvec([0.3, -1.0, 2.0])
-    return Trajectory(t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1)))
+    return Trajectory(
+        t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1))
+    )
 
 
 def shake(calm: Trajectory, parts: tuple, rng: np.random.Generator) -> Trajectory:
@@ -45,7 +52,8 @@ def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarr
 
 
 def test_nothing_that_shakes_is_the_same_history() -> None:
-    calm, rng = turning(1.0), np.random.default_rng(1)
+    calm = turning(1.0)
+    rng = np.random.default_rng(1)
     assert shake(calm, (), rng) is calm
     assert shake(calm, (line(rms=(0.0, 0.0, 0.0)),), rng) is calm
 
@@ -75,7 +83,8 @@ def test_a_band_has_its_rms_and_keeps_within_its_edges(slope: float) -> None:
     sines = SPECTRA["band"](band(2.0, 49.0, slope), np.random.default_rng(4))
     rms = np.sqrt(np.sum(sines.sine_rad**2 + sines.cosine_rad**2, axis=0) / 2)
     np.testing.assert_allclose(rms, np.array(RMS) * ARCSEC, rtol=1e-12)
-    frequency_hz, piece = sines.omega_rad_s / (2 * np.pi), 24.5 ** (1 / len(sines.omega_rad_s))
+    frequency_hz = sines.omega_rad_s / (2 * np.pi)
+    piece = 24.5 ** (1 / len(sines.omega_rad_s))
     assert 2.0 <= frequency_hz.min() <= 2.0 * piece
     assert 49.0 / piece <= frequency_hz.max() <= 49.0
 
@@ -84,20 +93,30 @@ def test_a_band_has_its_rms_and_keeps_within_its_edges(slope: float) -> None:
 @pytest.mark.parametrize("slope", [-2.0, -1.0, 0.0, 2.0])
 def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
     """Power by octave of many draws: its integral over f^slope, to 4 sigma of the draws' own scatter."""
-    rng, rate_hz, seconds = np.random.default_rng(5), 256.0, 8.0
+    rng = np.random.default_rng(5)
+    rate_hz = 256.0
+    seconds = 8.0
     t = np.arange(int(seconds * rate_hz)) / rate_hz
     window = np.hanning(len(t))[:, None]
     edges = np.array([4.0, 8.0, 16.0, 32.0, 64.0])
     shares = []
     for _ in range(40):
         sines = SPECTRA["band"](band(4.0, 64.0, slope), rng)
-        phi = evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC / np.array(RMS)
+        phi = (
+            evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
+            / ARCSEC
+            / np.array(RMS)
+        )
         power = (np.abs(np.fft.rfft(phi * window, axis=0)) ** 2).sum(axis=1)
         frequency = np.fft.rfftfreq(len(t), 1 / rate_hz)
-        outside = (frequency < 4.0 - 0.5) | (frequency > 64.0 + 0.5)  # four bins: Hann leaks 1e-3 beyond
+        outside = (frequency < 4.0 - 0.5) | (
+            frequency > 64.0 + 0.5
+        )  # four bins: Hann leaks 1e-3 beyond
         assert power[outside].sum() < 2e-3 * power.sum()
         shares.append(np.histogram(frequency, edges, weights=power)[0] / power.sum())
-    octave = np.exp2((slope + 1) * np.arange(4))  # power of an octave over that of the one below is 2^(slope + 1)
+    octave = np.exp2(
+        (slope + 1) * np.arange(4)
+    )  # power of an octave over that of the one below is 2^(slope + 1)
     scatter = np.std(shares, axis=0) / np.sqrt(len(shares))
     # Within 4 sigma, and 1 % that the window carries over an octave's edge.
     assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
@@ -157,7 +176,9 @@ def test_rates_are_the_derivative_of_the_attitude() -> None:
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 0.9e-4, 1.1e-4, 1e-2, 1.0, 3.0])
 def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None:
     """Rotations by complex numbers about one axis cannot see the cross terms: central differences of scipy's can."""
-    phi, phi_rate, h = angle_rad * np.array([[0.6, 0.0, 0.8]]), np.array([[0.3, -1.0, 0.2]]), 1e-5
+    phi = angle_rad * np.array([[0.6, 0.0, 0.8]])
+    phi_rate = np.array([[0.3, -1.0, 0.2]])
+    h = 1e-5
     before, after = (Rotation.from_rotvec(phi + side * h * phi_rate) for side in (-1, 1))
     turned = (before.inv() * after).as_rotvec() / (2 * h)
     np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate), turned, rtol=0, atol=1e-9)
@@ -165,8 +186,11 @@ def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None
 
 def test_cross_term_of_the_rate_is_needed() -> None:
     """Coning: two axes a quarter period apart turn the body steadily at (1 - cos a) dphi/dt / a about the third."""
-    phi, phi_rate = np.array([[0.01, 0.0, 0.0]]), np.array([[0.0, 0.01, 0.0]])
-    np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11)
+    phi = np.array([[0.01, 0.0, 0.0]])
+    phi_rate = np.array([[0.0, 0.01, 0.0]])
+    np.testing.assert_allclose(
+        rotvec_body_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11
+    )
 
 
 @pytest.mark.parametrize("angle", [1e-6, 3e-5, 0.99e-4, 1.01e-4, 1e-3])
@@ -186,13 +210,17 @@ def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
 
 def test_the_same_stream_shakes_alike() -> None:
     calm = turning(0.2)
-    first, again, other = (shake(calm, (band(1.0, 30.0),), np.random.default_rng(s)) for s in (1, 1, 2))
+    first, again, other = (
+        shake(calm, (band(1.0, 30.0),), np.random.default_rng(s)) for s in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first.rate_body_rad_s, again.rate_body_rad_s)
     assert not np.array_equal(first.rate_body_rad_s, other.rate_body_rad_s)
 
 
 def test_too_many_samples_are_refused_in_one_line() -> None:
-    with pytest.raises(InputError, match=r"^motion\.jitter: 1e\+06 Hz over 60 s needs 960,000,001 .*$"):
+    with pytest.raises(
+        InputError, match=r"^motion\.jitter: 1e\+06 Hz over 60 s needs 960,000,001 .*$"
+    ):
         shake(turning(60.0), (line(1e6),), np.random.default_rng(1))
 
 
@@ -223,7 +251,9 @@ def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
         # The mean square of 10x^3 - 15x^4 + 6x^5 is 181/462, and what the sine's square leaves of its own swing over
         # a rise of T is at most 1 / (2 omega T), 0.005.
         edge = shaken_by(calm, shaken, np.linspace(begin, end, 2000, endpoint=False))
-        np.testing.assert_allclose(np.mean(edge**2, axis=0), np.square(RMS) * 181 / 462, rtol=1.3e-2)
+        np.testing.assert_allclose(
+            np.mean(edge**2, axis=0), np.square(RMS) * 181 / 462, rtol=1.3e-2
+        )
 
 
 def test_a_long_while_rises_within_a_second() -> None:
@@ -235,33 +265,44 @@ def test_a_long_while_rises_within_a_second() -> None:
 
 
 def test_nothing_shakes_outside_of_its_while() -> None:
-    calm, rng = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801), np.random.default_rng(15)
+    calm = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801)
+    rng = np.random.default_rng(15)
     vibration = Vibration.draw(shaking(2.0, 3.0), rng)
     shaken = vibration.add_to(calm)
     t = np.random.default_rng(16).uniform(0, 8, 4000)
     outside = (t < 1) | ((t > 3) & (t < 4)) | (t > 7)
     phi, rate = vibration.evaluate(np.sort(t[outside]))
     np.testing.assert_array_equal([phi, rate], np.zeros((2, outside.sum(), 3)))
-    assert np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9  # rounding: 1e-15 rad is 2e-10 arcsec
+    assert (
+        np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9
+    )  # rounding: 1e-15 rad is 2e-10 arcsec
     assert (np.abs(shaken_by(calm, shaken, t[~outside])).max(axis=0) > RMS).all()
     silent = (shaken.t_s <= 1) | ((shaken.t_s >= 3) & (shaken.t_s <= 4)) | (shaken.t_s >= 7)
-    np.testing.assert_allclose(shaken.rate_body_rad_s[silent], [[0.1, 0.2, -0.1]] * silent.sum(), rtol=1e-14)
-    np.testing.assert_allclose(np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9)  # no finer where it is calm
+    np.testing.assert_allclose(
+        shaken.rate_body_rad_s[silent], [[0.1, 0.2, -0.1]] * silent.sum(), rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9
+    )  # no finer where it is calm
 
 
 def test_two_whiles_of_the_same_vibration_have_their_own_phases() -> None:
     vibration = Vibration.draw(shaking(2.0, 2.0), np.random.default_rng(17))
     t = np.linspace(1.5, 2.5, 1000, endpoint=False)
-    first, second = vibration.evaluate(t)[0], vibration.evaluate(t + 3.0)[0]  # 120 periods later
+    # 120 periods later
+    first = vibration.evaluate(t)[0]
+    second = vibration.evaluate(t + 3.0)[0]
     assert (np.sqrt(np.mean((first - second) ** 2, axis=0)) > 0.05 * ARCSEC * np.array(RMS)).any()
 
 
 @pytest.mark.parametrize("always", [(), LOUD])
 def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -> None:
     """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
-    vibration, h = Vibration.draw(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)), 1e-6
+    vibration = Vibration.draw(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18))
+    h = 1e-6
     t = np.sort(np.random.default_rng(19).uniform(0.9, 3.1, 3000))
-    before, after = vibration.evaluate(t - h)[0], vibration.evaluate(t + h)[0]
+    before = vibration.evaluate(t - h)[0]
+    after = vibration.evaluate(t + h)[0]
     rate = vibration.evaluate(t)[1]
     # h^2 / 6 times a third derivative of some (2 pi 7 + 4 / 0.2)^3 * 0.05 rad = 1e4 rad/s3 at the most
     np.testing.assert_allclose((after - before) / (2 * h), rate, rtol=0, atol=4e-9)
@@ -272,7 +313,8 @@ def test_the_shaken_rate_is_the_derivative_of_the_attitude_through_a_while() -> 
     """At its samples by central differences of lab_from_body exp(phi); between them it follows that too."""
     calm = turning(4.0, rate=(0.2, -0.1, 0.25), samples=4001)
     vibration = Vibration.draw(shaking(2.0, parts=LOUD), np.random.default_rng(20))
-    shaken, h = vibration.add_to(calm), 1e-6
+    shaken = vibration.add_to(calm)
+    h = 1e-6
     at = shaken.t_s[(shaken.t_s > 0.9) & (shaken.t_s < 3.1)][::7]
 
     def body(t_s: np.ndarray) -> Rotation:
@@ -291,7 +333,8 @@ def test_a_short_while_is_sampled_for_its_envelope_too() -> None:
     calm = turning(2.2, samples=3)
     slow = [{"kind": "line", "frequency_hz": 0.5, "rms_arcsec": RMS}]
     vibration = Vibration.draw(shaking(0.1, parts=slow), np.random.default_rng(22))
-    shaken, t = vibration.add_to(calm), np.linspace(0.95, 1.15, 4000)
+    shaken = vibration.add_to(calm)
+    t = np.linspace(0.95, 1.15, 4000)
     wanted = vibration.evaluate(t)[0] / ARCSEC
     assert (np.abs(shaken_by(calm, shaken, t) - wanted) < 1e-4 * np.sqrt(2) * np.array(RMS)).all()
     assert (np.abs(wanted).max(axis=0) > 0).all()
@@ -302,7 +345,9 @@ def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
     t = np.arange(0, 3.0 + 5e-4, 1e-3)
     rate = np.outer(1 + t, [0.1, 0.0, 0.2])
     angle = np.outer(t + t**2 / 2, [0.1, 0.0, 0.2])
-    vibration = Vibration.draw(shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23))
+    vibration = Vibration.draw(
+        shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23)
+    )
     whole = vibration.add_to(Trajectory(t, Rotation.from_rotvec(angle), rate))
     cuts = [0, 10, 700, 1003, 1995, len(t) - 1]
     for first, last in itertools.pairwise(cuts):
@@ -310,9 +355,13 @@ def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
         piece = vibration.add_to(Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now]))
         same = (whole.t_s >= t[first]) & (whole.t_s <= t[last])
         np.testing.assert_array_equal(piece.t_s, whole.t_s[same])
-        np.testing.assert_allclose(piece.rate_body_rad_s, whole.rate_body_rad_s[same], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            piece.rate_body_rad_s, whole.rate_body_rad_s[same], rtol=0, atol=1e-12
+        )
         at = np.random.default_rng(24).uniform(t[first], t[last], 300)
-        assert np.abs((whole.attitude_at(at).inv() * piece.attitude_at(at)).as_rotvec()).max() < 1e-12
+        assert (
+            np.abs((whole.attitude_at(at).inv() * piece.attitude_at(at)).as_rotvec()).max() < 1e-12
+        )
 
 
 def test_a_piece_in_which_nothing_sounds_is_the_same_history() -> None:
@@ -326,7 +375,9 @@ def test_too_many_samples_of_a_while_are_refused_with_its_time() -> None:
     fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
     vibration = Vibration.draw(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
     flight = turning(3.0, samples=3001)
-    with pytest.raises(InputError, match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"):
+    with pytest.raises(
+        InputError, match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"
+    ):
         vibration.add_to(flight)
     with pytest.raises(InputError, match=r"; allowed: 5,000,000, 16 a period$"):
         vibration.subdivisions(flight.t_s)

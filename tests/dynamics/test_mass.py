@@ -20,7 +20,9 @@ from skysim.dynamics.multibody.mass import is_possible
         ([-1.0, -2.0, -3.0], False),
     ],
 )
-def test_a_body_s_moments_are_sums_of_two_positive_second_moments(second_moments: list[float], possible: bool) -> None:
+def test_a_body_s_moments_are_sums_of_two_positive_second_moments(
+    second_moments: list[float], possible: bool
+) -> None:
     """About x: the sum of m y^2 and m z^2; so the largest moment is at most the sum of the others."""
     moments = np.sort(np.sum(second_moments) - np.array(second_moments))
     assert is_possible(moments) == possible

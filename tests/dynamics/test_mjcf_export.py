@@ -41,7 +41,9 @@ STARTS = {  # 3-2-1 Euler angles; the second falls into the tilt stop within the
 LEVEL = Rotation.identity()
 
 
-def dome_lab(overrides: dict[str, str] | None = None) -> tuple[Scene, multibody.VehicleModel, Sources]:
+def dome_lab(
+    overrides: dict[str, str] | None = None,
+) -> tuple[Scene, multibody.VehicleModel, Sources]:
     scene = load("afit_simsat", overrides or {})
     assert scene.light.kind == "dome"
     band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
@@ -53,7 +55,9 @@ def star_lab() -> tuple[Scene, multibody.VehicleModel, Sources, Rotation]:
     assert scene.light.kind == "stars"
     band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
     stars = catalog.read(scene.light.catalog)
-    sources = star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
+    sources = star_sources.sources(
+        stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band
+    )
     lab_from_body = star_sources.cam_from_icrs(83.0, 2.0, 20.0).inv()
     return scene, multibody.build(scene.vehicle), sources, lab_from_body
 
@@ -128,7 +132,8 @@ def test_a_free_vehicle_flies_like_the_stepped_model_under_the_stars() -> None:
 
 def test_export_leaves_the_stepped_model_alone_and_weighs_nothing() -> None:
     scene, vehicle, sources = dome_lab(EVERYTHING)
-    before, geoms = vehicle.spec.to_xml(), vehicle.model.ngeom
+    before = vehicle.spec.to_xml()
+    geoms = vehicle.model.ngeom
     model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     assert vehicle.spec.to_xml() == before
     assert vehicle.model.ngeom == geoms < model.ngeom
@@ -231,7 +236,8 @@ def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None
     np.testing.assert_allclose(on_it, 1.0, rtol=0, atol=1e-5)
     cam_from_lab = here.cam_from_body * lab_from_body.inv()
     seen_px = Optics.from_camera(scene.camera).project(cam_from_lab.apply(corner - tip_m))
-    wide, high = scene.camera.width_px - 0.5, scene.camera.height_px - 0.5
+    wide = scene.camera.width_px - 0.5
+    high = scene.camera.height_px - 0.5
     wanted = {(-0.5, -0.5), (wide, -0.5), (wide, high), (-0.5, high)}
     # Vertices are rounded to a micrometer, in front of a camera of 9,131 px at 0.84 m.
     assert {tuple(np.round(2 * one) / 2) for one in seen_px} == wanted
@@ -239,7 +245,9 @@ def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None
 
 def test_the_brightest_stars_stand_on_a_sphere_where_the_sky_has_them() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
-    grains = vertices_m(*loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_")
+    grains = vertices_m(
+        *loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_"
+    )
     star_m = grains.reshape(-1, 6, 3).mean(axis=1)
     assert len(star_m) == mjcf_export.MAX_STARS
     np.testing.assert_allclose(np.linalg.norm(star_m, axis=1), mjcf_export.SKY_RADIUS_M, rtol=1e-5)
@@ -264,7 +272,10 @@ def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     hardware = data.geom_xpos[model.body_rootid[model.geom_bodyid] == model.body("bus").id]
     deck_m = [[0.45 * np.cos(a), 0.45 * np.sin(a), -0.2] for a in np.arange(12) * np.pi / 6]
-    parts = [vertices_m(model, data, name) for name in ("stage_dome", "stage_rim", "stage_leds", "stage_field")]
+    parts = [
+        vertices_m(model, data, name)
+        for name in ("stage_dome", "stage_rim", "stage_leds", "stage_field")
+    ]
     seen = seen_px(model, data, np.concatenate([*parts, hardware, deck_m]))
     assert seen.min() >= 0
     assert (seen < SIZE_PX).all()
@@ -298,7 +309,8 @@ def test_the_edges_of_the_camera_s_field_are_thin_lines_along_it() -> None:
     corner_m = corner_m[np.linalg.norm(corner_m - tip_m, axis=1) > 0.1]
     ends = [(data.geom(f"stage_ray_{k}"), model.geom(f"stage_ray_{k}").size) for k in range(4)]
     for ray, (radius, half_m, _) in ends:
-        middle, along = ray.xpos, ray.xmat.reshape(3, 3)[:, 2]
+        middle = ray.xpos
+        along = ray.xmat.reshape(3, 3)[:, 2]
         reached = np.array([middle + half_m * along, middle - half_m * along])
         assert np.linalg.norm(reached - tip_m, axis=1).min() < 1e-6
         corners_off_m = np.linalg.norm(reached[:, None] - corner_m, axis=2)
@@ -309,7 +321,9 @@ def test_the_edges_of_the_camera_s_field_are_thin_lines_along_it() -> None:
 # Pictures
 
 SIZE_PX = (640, 480)
-Drawn = tuple[Sources, multibody.VehicleModel, mujoco.MjModel, mujoco.MjData, np.ndarray, np.ndarray]
+Drawn = tuple[
+    Sources, multibody.VehicleModel, mujoco.MjModel, mujoco.MjData, np.ndarray, np.ndarray
+]
 TILTED = Rotation.from_euler("ZYX", [0.0, 0.0, 20.0], degrees=True)
 NOTHING = "<mujoco><worldbody><camera name='lab'/></worldbody></mujoco>"
 
@@ -334,7 +348,13 @@ def drawn(opengl: None) -> Drawn:
     text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
     dark = mjcf_export.mjcf(vehicle, scene, sources.take(np.zeros(len(sources), bool)), LEVEL)
     lit = np.array(list(picture.film(text, states(LEVEL, TILTED), SIZE_PX)), float)
-    return sources, vehicle, *loaded(text), lit, picture.picture(dark, states(LEVEL), SIZE_PX).astype(float)
+    return (
+        sources,
+        vehicle,
+        *loaded(text),
+        lit,
+        picture.picture(dark, states(LEVEL), SIZE_PX).astype(float),
+    )
 
 
 def seen_px(model: mujoco.MjModel, data: mujoco.MjData, place_m: np.ndarray) -> np.ndarray:
@@ -398,7 +418,9 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("opengl_name", ["disable", "nonsense"])
-def test_without_opengl_one_line_says_what_to_do(opengl_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_opengl_one_line_says_what_to_do(
+    opengl_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MUJOCO_GL", opengl_name)
     with pytest.raises(picture.NoPicture, match="apt-get install libegl1") as refused:
         picture.picture(NOTHING, np.zeros(0), (64, 48))
@@ -434,7 +456,10 @@ def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Pat
 @pytest.mark.long
 def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) -> None:
     """One hundred frames of the lab at the film's size, the vehicle in two poses by turns."""
-    lit = [cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA) for one in drawn[4]]
+    lit = [
+        cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA)
+        for one in drawn[4]
+    ]
     picture.write_film((lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0)
     assert (tmp_path / "film.gif").stat().st_size < 2.5e6
 
@@ -442,7 +467,9 @@ def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) ->
 def test_a_film_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
-    with pytest.raises(InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"):
+    with pytest.raises(
+        InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"
+    ):
         picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
     assert not list(tmp_path.iterdir())
 
@@ -471,10 +498,18 @@ def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
     tendons = [(model.tendon(k).name, model.tendon_group[k]) for k in range(model.ntendon)]
     sites = [(model.site(k).name, model.site_group[k]) for k in range(model.nsite)]
     for named in (tendons, sites):
-        stop = [group == mjcf_export.GROUP_HIDDEN for name, group in named if name.startswith("tilt_stop")]
+        stop = [
+            group == mjcf_export.GROUP_HIDDEN
+            for name, group in named
+            if name.startswith("tilt_stop")
+        ]
         assert stop
         assert all(stop)
-        assert not any(group == mjcf_export.GROUP_HIDDEN for name, group in named if not name.startswith("tilt_stop"))
+        assert not any(
+            group == mjcf_export.GROUP_HIDDEN
+            for name, group in named
+            if not name.startswith("tilt_stop")
+        )
 
 
 # The shapes for other drawing programs
@@ -484,7 +519,8 @@ def test_the_shapes_of_a_laboratory_are_the_file_s_without_its_lights() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", (30.0, -5.0, 10.0), degrees=True)
     text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
-    lab, (model, data) = multibody.laboratory(text), loaded(text)
+    lab = multibody.laboratory(text)
+    (model, data) = loaded(text)
     by_name = {shape.name: shape for shape in lab.shapes}
     assert {"stage_floor", "stage_column", "stage_rim_inside", "stage_field"} < set(by_name)
     assert not [name for name in by_name if name.startswith(("stage_leds", "stage_stars"))]
@@ -493,13 +529,19 @@ def test_the_shapes_of_a_laboratory_are_the_file_s_without_its_lights() -> None:
     inside = surface.build_surface(scene.light.surface)
     on_it = turn.apply(dome.vertices_m) + dome.position_m
     np.testing.assert_allclose(
-        np.sum(((on_it - inside.center_m) / inside.semi_axes_m) ** 2, axis=1), 1.0, rtol=0, atol=1e-5
+        np.sum(((on_it - inside.center_m) / inside.semi_axes_m) ** 2, axis=1),
+        1.0,
+        rtol=0,
+        atol=1e-5,
     )
     assert dome.faces.max() == len(dome.vertices_m) - 1
     # Shapes of the vehicle turn with it: the file's start has them where its attitude takes those of body axes.
     for name in ("ball", "upper_deck", "stage_ray_0"):
-        shape, geom = by_name[name], model.geom(name).id
+        shape = by_name[name]
+        geom = model.geom(name).id
         assert shape.on_vehicle
-        np.testing.assert_allclose(lab_from_body.apply(shape.position_m), data.geom_xpos[geom], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            lab_from_body.apply(shape.position_m), data.geom_xpos[geom], rtol=0, atol=1e-9
+        )
     assert not dome.on_vehicle
     np.testing.assert_array_equal(lab.eye_m, model.camera("lab").pos)

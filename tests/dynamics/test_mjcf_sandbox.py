@@ -52,11 +52,17 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     ),
     "attached URDF": ({"v.xml": whole(ATTACHED), "c.xml": URDF}, {}),
     "attached meshdir": ({"v.xml": whole(ATTACHED), "c.xml": MESHED}, {"dd/x.obj": "out/x.obj"}),
-    "namespace of an include": ({"v.xml": whole('<include xmlns="a" file="c.xml"/>'), "c.xml": CHILD}, {}),
+    "namespace of an include": (
+        {"v.xml": whole('<include xmlns="a" file="c.xml"/>'), "c.xml": CHILD},
+        {},
+    ),
     "namespace of all": ({"v.xml": whole(OUT, ' xmlns="a"')}, {}),
     "backslash": ({"v.xml": whole(OUT.replace("/o", "\\o").replace("t/", "t\\"))}, {}),
     "character by number": ({"v.xml": whole(OUT.replace("..", "&#46;."))}, {}),
-    "link beneath meshdir": ({"v.xml": whole(mesh("x.obj", 'meshdir="dd"'))}, {"dd/x.obj": "out/x.obj"}),
+    "link beneath meshdir": (
+        {"v.xml": whole(mesh("x.obj", 'meshdir="dd"'))},
+        {"dd/x.obj": "out/x.obj"},
+    ),
     "link without its folder": (
         {"v.xml": whole(mesh("a/x.obj", 'strippath="true"'))},
         {"x.obj": "out/x.obj"},
@@ -96,7 +102,8 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> None:
     """MuJoCo compiles each, and could not without the file outside."""
     files, links = WAYS[way]
-    folder, out = tmp_path / "theirs", tmp_path / "out"
+    folder = tmp_path / "theirs"
+    out = tmp_path / "out"
     out.mkdir()
     (out / "secret.xml").write_text(f"<mujoco><worldbody>{SECRET}</worldbody></mujoco>")
     (out / "x.obj").write_text(SOLID)
@@ -107,7 +114,9 @@ def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> Non
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(tmp_path / target)
     mujoco.MjSpec.from_file(str(folder / "v.xml")).compile()
-    with pytest.raises(InputError, match=r"allowed: (files in it|.*XML without|MJCF, not URDF)") as refusal:
+    with pytest.raises(
+        InputError, match=r"allowed: (files in it|.*XML without|MJCF, not URDF)"
+    ) as refusal:
         mjcf.load(folder / "v.xml")
     assert len(str(refusal.value).splitlines()) == 1
 
@@ -137,7 +146,9 @@ def test_any_name_that_leaves_the_folder_is_refused(tmp_path: Path, names: str) 
         mjcf.load(tmp_path / "v.xml")
 
 
-def test_a_file_that_includes_itself_in_many_ways_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_includes_itself_in_many_ways_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each way would be a folder of its own, to which each way leads again: for hours."""
     read = list[Path]()
 
@@ -147,14 +158,17 @@ def test_a_file_that_includes_itself_in_many_ways_is_read_once(tmp_path: Path, m
 
     monkeypatch.setattr(mjcf_sandbox, "xml_root", noted)
     (tmp_path / "sub").mkdir()
-    (tmp_path / "v.xml").write_text(whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3))))
+    (tmp_path / "v.xml").write_text(
+        whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3)))
+    )
     with pytest.raises(InputError, match="not a MuJoCo model"):
         mjcf.load(tmp_path / "v.xml")
     assert read == [tmp_path / "v.xml"]
 
 
 def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
-    path, pipe = tmp_path / "v.xml", tmp_path / "pipe.xml"
+    path = tmp_path / "v.xml"
+    pipe = tmp_path / "pipe.xml"
     path.write_bytes(whole(OUT).encode("utf-16"))
     with pytest.raises(InputError, match="not a MuJoCo model: 'utf-8' codec"):
         mjcf.load(path)
@@ -175,7 +189,9 @@ def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
 def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
     """Includes of includes from a folder beneath, meshes, an attached model; `..` that stays inside."""
     for name, text in {
-        "v.xml": whole(ATTACHED + mesh("sub/../x.obj", 'meshdir="dd"') + '<include file="sub/c.xml"/>'),
+        "v.xml": whole(
+            ATTACHED + mesh("sub/../x.obj", 'meshdir="dd"') + '<include file="sub/c.xml"/>'
+        ),
         "sub/c.xml": '<mujoco><include file="sub/d.xml"/></mujoco>',
         "sub/d.xml": "<mujoco><worldbody><site name='in'/></worldbody></mujoco>",
         "c.xml": f"<mujoco><worldbody>{SECRET}</worldbody></mujoco>",
@@ -196,16 +212,18 @@ def nested(count: int) -> str:
 
 
 def flexcomp(count: str) -> str:
-    return (
-        f'<body name="f"><flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/></body>'
-    )
+    flex = f'<flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/>'
+    return f'<body name="f">{flex}</body>'
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (whole(ATTACHED.replace("c.xml", "v.xml").replace("secret", "bus")), r"crashes its reader \(SIGSEGV\)"),
+        (
+            whole(ATTACHED.replace("c.xml", "v.xml").replace("secret", "bus")),
+            r"crashes its reader \(SIGSEGV\)",
+        ),
         (whole(f"<worldbody>{flexcomp('200 200 1')}</worldbody>"), "takes more than 1 s"),
         (whole(f"<worldbody>{flexcomp('20 20 1')}</worldbody>"), "nv 1200; allowed: up to 1000"),
         (whole(f"<worldbody>{nested(60)}</worldbody>"), "ngeom 3601; allowed: up to 2000"),
@@ -223,21 +241,29 @@ def test_a_model_that_would_crash_or_never_end_is_refused(
     if "1 s" in told:
         monkeypatch.setattr(mjcf, "TRIAL_CPU_S", 1)
     (tmp_path / "v.xml").write_text(text)
-    with pytest.raises(InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{told}$"):
+    with pytest.raises(
+        InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{told}$"
+    ):
         mjcf.load(tmp_path / "v.xml")
 
 
 @pytest.mark.parametrize("value", ["inf", "1 NaN 1", "-1e300", "Infinity"])
 def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, value: str) -> None:
     (tmp_path / "v.xml").write_text(whole("").replace('size=".1"', f'size=".1" pos="{value}"'))
-    with pytest.raises(InputError, match=r"v\.xml: geom pos='.*'; allowed: finite numbers up to 1e\+12$"):
+    with pytest.raises(
+        InputError, match=r"v\.xml: geom pos='.*'; allowed: finite numbers up to 1e\+12$"
+    ):
         mjcf.load(tmp_path / "v.xml")
 
 
-def test_a_shipped_vehicle_needs_no_child_and_another_file_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shipped_vehicle_needs_no_child_and_another_file_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A second import of MuJoCo would lengthen the start of every run."""
     tried = list[str]()
-    monkeypatch.setattr(mjcf, "run_guarded", lambda _script, path, **_limits: tried.append(path) or "")
+    monkeypatch.setattr(
+        mjcf, "run_guarded", lambda _script, path, **_limits: tried.append(path) or ""
+    )
     for shipped in (SCENES / "vehicles").glob("*.xml"):
         mjcf.load(shipped)
     own = tmp_path / "v.xml"

@@ -28,7 +28,11 @@ from skysim.scene.sections.vehicle import VehicleConfig
 STILL = np.zeros(3)
 LEVEL = Rotation.identity()
 INERTIA = np.array([6.0, 6.5, 9.0])
-SIMSAT = {"model": "vehicles/simsat.xml", "mass": "80 kg", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
+SIMSAT = {
+    "model": "vehicles/simsat.xml",
+    "mass": "80 kg",
+    "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+}
 
 
 def vehicle_config(**changes: object) -> VehicleConfig:
@@ -51,7 +55,8 @@ def test_sphere_keeps_its_rate() -> None:
     """The SHEFEX-2 scene's law of motion: lab_from_body = start * exp(w t)."""
     given = yaml.safe_load((SCENES / "shefex2.yaml").read_text(encoding="utf-8"))["vehicle"]
     flown = multibody.build(VehicleConfig.model_validate(given))
-    begin, rate = Rotation.from_rotvec([0.1, -0.7, 0.4]), np.radians([0.3, 0.4, 0.0])
+    begin = Rotation.from_rotvec([0.1, -0.7, 0.4])
+    rate = np.radians([0.3, 0.4, 0.0])
     flight = multibody.simulate(flown, begin, rate, 10.0)
     expected = begin * Rotation.from_rotvec(10.0 * rate)
     assert (expected.inv() * flight.attitude_at(10.0)).magnitude() < 1e-12
@@ -86,7 +91,9 @@ def test_vehicle_weighs_what_the_scene_declares() -> None:
 
 def test_balance_masses_do_not_move_the_camera() -> None:
     moved = multibody.build(vehicle_config(center_of_mass=["1 cm", "0 m", "-2 cm"]))
-    np.testing.assert_allclose(multibody.camera_mount(moved).camera_body_m, [0, 0, 0.381], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        multibody.camera_mount(moved).camera_body_m, [0, 0, 0.381], rtol=0, atol=1e-15
+    )
 
 
 def test_undeclared_mass_is_the_files_own() -> None:
@@ -100,11 +107,15 @@ def test_undeclared_mass_is_the_files_own() -> None:
 
 
 def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
-    with pytest.raises(InputError, match=r"vehicle.mass: 5 kg; allowed: more than the 20.6 kg that the bus carries"):
+    with pytest.raises(
+        InputError, match=r"vehicle.mass: 5 kg; allowed: more than the 20.6 kg that the bus carries"
+    ):
         multibody.build(vehicle_config(mass="5 kg"))
     with pytest.raises(InputError, match=r"vehicle.inertia: .* impossible for a rigid body"):
         multibody.build(vehicle_config(inertia=["0.5 kg m2"] * 3))
-    with pytest.raises(InputError, match=r"vehicle.camera: with the camera 5 m .* impossible for a rigid body"):
+    with pytest.raises(
+        InputError, match=r"vehicle.camera: with the camera 5 m .* impossible for a rigid body"
+    ):
         multibody.build(vehicle_config(camera=["0 m", "3 m", "4 m"]))
 
 
@@ -121,7 +132,9 @@ def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
         (("wheels", "cmgs", "fans"), 11, 13),
     ],
 )
-def test_what_the_scene_does_not_switch_on_is_locked(parts: tuple[str, ...], joints: int, motors: int) -> None:
+def test_what_the_scene_does_not_switch_on_is_locked(
+    parts: tuple[str, ...], joints: int, motors: int
+) -> None:
     """Beside the bearing's three freedoms and the three ideal torques; the whole weighs the same."""
     vehicle = multibody.build(vehicle_config(**{part: {} for part in parts}))
     assert vehicle.model.nv == 3 + joints
@@ -129,7 +142,8 @@ def test_what_the_scene_does_not_switch_on_is_locked(parts: tuple[str, ...], joi
     assert (len(vehicle.wheels), len(vehicle.gimbals), len(vehicle.rotors), len(vehicle.fans)) == (
         3 * ("wheels" in parts), 4 * ("cmgs" in parts), 4 * ("cmgs" in parts), 6 * ("fans" in parts),
     )  # fmt: skip
-    data, full = mujoco.MjData(vehicle.model), np.zeros((vehicle.model.nv, vehicle.model.nv))
+    data = mujoco.MjData(vehicle.model)
+    full = np.zeros((vehicle.model.nv, vehicle.model.nv))
     mujoco.mj_forward(vehicle.model, data)
     mujoco.mj_fullM(vehicle.model, data, full)
     np.testing.assert_allclose(full[:3, :3], np.diag(INERTIA), rtol=0, atol=1e-10)
@@ -152,9 +166,14 @@ def test_cmgs_are_found_where_the_file_has_them() -> None:
     vehicle = multibody.build(vehicle_config(cmgs={}))
     assert vehicle.gimbals.names == ("gimbal_1", "gimbal_2", "gimbal_3", "gimbal_4")
     assert vehicle.rotors.names == ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
-    s, c = math.sqrt(2 / 3), math.sqrt(1 / 3)
-    np.testing.assert_allclose(vehicle.gimbals.axes, [[s, 0, -s, 0], [0, s, 0, -s], [c, c, c, c]], rtol=0, atol=5e-6)
-    np.testing.assert_allclose(vehicle.rotors.axes, [[0, -1, 0, 1], [1, 0, -1, 0], [0, 0, 0, 0]], rtol=0, atol=1e-15)
+    s = math.sqrt(2 / 3)
+    c = math.sqrt(1 / 3)
+    np.testing.assert_allclose(
+        vehicle.gimbals.axes, [[s, 0, -s, 0], [0, s, 0, -s], [c, c, c, c]], rtol=0, atol=5e-6
+    )
+    np.testing.assert_allclose(
+        vehicle.rotors.axes, [[0, -1, 0, 1], [1, 0, -1, 0], [0, 0, 0, 0]], rtol=0, atol=1e-15
+    )
     np.testing.assert_allclose(vehicle.gimbals.inertia_kg_m2, 0.00212 + 0.001365, rtol=1e-9)
     np.testing.assert_allclose(vehicle.rotors.inertia_kg_m2, 1.8 * 0.05**2 / 2, rtol=1e-12)
 
@@ -172,18 +191,27 @@ def test_fans_are_found_where_the_file_has_them() -> None:
 def test_tas2_has_three_cmgs_of_variable_speed() -> None:
     """57 deg from body z, 120 deg apart; both gimbals and rotors are driven."""
     vehicle = multibody.build(
-        VehicleConfig.model_validate({"model": "vehicles/tas2.xml", "cmgs": {"rotor_torque_limit": "0.5 N m"}})
+        VehicleConfig.model_validate(
+            {"model": "vehicles/tas2.xml", "cmgs": {"rotor_torque_limit": "0.5 N m"}}
+        )
     )
     assert vehicle.gimbals.names == ("gimbal_1", "gimbal_2", "gimbal_3")
-    np.testing.assert_allclose(np.degrees(np.arccos(vehicle.gimbals.axes[2])), 57, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(
+        np.degrees(np.arccos(vehicle.gimbals.axes[2])), 57, rtol=0, atol=1e-3
+    )
     np.testing.assert_allclose(vehicle.gimbals.axes[:2].sum(axis=1), 0, rtol=0, atol=1e-5)
     assert (vehicle.rotors.motor >= 0).all()
-    np.testing.assert_allclose((vehicle.gimbals.axes * vehicle.rotors.axes).sum(axis=0), 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        (vehicle.gimbals.axes * vehicle.rotors.axes).sum(axis=0), 0, rtol=0, atol=1e-12
+    )
 
 
 def test_accelerometers_sit_at_the_site_imu_or_at_the_bearing() -> None:
     np.testing.assert_allclose(
-        multibody.imu_position_m(multibody.build(vehicle_config())), [0.1, 0.1, 0.14], rtol=0, atol=1e-15
+        multibody.imu_position_m(multibody.build(vehicle_config())),
+        [0.1, 0.1, 0.14],
+        rtol=0,
+        atol=1e-15,
     )
     other = multibody.build(VehicleConfig.model_validate({"model": "vehicles/shefex2.xml"}))
     np.testing.assert_array_equal(multibody.imu_position_m(other), np.zeros(3))
@@ -201,7 +229,9 @@ def test_mount_is_mujocos_own_camera() -> None:
     data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
     mujoco.mj_forward(flown.model, data)
     camera = data.camera("star_camera")
-    np.testing.assert_allclose(lab_from_body.apply(seat.camera_body_m), camera.xpos, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        lab_from_body.apply(seat.camera_body_m), camera.xpos, rtol=0, atol=1e-14
+    )
     lab_from_cam = (lab_from_body * seat.cam_from_body.inv()).as_matrix()
     right, up, back = camera.xmat.reshape(3, 3).T
     np.testing.assert_allclose(lab_from_cam.T, [right, -up, -back], rtol=0, atol=1e-14)
@@ -217,7 +247,9 @@ def test_camera_leans_the_way_the_vehicle_rolls() -> None:
     np.testing.assert_allclose(lab_from_body.apply(seat.camera_body_m), place, rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("model", ["vehicles/simsat.xml", "vehicles/shefex2.xml", "vehicles/tas2.xml"])
+@pytest.mark.parametrize(
+    "model", ["vehicles/simsat.xml", "vehicles/shefex2.xml", "vehicles/tas2.xml"]
+)
 def test_shipped_cameras_look_up_with_their_right_along_x(model: str) -> None:
     seat = multibody.camera_mount(multibody.build(VehicleConfig.model_validate({"model": model})))
     assert seat.cam_from_body.magnitude() < 1e-15
@@ -237,7 +269,9 @@ def test_tilt_stop_holds_a_top_heavy_vehicle_through_two_turns_of_yaw() -> None:
 
 @pytest.mark.parametrize("rate_deg_s", [10, 60])
 def test_tilt_stop_is_hard_and_does_not_throw_back(rate_deg_s: float) -> None:
-    flight = multibody.simulate(multibody.build(vehicle_config()), LEVEL, np.radians([rate_deg_s, 0, 0]), 5.0)
+    flight = multibody.simulate(
+        multibody.build(vehicle_config()), LEVEL, np.radians([rate_deg_s, 0, 0]), 5.0
+    )
     tilt = tilt_deg(flight)
     assert 29.9 < tilt.max() <= 30.1
     assert np.abs(np.degrees(flight.rate_body_rad_s[-1])).max() < 0.07 * rate_deg_s
@@ -245,21 +279,31 @@ def test_tilt_stop_is_hard_and_does_not_throw_back(rate_deg_s: float) -> None:
 
 def test_tilt_stop_leaves_yaw_alone() -> None:
     """Level and spinning at 90 deg/s: nothing has slowed it after two turns, nor tilted it."""
-    flight = multibody.simulate(multibody.build(vehicle_config()), LEVEL, np.radians([0, 0, 90.0]), 8.0)
+    flight = multibody.simulate(
+        multibody.build(vehicle_config()), LEVEL, np.radians([0, 0, 90.0]), 8.0
+    )
     assert yaw_deg(flight)[-1] == pytest.approx(720, abs=1e-9)
     assert tilt_deg(flight).max() < 1e-9
 
 
 def test_start_beyond_the_stop_is_refused() -> None:
-    with pytest.raises(InputError, match=r"motion.start: tilt of 35.0 deg; allowed: up to vehicle.tilt_stop_deg 30"):
-        multibody.simulate(multibody.build(vehicle_config()), Rotation.from_euler("y", 35, degrees=True), STILL, 1.0)
+    with pytest.raises(
+        InputError, match=r"motion.start: tilt of 35.0 deg; allowed: up to vehicle.tilt_stop_deg 30"
+    ):
+        multibody.simulate(
+            multibody.build(vehicle_config()),
+            Rotation.from_euler("y", 35, degrees=True),
+            STILL,
+            1.0,
+        )
 
 
 # --- trajectory ---------------------------------------------------------------------------------------------
 
 
 def test_flight_starts_and_ends_where_and_when_it_was_told() -> None:
-    begin, rate = Rotation.from_rotvec([0.1, 0.2, 0.3]), np.array([0.01, 0.02, 0.03])
+    begin = Rotation.from_rotvec([0.1, 0.2, 0.3])
+    rate = np.array([0.01, 0.02, 0.03])
     flight = multibody.simulate(multibody.build(vehicle_config()), begin, rate, 0.25)
     np.testing.assert_allclose(flight.t_s, np.arange(251) * 1e-3, rtol=0, atol=1e-15)
     assert (begin.inv() * flight.lab_from_body[0]).magnitude() < 1e-15
@@ -274,7 +318,9 @@ def test_controller_is_asked_every_period_about_the_present() -> None:
         asked.append(now)  # type: ignore[arg-type]
         return np.array([0.1, 0.0, 0.0])
 
-    flight = multibody.simulate(multibody.build(vehicle_config()), LEVEL, np.array([0.1, 0.2, 0.3]), 0.2, listen, 0.02)
+    flight = multibody.simulate(
+        multibody.build(vehicle_config()), LEVEL, np.array([0.1, 0.2, 0.3]), 0.2, listen, 0.02
+    )
     np.testing.assert_allclose([t for t, _, _ in asked], np.arange(10) * 0.02, rtol=0, atol=1e-15)
     for t, seen, rate in asked:
         k = round(t / 1e-3)
@@ -288,7 +334,9 @@ def test_same_flight_twice_is_the_same_to_the_last_bit() -> None:
     np.testing.assert_array_equal(one.lab_from_body.as_quat(), two.lab_from_body.as_quat())
 
 
-def test_mujocos_warning_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mujocos_warning_is_an_error_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     flown = multibody.build(vehicle_config())
     with pytest.raises(InputError, match=r"MuJoCo warned before 0\.010 s \(mjWARN_BADCTRL\)"):
@@ -358,7 +406,10 @@ def built(folder: Path, bodies: str, more: str = "", **changes: object) -> multi
         (BUS.replace("<geom", "<gem"), "not a MuJoCo model: .*unrecognized element"),
         (BUS.replace('size="0.3"', 'size="-1"'), "MuJoCo cannot compile it: .*size"),
         (BUS.replace(' mass="50"', ' mass="0"'), "vehicle.mass: 0 kg; allowed: more than"),
-        (carrying(WHEEL.replace("wheel_a", "bearing")), "reserved for skysim's bearing: .*'bearing'"),
+        (
+            carrying(WHEEL.replace("wheel_a", "bearing")),
+            "reserved for skysim's bearing: .*'bearing'",
+        ),
     ],
 )
 def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, message: str) -> None:
@@ -377,7 +428,11 @@ def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, messag
         ("cmgs", carrying(GIMBAL % ""), r"no joint rotor_\*, which vehicle.cmgs needs"),
         ("fans", BUS, r"no site fan_\*, which vehicle.fans needs"),
         ("fans", f'{BUS}<site name="fan_1"/>', r"sites fan_\* must be on body bus"),
-        ("wheels", carrying(WHEEL.replace("axis", 'type="ball" axis')), r"joints wheel_\* must be hinges"),
+        (
+            "wheels",
+            carrying(WHEEL.replace("axis", 'type="ball" axis')),
+            r"joints wheel_\* must be hinges",
+        ),
         (
             "cmgs",
             carrying(GIMBAL % (ROTOR % "2")),
@@ -388,7 +443,11 @@ def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, messag
             carrying(GIMBAL % "" + ROTOR % "1"),
             "joint gimbal_1 has no joint rotor_1 on a child body of its own",
         ),
-        ("cmgs", carrying(GIMBAL % (ROTOR % "1") + ROTOR % "2"), r"a joint rotor_\* has no joint gimbal_\*"),
+        (
+            "cmgs",
+            carrying(GIMBAL % (ROTOR % "1") + ROTOR % "2"),
+            r"a joint rotor_\* has no joint gimbal_\*",
+        ),
     ],
 )
 def test_actuators_that_a_file_lacks_are_answered_in_one_line(
@@ -404,7 +463,9 @@ def test_actuators_that_a_file_lacks_are_answered_in_one_line(
 @pytest.mark.parametrize("name", ["torque_x", "wheel_a", "gimbal_1", "rotor_1", "fan_1"])
 def test_actuator_of_a_reserved_name_is_refused(tmp_path: Path, name: str) -> None:
     motor = f'<actuator><motor name="{name}" site="center" gear="0 0 0 1 0 0"/></actuator>'
-    with pytest.raises(InputError, match=rf"mine\.xml: actuator {name}: an actuator of this name is added"):
+    with pytest.raises(
+        InputError, match=rf"mine\.xml: actuator {name}: an actuator of this name is added"
+    ):
         built(tmp_path, BUS, motor)
 
 
@@ -421,7 +482,10 @@ def test_files_other_actuators_stay_and_are_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"wheels": {"start_rpm": [100, 200]}}, r"vehicle\.wheels\.start_rpm: 2 values; allowed: 3"),
+        (
+            {"wheels": {"start_rpm": [100, 200]}},
+            r"vehicle\.wheels\.start_rpm: 2 values; allowed: 3",
+        ),
         ({"cmgs": {"start_deg": [1, 2, 3]}}, r"vehicle\.cmgs\.start_deg: 3 values; allowed: 4"),
     ],
 )
@@ -439,7 +503,9 @@ def test_imbalance_that_no_rigid_wheel_has_is_refused() -> None:
 
 
 def test_compiler_setting_that_undoes_the_declared_mass_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"the compiled mass is 50 kg .* not as declared; remove inertiafromgeom"):
+    with pytest.raises(
+        InputError, match=r"the compiled mass is 50 kg .* not as declared; remove inertiafromgeom"
+    ):
         built(tmp_path, BUS, '<compiler inertiafromgeom="true"/>', mass="80 kg")
 
 
@@ -464,7 +530,9 @@ def test_vehicle_may_carry_wheels_that_turn(tmp_path: Path) -> None:
         '<asset><texture name="t" type="cube" fileright="../../t.png"/></asset>',
     ],
 )
-def test_a_stranger_s_vehicle_reads_no_file_outside_of_its_folder(tmp_path: Path, names: str) -> None:
+def test_a_stranger_s_vehicle_reads_no_file_outside_of_its_folder(
+    tmp_path: Path, names: str
+) -> None:
     folder = tmp_path / "theirs"
     (folder / "deep").mkdir(parents=True)
     (tmp_path / "secret.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
@@ -491,7 +559,9 @@ def test_missing_file_is_named() -> None:
 
 def test_users_own_vehicle_loses_its_joints_place_and_keyframes(tmp_path: Path) -> None:
     """A file made for other uses: a free joint, a place and heading of its own, a keyframe, a floor."""
-    bus = BUS.replace('name="bus"', 'name="bus" pos="1 2 3" euler="0 0 30"').replace("<site", "<freejoint/><site")
+    bus = BUS.replace('name="bus"', 'name="bus" pos="1 2 3" euler="0 0 30"').replace(
+        "<site", "<freejoint/><site"
+    )
     keys = '<keyframe><key qpos="1 2 3 1 0 0 0"/></keyframe>'
     own = built(tmp_path, f'<geom type="plane" size="5 5 1"/>{bus}', keys)
     assert own.model.nq == 4
@@ -499,7 +569,9 @@ def test_users_own_vehicle_loses_its_joints_place_and_keyframes(tmp_path: Path) 
 
 
 def test_free_vehicle_turns_about_its_center_of_mass() -> None:
-    with pytest.raises(InputError, match=r"vehicle.center_of_mass: a free vehicle rotates about it"):
+    with pytest.raises(
+        InputError, match=r"vehicle.center_of_mass: a free vehicle rotates about it"
+    ):
         multibody.build(vehicle_config(mount="free", center_of_mass=["1 mm", "0 m", "0 m"]))
 
 
@@ -538,7 +610,9 @@ def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody
         ),
     ],
 )
-def test_what_the_scene_declares_is_not_the_file_s_to_say(tmp_path: Path, right: str, wrong: str, says: str) -> None:
+def test_what_the_scene_declares_is_not_the_file_s_to_say(
+    tmp_path: Path, right: str, wrong: str, says: str
+) -> None:
     with pytest.raises(InputError, match=re.escape(says)):
         spoilt(tmp_path, right, wrong, wheels={}, fans={})
 
@@ -559,16 +633,21 @@ def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
         'fullinertia="0.0101 0.006 0.006 0 0 0"',
     ],
 )
-def test_a_wheel_s_inertia_is_the_file_s_however_it_is_written(tmp_path: Path, inertial: str) -> None:
+def test_a_wheel_s_inertia_is_the_file_s_however_it_is_written(
+    tmp_path: Path, inertial: str
+) -> None:
     given = f'<inertial pos="0 0 0" mass="2.5" {inertial}/><joint name="wheel_x" axis'
-    made = spoilt(tmp_path, '<joint name="wheel_x" axis', given, wheels={"dynamic_imbalance": "1 g cm2"})
+    made = spoilt(
+        tmp_path, '<joint name="wheel_x" axis', given, wheels={"dynamic_imbalance": "1 g cm2"}
+    )
     assert made.wheels.inertia_kg_m2[0] == pytest.approx(0.0101, rel=1e-6)
 
 
 def test_an_unstable_flight_is_an_error_though_it_calms_down() -> None:
     """MuJoCo puts the vehicle back to its start and forgets its warning with the next call."""
     flight = multibody.Simulation(multibody.build(vehicle_config()), LEVEL, STILL, 0.1)
-    bad, good = np.full((10, 3), np.nan), np.zeros((10, 3))
+    bad = np.full((10, 3), np.nan)
+    good = np.zeros((10, 3))
     flight.advance(good)
     with pytest.raises(InputError, match=r"MuJoCo warned before 0\.020 s"):
         flight.advance(bad)

@@ -29,13 +29,15 @@ QUIET = {
     "camera.detector.noise": "false",
     "light.layout.spacing": "1.6 in",
 }
-STARTS = ["{roll_deg: 0}", "{roll_deg: -15, pitch_deg: 8, yaw_deg: 100}", "{pitch_deg: -20, yaw_deg: -170}"]
+STARTS = [
+    "{roll_deg: 0}",
+    "{roll_deg: -15, pitch_deg: 8, yaw_deg: 100}",
+    "{pitch_deg: -20, yaw_deg: -170}",
+]
 # A mast in the camera's view: where it stands in the frame that it is fixed to, how it is turned, and half its sides.
-MAST_M, MAST_TURN, MAST_HALF_M = (
-    np.array([0.012, -0.004, 0.6]),
-    Rotation.from_euler("xyz", [30, 50, 10], True),
-    np.array([0.005, 0.03, 0.02]),
-)
+MAST_M = np.array([0.012, -0.004, 0.6])
+MAST_TURN = Rotation.from_euler("xyz", [30, 50, 10], True)
+MAST_HALF_M = np.array([0.005, 0.03, 0.02])
 
 
 def words(values: Floats) -> str:
@@ -51,17 +53,23 @@ def furnished(folder: Path, mjcf: str, **changes: str) -> Lab:
     """The lab of afit_simsat with another vehicle, whose body stands at its start throughout."""
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = QUIET | {"vehicle.model": str(folder / "vehicle.xml")}
-    return build_lab(loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()}))
+    return build_lab(
+        loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()})
+    )
 
 
 def on_bus(geom: str) -> str:
-    return SIMSAT.replace('<body name="star_camera_housing"', f'{geom}<body name="star_camera_housing"')
+    return SIMSAT.replace(
+        '<body name="star_camera_housing"', f'{geom}<body name="star_camera_housing"'
+    )
 
 
 def crosses(begin_m: Floats, end_m: Floats, middle_m: Floats) -> np.ndarray:
     """(N,) whether segments from one point to (N, 3) pass through the mast about its middle: the slab test."""
-    start, along = MAST_TURN.inv().apply(begin_m - middle_m), MAST_TURN.inv().apply(end_m - begin_m)
-    near, far = (-MAST_HALF_M - start) / along, (MAST_HALF_M - start) / along
+    start = MAST_TURN.inv().apply(begin_m - middle_m)
+    along = MAST_TURN.inv().apply(end_m - begin_m)
+    near = (-MAST_HALF_M - start) / along
+    far = (MAST_HALF_M - start) / along
     enters = np.minimum(near, far).max(axis=1)
     leaves = np.maximum(near, far).min(axis=1)
     return np.asarray((enters < leaves) & (leaves > 0) & (enters < 1))
@@ -86,7 +94,9 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     _, seen, truth = picture(lab)
     everything = picture(bare)[1]
     to_body = truth.lab_from_body.inv()
-    behind = crosses(lab.camera.mount.camera_body_m, to_body.apply(lab.camera.sources.place[:, :3]), MAST_M)
+    behind = crosses(
+        lab.camera.mount.camera_body_m, to_body.apply(lab.camera.sources.place[:, :3]), MAST_M
+    )
     gone = set(lab.camera.sources.id[behind].tolist())
     assert seen == everything - gone
     # Those beyond the border whose blur reaches in are on the frame, but not on the chip.
@@ -118,10 +128,13 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     """With the switch on and off; and switched off a mast is as good as none."""
-    on, off = (picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false"))
+    on, off = (
+        picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false")
+    )
     assert on[:2] == off[:2]
     masted = {
-        word: picture(furnished(tmp_path, on_bus(mast(MAST_M)), light__occlusion=word)) for word in ("true", "false")
+        word: picture(furnished(tmp_path, on_bus(mast(MAST_M)), light__occlusion=word))
+        for word in ("true", "false")
     }
     assert masted["false"][:2] == off[:2]
     assert masted["true"][0] != off[0]
@@ -130,13 +143,18 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
 
 def test_it_is_on_unless_the_scene_says_otherwise() -> None:
     hides = [
-        any(isinstance(light, Obstacle) for light in build_lab(loader.load("afit_simsat", keys)).camera.lights)
+        any(
+            isinstance(light, Obstacle)
+            for light in build_lab(loader.load("afit_simsat", keys)).camera.lights
+        )
         for keys in ({}, {"light.occlusion": "false"})
     ]
     assert hides == [True, False]
 
 
-LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
+LENS = (
+    '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
+)
 
 
 @pytest.mark.slow
@@ -157,7 +175,9 @@ def test_the_camera_s_own_housing_does_not_blind_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_geom_that_cannot_be_seen_hides_nothing(tmp_path: Path) -> None:
     clear = on_bus(mast(MAST_M).replace("/>", ' rgba="1 1 1 0"/>'))
-    assert len(picture(furnished(tmp_path, clear))[1]) == len(picture(furnished(tmp_path, SIMSAT))[1])
+    assert len(picture(furnished(tmp_path, clear))[1]) == len(
+        picture(furnished(tmp_path, SIMSAT))[1]
+    )
 
 
 def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
@@ -166,13 +186,16 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
     A ray u from the origin meets it where the discriminant of |(s u - c) / a|^2 = 1 is not negative, ahead.
     """
     lab = build_lab(loader.load("shefex2"))
-    center, axes = np.array([0.0, 0.0, -0.8]), np.array([0.25, 0.25, 0.6])
+    center = np.array([0.0, 0.0, -0.8])
+    axes = np.array([0.25, 0.25, 0.6])
     turn = lab.start
     rays = turn.inv().apply(lab.camera.sources.place[:, :3]) / axes
     along = rays @ (center / axes)
     root = along**2 - np.sum(rays**2, axis=1) * (np.sum((center / axes) ** 2) - 1)
     behind = (root >= 0) & (along > 0)
-    np.testing.assert_array_equal(multibody.occluded(obstacles_of(lab), turn, lab.camera.sources.place), behind)
+    np.testing.assert_array_equal(
+        multibody.occluded(obstacles_of(lab), turn, lab.camera.sources.place), behind
+    )
     assert 100 < behind.sum() < len(behind) / 4
 
 
@@ -228,7 +251,9 @@ def test_gimbals_stand_where_they_are_at_the_start() -> None:
 def test_no_source_is_no_question() -> None:
     lab = build_lab(loader.load("afit_simsat"))
     no_sources = lab.camera.sources.take(np.zeros(0, np.int64))
-    assert multibody.occluded(obstacles_of(lab), Rotation.identity(), no_sources.place).shape == (0,)
+    assert multibody.occluded(obstacles_of(lab), Rotation.identity(), no_sources.place).shape == (
+        0,
+    )
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -241,21 +266,30 @@ def made(text: dict[str, Any]) -> Surface:
 def places(inside: Surface, half_deg: float) -> Floats:
     """(500, 3) LEDs all over the cap that the bearing sees."""
     rng = np.random.default_rng(5)
-    up, azimuth = rng.uniform(np.cos(np.radians(half_deg)), 1, 500), rng.uniform(0, 2 * np.pi, 500)
+    up = rng.uniform(np.cos(np.radians(half_deg)), 1, 500)
+    azimuth = rng.uniform(0, 2 * np.pi, 500)
     out = np.sqrt(1 - up**2)
-    return inside.meet(np.zeros(3), np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up]))
+    return inside.meet(
+        np.zeros(3), np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up])
+    )
 
 
 BOWL = {"kind": "sphere", "apex": "1.5 m", "radius": "1 m", "rim_height": "0.5 m"}
 
 
-def test_the_wall_hides_leds_from_a_camera_beside_the_dome_unless_it_looks_beneath_the_rim() -> None:
+def test_the_wall_hides_leds_from_a_camera_beside_the_dome_unless_it_looks_beneath_the_rim() -> (
+    None
+):
     """A half-sphere open at 0.5 m: a sight enters it through the wall or beneath, by the lesser root of a quadratic."""
-    inside, center = made(BOWL), np.array([0.0, 0.0, 0.5])
+    inside = made(BOWL)
+    center = np.array([0.0, 0.0, 0.5])
     leds = places(inside, 60)
     for camera_m in ([1.3, 0.0, 0.3], [0.4, -1.1, 0.45], [1.05, 0.2, 0.1]):
-        way, start = leds - camera_m, np.array(camera_m) - center
-        a, b, c = np.sum(way**2, axis=1), way @ start, start @ start - 1
+        way = leds - camera_m
+        start = np.array(camera_m) - center
+        a = np.sum(way**2, axis=1)
+        b = way @ start
+        c = start @ start - 1
         entry = (-b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a
         height_m = camera_m[2] + entry * way[:, 2]
         # An LED on the near side is where the sight enters: it shows its back.
@@ -276,14 +310,18 @@ def test_the_wall_hides_nothing_from_a_camera_within() -> None:
 def test_a_panel_hides_its_leds_from_above_as_far_as_it_reaches() -> None:
     """Every LED sits on the panel's underside; from beyond its edge one looks past it, but not through it."""
     panel = made({"kind": "flat", "apex": "1 m", "width": "2 m", "height": "1 m"})
-    assert behind_wall(panel, np.array([0.1, 0.2, 1.5]), np.array([[0.3, 0.2, 1.0], [-0.9, 0.4, 1.0]])).all()
+    assert behind_wall(
+        panel, np.array([0.1, 0.2, 1.5]), np.array([[0.3, 0.2, 1.0], [-0.9, 0.4, 1.0]])
+    ).all()
     assert not behind_wall(panel, np.array([0.1, 0.2, 0.5]), np.array([[0.3, 0.2, 1.0]])).any()
 
 
 @pytest.mark.slow
 def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     """Through `furnish`: a camera beside a narrow drum looks at the wall's outside, and at LEDs beneath its edge."""
-    beside = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"')
+    beside = SIMSAT.replace(
+        'name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"'
+    )
     drum = "{kind: cylinder, axis: z, apex: 3 m, radius: 0.4 m, length: 2.4 m}"
     layout = "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
     lab = furnished_drum(tmp_path, beside, drum, layout)
@@ -298,7 +336,9 @@ def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
 def hidden_by_wall(lab: Lab) -> np.ndarray:
     """(N,) which LEDs the dome's wall hides from a level camera."""
     exposure = expected_exposure(lab.camera, Rotation.identity(), np.zeros(3), 0.0)
-    walls = [light.during(exposure).hides for light in lab.camera.lights if isinstance(light, DomeWall)]
+    walls = [
+        light.during(exposure).hides for light in lab.camera.lights if isinstance(light, DomeWall)
+    ]
     (wall,) = walls
     assert wall is not None
     return wall.hides(lab.camera.sources.place)
@@ -306,5 +346,9 @@ def hidden_by_wall(lab: Lab) -> np.ndarray:
 
 def furnished_drum(folder: Path, mjcf: str, drum: str, layout: str) -> Lab:
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
-    given = {"vehicle.model": str(folder / "vehicle.xml"), "light.surface": drum, "light.layout": layout}
+    given = {
+        "vehicle.model": str(folder / "vehicle.xml"),
+        "light.surface": drum,
+        "light.layout": layout,
+    }
     return build_lab(loader.load("afit_simsat", given))

@@ -17,7 +17,11 @@ from skysim.scene.sections.vehicle import VehicleConfig
 STILL = np.zeros(3)
 LEVEL = Rotation.identity()
 INERTIA = np.array([6.0, 6.5, 9.0])
-SIMSAT = {"model": "vehicles/simsat.xml", "mass": "80 kg", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
+SIMSAT = {
+    "model": "vehicles/simsat.xml",
+    "mass": "80 kg",
+    "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+}
 HEAVY = {"inertia": ["6e6 kg m2", "6.5e6 kg m2", "9e6 kg m2"]}  # nothing that it carries moves it
 WHEEL_KG_M2 = 2.5 * 0.09**2 / 2  # simsat.xml's wheels: cylinders of 2.5 kg and 9 cm
 RPM = math.pi / 30
@@ -73,7 +77,9 @@ def test_wheel_motor_turns_the_body_the_other_way_and_stops_at_its_limit(axis: i
 def test_wheel_starts_at_its_speed_relative_to_the_body() -> None:
     vehicle = multibody.build(vehicle_config(mount="free", wheels={"start_rpm": [300, -200, 100]}))
     flight = multibody.Simulation(vehicle, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0)
-    np.testing.assert_allclose(flight.speeds_rad_s, [0.1, 0.2, 0.3, 300 * RPM, -200 * RPM, 100 * RPM], rtol=1e-15)
+    np.testing.assert_allclose(
+        flight.speeds_rad_s, [0.1, 0.2, 0.3, 300 * RPM, -200 * RPM, 100 * RPM], rtol=1e-15
+    )
 
 
 def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> None:
@@ -84,8 +90,10 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
     friction = {"coulomb": "0.1 N m", "viscous": "1e-3 N m s", "start_rpm": [500, 0, 0]}
     vehicle = multibody.build(vehicle_config(mount="free", wheels=friction))
     flight = flown(vehicle, STILL, still(vehicle, 6.0))
-    t, speed = np.arange(6001) * 1e-3, speeds(flight)[:, vehicle.wheels.dof[0]]
-    start, both = 500 * RPM, WHEEL_KG_M2 * (6 - WHEEL_KG_M2) / 6
+    t = np.arange(6001) * 1e-3
+    speed = speeds(flight)[:, vehicle.wheels.dof[0]]
+    start = 500 * RPM
+    both = WHEEL_KG_M2 * (6 - WHEEL_KG_M2) / 6
     stops_s = both / 1e-3 * math.log(1 + start * 1e-3 / 0.1)
     assert 4 < stops_s < 5
     turning = t < stops_s - 0.01
@@ -97,7 +105,9 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
 
 
 @pytest.mark.parametrize(("torque_nm", "expected"), [(0.019, 0.0), (0.03, 0.01 / WHEEL_KG_M2)])
-def test_wheel_sticks_until_its_motor_beats_coulombs_friction(torque_nm: float, expected: float) -> None:
+def test_wheel_sticks_until_its_motor_beats_coulombs_friction(
+    torque_nm: float, expected: float
+) -> None:
     """Speed after a second of a motor against 0.02 N m; MuJoCo's friction creeps, by 2e-3 rad/s here."""
     vehicle = multibody.build(vehicle_config(mount="free", wheels={"coulomb": "0.02 N m"}, **HEAVY))
     flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[2], torque_nm, 1.0))
@@ -117,21 +127,29 @@ def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
 def torque_of_imbalance(axis: int, static_kg_m: float, dynamic_kg_m2: float) -> Floats:
     """(3,) complex: T = Re(this w^2 exp(i w t)) of simsat.xml's wheel along an axis, but for its phase."""
     place = {0: [0.30, 0, -0.02], 1: [0, 0.30, -0.02], 2: [-0.30, 0, -0.02]}[axis]
-    line = np.roll(np.eye(3)[0], axis + 1) - 1j * np.roll(np.eye(3)[0], axis + 2)  # what turns with the wheel
+    line = np.roll(np.eye(3)[0], axis + 1) - 1j * np.roll(
+        np.eye(3)[0], axis + 2
+    )  # what turns with the wheel
     return static_kg_m * np.cross(place, line) + dynamic_kg_m2 * line
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(("static_g_cm", "dynamic_g_cm2"), [(1.0, 0.0), (0.0, 10.0)])
-def test_unbalanced_wheel_shakes_the_body(axis: int, static_g_cm: float, dynamic_g_cm2: float) -> None:
+def test_unbalanced_wheel_shakes_the_body(
+    axis: int, static_g_cm: float, dynamic_g_cm2: float
+) -> None:
     """At 3000 rpm: amplitudes U_s arm / J and U_d / J about each axis, as a run of ten times finer steps has them.
 
     J dw/dt + w x h = T, the wheel's own momentum h coupling the axes by I_wheel / J, one in 600. J is without the
     wheels, for about its own axle none of the three turns along. So told it is right to 2e-5.
     """
     turned_by: dict[str, object] = {"static_imbalance": f"{static_g_cm} g cm"}
-    turned_by |= {"dynamic_imbalance": f"{dynamic_g_cm2} g cm2", "start_rpm": list(3000 * np.eye(3)[axis])}
-    vehicle, w = multibody.build(vehicle_config(mount="free", wheels=turned_by)), 3000 * RPM
+    turned_by |= {
+        "dynamic_imbalance": f"{dynamic_g_cm2} g cm2",
+        "start_rpm": list(3000 * np.eye(3)[axis]),
+    }
+    vehicle = multibody.build(vehicle_config(mount="free", wheels=turned_by))
+    w = 3000 * RPM
     h = WHEEL_KG_M2 * w * np.eye(3)[axis]
     inertia = np.diag(INERTIA - WHEEL_KG_M2)
     across = np.cross(np.eye(3), h).T  # across @ rate = rate x h
@@ -160,7 +178,9 @@ def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> 
     Two masses m at (+-d along the axle, -+r along v = axle x u) are a product of inertia U_d = 2 m d r, and their
     centrifugal forces a torque 2 d m r w^2 (v x axle) = U_d w^2 u. A sign is not seen in the amplitudes of shaking.
     """
-    w, heavy_kg_m, product_kg_m2 = 3000 * RPM, 1e-4, 1e-5
+    w = 3000 * RPM
+    heavy_kg_m = 1e-4
+    product_kg_m2 = 1e-5
     start = list(3000 * np.eye(3)[axis])
     wheels = {"static_imbalance": f"{heavy_kg_m} kg m", "start_rpm": start}
     torques = []
@@ -172,7 +192,9 @@ def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> 
         data.qvel[:] = multibody.Simulation(vehicle, LEVEL, STILL, 0.1).speeds_rad_s
         mujoco.mj_forward(vehicle.model, data)
         torques.append(data.qacc[:3] * (INERTIA - WHEEL_KG_M2))
-        wheel = vehicle.model.body(vehicle.model.jnt_bodyid[vehicle.model.joint(vehicle.wheels.names[axis]).id])
+        wheel = vehicle.model.body(
+            vehicle.model.jnt_bodyid[vehicle.model.joint(vehicle.wheels.names[axis]).id]
+        )
         heavy_m = wheel.ipos - wheel.ipos @ np.eye(3)[axis] * np.eye(3)[axis]
     line = heavy_m / np.linalg.norm(heavy_m)
     largest = product_kg_m2 * w**2
@@ -185,7 +207,9 @@ def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> 
 def test_gimbal_reaches_its_commanded_rate_with_the_time_constant() -> None:
     """A critically damped spring after a ramp: d(angle)/dt = r (1 - (1 + t / tau) exp(-t / tau))."""
     vehicle = multibody.build(
-        vehicle_config(mount="free", cmgs={"gimbal_time_constant": "20 ms", "rotor_rpm": 1e-6}, **HEAVY)
+        vehicle_config(
+            mount="free", cmgs={"gimbal_time_constant": "20 ms", "rotor_rpm": 1e-6}, **HEAVY
+        )
     )
     flight = flown(vehicle, STILL, held(vehicle, vehicle.gimbals.motor[1], 0.5, 0.2))
     x = np.arange(201) * 1e-3 / 0.02
@@ -202,7 +226,8 @@ def test_gimbal_keeps_its_rate_while_the_vehicle_turns() -> None:
     """
     cmgs = {"rotor_rpm": 2600, "gimbal_time_constant": "10 ms"}
     vehicle = multibody.build(vehicle_config(mount="free", cmgs=cmgs, **HEAVY))
-    t, rate = np.arange(5001) * 1e-3, np.radians([10.0, -10.0, 5.0, 0.0])
+    t = np.arange(5001) * 1e-3
+    rate = np.radians([10.0, -10.0, 5.0, 0.0])
     control = still(vehicle, 5.0)
     control[:, vehicle.gimbals.motor] = rate
     flight = flown(vehicle, np.array([0.0, 0.0, 1.0]), control)
@@ -220,7 +245,9 @@ def test_rotor_keeps_its_speed_or_is_driven_where_it_has_a_motor() -> None:
     flight = flown(free, STILL, still(free, 1.0))
     np.testing.assert_allclose(flight.speeds_rad_s[free.rotors.dof], 2600 * RPM, rtol=1e-12)
     driven = multibody.build(
-        vehicle_config(mount="free", cmgs={"rotor_rpm": 2600, "rotor_torque_limit": "0.1 N m"}, **HEAVY)
+        vehicle_config(
+            mount="free", cmgs={"rotor_rpm": 2600, "rotor_torque_limit": "0.1 N m"}, **HEAVY
+        )
     )
     flight = flown(driven, STILL, held(driven, driven.rotors.motor[2], 7.0, 1.0))
     expected = 2600 * RPM + np.array([0, 0, 0.1, 0]) / (1.8 * 0.05**2 / 2)
@@ -229,10 +256,14 @@ def test_rotor_keeps_its_speed_or_is_driven_where_it_has_a_motor() -> None:
 
 def test_gimbals_start_where_the_scene_has_them() -> None:
     """And stay there: the servo aims at the same angle."""
-    vehicle = multibody.build(vehicle_config(mount="free", cmgs={"start_deg": [10, -20, 30, 90]}, **HEAVY))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", cmgs={"start_deg": [10, -20, 30, 90]}, **HEAVY)
+    )
     flight = flown(vehicle, STILL, still(vehicle, 1.0))
     np.testing.assert_allclose(
-        np.degrees(angles(flight)[:, vehicle.gimbals.qpos]), np.tile([10, -20, 30, 90], (1001, 1)), atol=1e-6
+        np.degrees(angles(flight)[:, vehicle.gimbals.qpos]),
+        np.tile([10, -20, 30, 90], (1001, 1)),
+        atol=1e-6,
     )
 
 
@@ -244,11 +275,15 @@ def test_fans_thrust_follows_with_a_lag_and_stops_at_its_limit() -> None:
 
     A pair at 0.46 m, told 5 N each of which it has 0.3, for a second.
     """
-    vehicle = multibody.build(vehicle_config(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"}))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"})
+    )
     control = still(vehicle, 3.0)
     control[:1000, vehicle.fans.motor[:2]] = 5.0
     rate = speeds(flown(vehicle, STILL, control))[:, 0]
-    t, torque, tau = np.arange(3001) * 1e-3, 2 * 0.3 * 0.46, 0.2
+    t = np.arange(3001) * 1e-3
+    torque = 2 * 0.3 * 0.46
+    tau = 0.2
     pushed = torque / 6 * (t - tau * (1 - np.exp(-t / tau)))
     np.testing.assert_allclose(rate[:1001], pushed[:1001], rtol=0, atol=1e-10)
     left = torque / 6 * tau * (1 - math.exp(-1 / tau)) * (1 - np.exp(-(t - 1) / tau))
@@ -291,7 +326,9 @@ def test_drag_slows_a_spin(begin: float, viscous: float, quadratic: float) -> No
 
 def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
     """T = -(0.01 + 0.02 |w_i|) w_i at (0.1, -0.2, 0.3) rad/s, by hand."""
-    vehicle = multibody.build(vehicle_config(drag={"viscous": "0.01 N m s", "quadratic": "0.02 N m s2"}))
+    vehicle = multibody.build(
+        vehicle_config(drag={"viscous": "0.01 N m s", "quadratic": "0.02 N m s2"})
+    )
     data = mujoco.MjData(vehicle.model)
     data.qvel[:] = [0.1, -0.2, 0.3]
     mujoco.mj_forward(vehicle.model, data)
@@ -303,7 +340,9 @@ def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
 def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float) -> None:
     """T = 2 pi sqrt(J / k) about each axis, whatever the amplitude: the torque goes with the angle."""
     stiffness = 2.0
-    vehicle = multibody.build(vehicle_config(disturbances={"cable": {"stiffness": f"{stiffness} N m / rad"}}))
+    vehicle = multibody.build(
+        vehicle_config(disturbances={"cable": {"stiffness": f"{stiffness} N m / rad"}})
+    )
     period = 2 * math.pi * math.sqrt(INERTIA[axis] / stiffness)
     begin = Rotation.from_rotvec(math.radians(amplitude_deg) * np.eye(3)[axis])
     flight = multibody.simulate(vehicle, begin, STILL, 0.8 * period)
@@ -319,8 +358,12 @@ def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float)
 
 def test_cable_turns_the_vehicle_back_by_the_shorter_way() -> None:
     """At 200 deg of yaw it is wound by 160 the other way: 0.1 N m/rad pull with +0.279 N m."""
-    vehicle = multibody.build(vehicle_config(disturbances={"cable": {"stiffness": "0.1 N m / rad"}}))
+    vehicle = multibody.build(
+        vehicle_config(disturbances={"cable": {"stiffness": "0.1 N m / rad"}})
+    )
     data = mujoco.MjData(vehicle.model)
     data.qpos[:4] = Rotation.from_euler("z", 200, degrees=True).as_quat(scalar_first=True)
     mujoco.mj_forward(vehicle.model, data)
-    np.testing.assert_allclose(data.qfrc_passive, [0, 0, 0.1 * math.radians(160)], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        data.qfrc_passive, [0, 0, 0.1 * math.radians(160)], rtol=0, atol=1e-12
+    )

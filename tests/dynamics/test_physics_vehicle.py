@@ -22,8 +22,16 @@ from skysim.scene.sections.vehicle import VehicleConfig
 STILL = np.zeros(3)
 LEVEL = Rotation.identity()
 INERTIA = np.array([6.0, 6.5, 9.0])
-SIMSAT = {"model": "vehicles/simsat.xml", "mass": "80 kg", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}
-SPINNING: dict[str, object] = {"mount": "free", "wheels": {"start_rpm": [3000, 2000, -1000]}, "cmgs": {}}
+SIMSAT = {
+    "model": "vehicles/simsat.xml",
+    "mass": "80 kg",
+    "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+}
+SPINNING: dict[str, object] = {
+    "mount": "free",
+    "wheels": {"start_rpm": [3000, 2000, -1000]},
+    "cmgs": {},
+}
 
 
 def vehicle_config(**changes: object) -> VehicleConfig:
@@ -34,7 +42,9 @@ def flown(
     vehicle: multibody.VehicleModel, lab_from_body: Rotation, rate: Floats, control: Floats
 ) -> multibody.Simulation:
     """A whole flight with a control (K, nu) for each step."""
-    flight = multibody.Simulation(vehicle, lab_from_body, rate, len(control) * vehicle.model.opt.timestep)
+    flight = multibody.Simulation(
+        vehicle, lab_from_body, rate, len(control) * vehicle.model.opt.timestep
+    )
     flight.advance(control)
     return flight
 
@@ -49,14 +59,19 @@ def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
 
     Of MuJoCo only each body's own velocity, place, mass and principal inertia: L = sum m r x v + J w.
     """
-    model, data = flight.model, mujoco.MjData(flight.model)
+    model = flight.model
+    data = mujoco.MjData(flight.model)
     state = flight.states[step, 1:]
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq : model.nq + model.nv]
     mujoco.mj_forward(model, data)
-    momentum, energy, velocity = np.zeros(3), 0.0, np.zeros(6)
+    momentum = np.zeros(3)
+    energy = 0.0
+    velocity = np.zeros(6)
     for body in range(1, model.nbody):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        spin, speed, axes = velocity[:3], velocity[3:], data.ximat[body].reshape(3, 3)
+        spin = velocity[:3]
+        speed = velocity[3:]
+        axes = data.ximat[body].reshape(3, 3)
         own = axes @ (model.body_inertia[body] * (spin @ axes))
         momentum += own + model.body_mass[body] * np.cross(data.xipos[body], speed)
         energy += (spin @ own + model.body_mass[body] * speed @ speed) / 2
@@ -72,11 +87,16 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
 
     For 40 s of the 60 random rates of up to 1 rad/s at the gimbals and 0.3 N m at the wheels, another each 0.1 s.
     """
-    vehicle, rng = multibody.build(vehicle_config(**SPINNING)), np.random.default_rng(4)
+    vehicle = multibody.build(vehicle_config(**SPINNING))
+    rng = np.random.default_rng(4)
     control = still(vehicle, 60.0)
     control[:40_000, vehicle.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (400, 4)), 100, axis=0)
-    control[:40_000, vehicle.wheels.motor] = np.repeat(rng.uniform(-0.3, 0.3, (400, 3)), 100, axis=0)
-    flight = flown(vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), control)
+    control[:40_000, vehicle.wheels.motor] = np.repeat(
+        rng.uniform(-0.3, 0.3, (400, 3)), 100, axis=0
+    )
+    flight = flown(
+        vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), control
+    )
     kept = np.array([carried(flight, step) for step in range(0, 60_001, 2000)], dtype=object)
     momentum = np.stack(kept[:, 0])
     assert np.abs(momentum - momentum[0]).max() < 1e-8
@@ -88,8 +108,12 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
 def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None:
     """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
-    vehicle.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # no servo holds the gimbals
-    flight = multibody.Simulation(vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), 60.0)
+    vehicle.model.opt.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    )  # no servo holds the gimbals
+    flight = multibody.Simulation(
+        vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), 60.0
+    )
     flight.states[0, 1 + vehicle.model.nq + vehicle.gimbals.dof] = [0.5, -0.3, 0.2, 0.1]
     flight.advance(still(vehicle, 60.0))
     kept = [carried(flight, step) for step in range(0, 60_001, 2000)]
@@ -103,7 +127,9 @@ def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None
 def test_torque_free_motion_keeps_momentum_and_energy() -> None:
     """A tumble about the middle axis, a minute long: L in the lab and w.Jw/2 stay to 1e-11 of themselves."""
     vehicle = multibody.build(vehicle_config(mount="free"))
-    flight = multibody.simulate(vehicle, Rotation.from_rotvec([0.3, 0.2, -1.0]), np.array([0.02, 1.0, 0.01]), 60.0)
+    flight = multibody.simulate(
+        vehicle, Rotation.from_rotvec([0.3, 0.2, -1.0]), np.array([0.02, 1.0, 0.01]), 60.0
+    )
     rate = flight.rate_body_rad_s
     momentum = flight.lab_from_body.apply(rate * INERTIA)
     assert np.abs(momentum - momentum[0]).max() < 1e-11 * np.linalg.norm(momentum[0])
@@ -118,15 +144,23 @@ def test_torque_free_motion_keeps_momentum_and_energy() -> None:
 @pytest.mark.parametrize(("axis", "name"), [(0, "roll"), (1, "pitch")])
 def test_bottom_heavy_vehicle_is_a_pendulum(axis: int, name: str) -> None:
     """T = 4 sqrt(I / m g d) K(sin^2(amplitude / 2)), from rest at 20 deg. The bar is 1e-6; 1e-9 is a root finder's."""
-    below_m, amplitude = 5e-3, math.radians(20)
+    below_m = 5e-3
+    amplitude = math.radians(20)
     vehicle = multibody.build(vehicle_config(center_of_mass=["0 m", "0 m", "-5 mm"]))
-    period = 4 * math.sqrt(INERTIA[axis] / (80 * 9.80665 * below_m)) * ellipk(math.sin(amplitude / 2) ** 2)
-    flight = multibody.simulate(vehicle, Rotation.from_rotvec(amplitude * np.eye(3)[axis]), STILL, 1.3 * period)
+    period = (
+        4
+        * math.sqrt(INERTIA[axis] / (80 * 9.80665 * below_m))
+        * ellipk(math.sin(amplitude / 2) ** 2)
+    )
+    flight = multibody.simulate(
+        vehicle, Rotation.from_rotvec(amplitude * np.eye(3)[axis]), STILL, 1.3 * period
+    )
 
     def angle(t_s: float) -> float:
         return flight.attitude_at(t_s).as_rotvec()[axis]
 
-    down, up = brentq(angle, 0.0, 0.5 * period, xtol=1e-12), brentq(angle, 0.5 * period, period, xtol=1e-12)
+    down = brentq(angle, 0.0, 0.5 * period, xtol=1e-12)
+    up = brentq(angle, 0.5 * period, period, xtol=1e-12)
     assert 4 * down == pytest.approx(period, rel=1e-9), name
     assert 2 * (up - down) == pytest.approx(period, rel=1e-9), name
 
@@ -134,14 +168,20 @@ def test_bottom_heavy_vehicle_is_a_pendulum(axis: int, name: str) -> None:
 def third_kind(n: Floats, amplitude: Floats, m: float) -> Floats:
     """Legendre's incomplete integral of the third kind, by Carlson's forms (DLMF 19.25.14), for every amplitude."""
     half_turns = np.round(amplitude / np.pi)
-    sine, cosine = np.sin(amplitude - half_turns * np.pi), np.cos(amplitude - half_turns * np.pi)
-    delta, pole = 1 - m * sine**2, 1 - n * sine**2
-    part = sine * elliprf(cosine**2, delta, 1) + n / 3 * sine**3 * elliprj(cosine**2, delta, 1, pole)
+    sine = np.sin(amplitude - half_turns * np.pi)
+    cosine = np.cos(amplitude - half_turns * np.pi)
+    delta = 1 - m * sine**2
+    pole = 1 - n * sine**2
+    part = sine * elliprf(cosine**2, delta, 1) + n / 3 * sine**3 * elliprj(
+        cosine**2, delta, 1, pole
+    )
     complete = elliprf(0, 1 - m, 1) + n / 3 * elliprj(0, 1 - m, 1, 1 - n)
     return part + 2 * half_turns * complete
 
 
-def asymmetric_top(inertia: Floats, first: float, third: float, t_s: Floats) -> tuple[Floats, Rotation]:
+def asymmetric_top(
+    inertia: Floats, first: float, third: float, t_s: Floats
+) -> tuple[Floats, Rotation]:
     """Rates (N, 3) in body axes and body_start_from_body of a free top: Jacobi's solution.
 
     It starts with the rates (first, 0, third) about its first and third axes, and is to circle about the third: the
@@ -153,11 +193,14 @@ def asymmetric_top(inertia: Floats, first: float, third: float, t_s: Floats) -> 
     which is L / I3 and an elliptic integral of the third kind. Landau & Lifshitz, Mechanics, section 37 (`assumed`).
     """
     i1, i2, i3 = inertia
-    energy2, squared = i1 * first**2 + i3 * third**2, (i1 * first) ** 2 + (i3 * third) ** 2
+    energy2 = i1 * first**2 + i3 * third**2
+    squared = (i1 * first) ** 2 + (i3 * third) ** 2
     pace = math.sqrt((i3 - i2) * (squared - energy2 * i1) / (i1 * i2 * i3))
     m = (i2 - i1) * (energy2 * i3 - squared) / ((i3 - i2) * (squared - energy2 * i1))
     assert 0 < m < 1
-    second = math.copysign(math.sqrt((energy2 * i3 - squared) / (i2 * (i3 - i2))), (i3 - i1) * first * third)
+    second = math.copysign(
+        math.sqrt((energy2 * i3 - squared) / (i2 * (i3 - i2))), (i3 - i1) * first * third
+    )
     sn, cn, dn, amplitude = ellipj(pace * t_s, m)
     rate = np.stack([first * cn, second * sn, third * dn], axis=1)
 
@@ -181,7 +224,9 @@ def test_asymmetric_top_turns_as_jacobi_solved_it(
     inertia: tuple[float, float, float], first: float, third: float
 ) -> None:
     """The issue's bar: 1e-6 rad within 60 s. It comes out below 1e-12, rounding's own size."""
-    vehicle = multibody.build(vehicle_config(mount="free", inertia=[f"{moment} kg m2" for moment in inertia]))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", inertia=[f"{moment} kg m2" for moment in inertia])
+    )
     lab_from_start = Rotation.from_rotvec([0.4, -1.1, 0.7])
     flight = multibody.simulate(vehicle, lab_from_start, np.array([first, 0.0, third]), 60.0)
     some = np.arange(0, 60_001, 500)
@@ -194,11 +239,15 @@ def test_asymmetric_top_turns_as_jacobi_solved_it(
 def test_heavy_top_against_an_integrator_of_its_own() -> None:
     """Euler's equation with gravity's torque, c x m g, by scipy's DOP853: a fast, unbalanced tumble."""
     center = np.array([3e-3, -2e-3, 5e-3])
-    vehicle = multibody.build(vehicle_config(center_of_mass=["3 mm", "-2 mm", "5 mm"], tilt_stop_deg=89))
-    begin, rate = Rotation.from_rotvec([0.2, 0.1, 0.5]), np.array([0.1, -0.2, 2.0])
+    vehicle = multibody.build(
+        vehicle_config(center_of_mass=["3 mm", "-2 mm", "5 mm"], tilt_stop_deg=89)
+    )
+    begin = Rotation.from_rotvec([0.2, 0.1, 0.5])
+    rate = np.array([0.1, -0.2, 2.0])
 
     def law(_: float, state: Floats) -> Floats:
-        (x, y, z, w), spin = state[:4], state[4:]
+        spin = state[4:]
+        (x, y, z, w) = state[:4]
         down_body = Rotation.from_quat(state[:4]).apply([0, 0, -9.80665], inverse=True)
         torque = np.cross(center, 80 * down_body) - np.cross(spin, INERTIA * spin)
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]]) @ spin / 2
@@ -206,7 +255,9 @@ def test_heavy_top_against_an_integrator_of_its_own() -> None:
 
     run = solve_ivp(law, (0, 5), [*begin.as_quat(), *rate], method="DOP853", rtol=1e-12, atol=1e-13)
     flight = multibody.simulate(vehicle, begin, rate, 5.0)
-    assert (flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))).all()  # the stop had no part
+    assert (
+        flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))
+    ).all()  # the stop had no part
     assert (Rotation.from_quat(run.y[:4, -1]).inv() * flight.attitude_at(5.0)).magnitude() < 1e-9
     np.testing.assert_allclose(flight.rate_body_rad_s[-1], run.y[4:, -1], rtol=0, atol=1e-9)
 
@@ -231,11 +282,15 @@ def test_torque_of_a_cmg_is_gimbal_rate_times_momentum(k: int) -> None:
     By MuJoCo's inverse dynamics, no part accelerating; h by hand, 2600 rpm of a rotor at an angle of 0.6 rad.
     """
     vehicle = multibody.build(vehicle_config(mount="free", cmgs={}))
-    data, rate_rad_s, h = mujoco.MjData(vehicle.model), 0.7, ROTOR_KG_M2 * 2600 * math.pi / 30
+    data = mujoco.MjData(vehicle.model)
+    rate_rad_s = 0.7
+    h = ROTOR_KG_M2 * 2600 * math.pi / 30
     data.qpos[vehicle.gimbals.qpos[k]], data.qvel[vehicle.gimbals.dof[k]] = 0.6, rate_rad_s
     data.qvel[vehicle.rotors.dof] = 2600 * math.pi / 30
     mujoco.mj_inverse(vehicle.model, data)
-    gimbal = Rotation.from_euler("z", 90 * k, degrees=True).apply([0.81650, 0, 0.57735]) / math.hypot(0.81650, 0.57735)
+    gimbal = Rotation.from_euler("z", 90 * k, degrees=True).apply(
+        [0.81650, 0, 0.57735]
+    ) / math.hypot(0.81650, 0.57735)
     expected = h * np.cross(rate_rad_s * gimbal, axle(k, 0.6))
     np.testing.assert_allclose(data.qfrc_inverse[:3], expected, rtol=0, atol=1e-6 * h * rate_rad_s)
     assert np.linalg.norm(expected) == pytest.approx(h * rate_rad_s, rel=1e-12)
@@ -272,7 +327,9 @@ def test_gimbals_give_a_free_vehicle_what_the_rotors_momentum_lost() -> None:
 # --- poses inside an exposure -------------------------------------------------------------------------------
 
 
-def apart_from_a_finer_run_rad(vehicle: multibody.VehicleModel, rate: Floats, control: Floats) -> Floats:
+def apart_from_a_finer_run_rad(
+    vehicle: multibody.VehicleModel, rate: Floats, control: Floats
+) -> Floats:
     """(N,) poses asked for between the steps of a flight, against the samples of one stepped ten times finer.
 
     Nine times in each step; ship's step is changed.
@@ -302,7 +359,9 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
     """
     shaking: dict[str, object] = {"static_imbalance": "1 g cm", "dynamic_imbalance": "1e-7 kg m2"}
     shaking |= {"start_rpm": [3000, -2900, 2800]}
-    vehicle = multibody.build(vehicle_config(wheels=shaking, center_of_mass=["20 um", "-10 um", "-50 um"]))
+    vehicle = multibody.build(
+        vehicle_config(wheels=shaking, center_of_mass=["20 um", "-10 um", "-50 um"])
+    )
     apart = apart_from_a_finer_run_rad(vehicle, np.array([0.05, 0.1, -0.2]), still(vehicle, 2.0))
     assert apart.max() < 3e-9
 
@@ -310,7 +369,8 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
 @pytest.mark.slow
 def test_pose_inside_an_exposure_while_gimbals_are_driven() -> None:
     """CMGs at 2600 rpm whose gimbals are told another rate each 10 ms: within 1e-9 rad."""
-    vehicle, rng = multibody.build(vehicle_config(cmgs={})), np.random.default_rng(6)
+    vehicle = multibody.build(vehicle_config(cmgs={}))
+    rng = np.random.default_rng(6)
     control = still(vehicle, 2.0)
     control[:, vehicle.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (200, 4)), 10, axis=0)
     apart = apart_from_a_finer_run_rad(vehicle, np.array([0.05, 0.1, -0.2]), control)

@@ -27,7 +27,9 @@ TIMES = np.arange(0.0, 6.05, 0.1)
 
 def tumble(t_s: np.ndarray) -> Rotation:
     """A tumble by up to 13 deg/s, with acceleration at both ends."""
-    yaw, pitch, roll = 40 * np.sin(0.3 * t_s + 0.3) + 3 * t_s, 20 * np.cos(0.5 * t_s), 15 * np.sin(0.7 * t_s + 1)
+    yaw = 40 * np.sin(0.3 * t_s + 0.3) + 3 * t_s
+    pitch = 20 * np.cos(0.5 * t_s)
+    roll = 15 * np.sin(0.7 * t_s + 1)
     return Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]), degrees=True)
 
 
@@ -51,29 +53,39 @@ def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
     spline = fit_spline(sampled())
     assert angle(attitudes(spline, TIMES), tumble(TIMES)).max() < 1e-14
     between = np.linspace(-0.1, 6.2, 200)
-    np.testing.assert_allclose(np.linalg.norm(spline.states_at(between)[0], axis=1), 1, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.linalg.norm(spline.states_at(between)[0], axis=1), 1, rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.slow
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     """Central differences within the steps, the continued ends included: off by their own h^2 and by rounding / h."""
-    spline, h = fit_spline(sampled()), 1e-4
+    spline = fit_spline(sampled())
+    h = 1e-4
     t = np.concatenate([TIMES[:-1] + 0.037, [-0.05, 6.05]])
     _, rate, acceleration = spline.states_at(t)
-    before, after = spline.states_at(t - h), spline.states_at(t + h)
-    turned = (Rotation.from_quat(before[0], scalar_first=True).inv() * attitudes(spline, t + h)).as_rotvec() / (2 * h)
+    before = spline.states_at(t - h)
+    after = spline.states_at(t + h)
+    turned = (
+        Rotation.from_quat(before[0], scalar_first=True).inv() * attitudes(spline, t + h)
+    ).as_rotvec() / (2 * h)
     np.testing.assert_allclose(turned, rate, rtol=0, atol=1e-8)
     np.testing.assert_allclose((after[1] - before[1]) / (2 * h), acceleration, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow
 def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
-    spline, eps = fit_spline(sampled()), 1e-9
-    before, after = spline.states_at(TIMES[1:-1] - eps), spline.states_at(TIMES[1:-1] + eps)
+    spline = fit_spline(sampled())
+    eps = 1e-9
+    before = spline.states_at(TIMES[1:-1] - eps)
+    after = spline.states_at(TIMES[1:-1] + eps)
     np.testing.assert_allclose(before[1], after[1], rtol=0, atol=1e-8)
     np.testing.assert_allclose(before[2], after[2], rtol=0, atol=1e-8)
     jerk = np.diff(spline.states_at(TIMES)[2], axis=0) / 0.1
-    assert np.abs(np.diff(jerk, axis=0)).max() > 1e-3  # the next derivative does jump, so the test can fail
+    assert (
+        np.abs(np.diff(jerk, axis=0)).max() > 1e-3
+    )  # the next derivative does jump, so the test can fail
 
 
 @pytest.mark.slow
@@ -83,7 +95,9 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
     ends = (t < 0.2) | (t > 5.8)
     errors = []
     for step_s in (0.1, 0.05):
-        error = angle(attitudes(fit_spline(sampled(np.arange(0, 6 + step_s / 2, step_s))), t), tumble(t))
+        error = angle(
+            attitudes(fit_spline(sampled(np.arange(0, 6 + step_s / 2, step_s))), t), tumble(t)
+        )
         errors.append([error.max(), error[ends].max()])
     assert np.array(errors[0]) / errors[1] == pytest.approx([16, 16], rel=0.2)
     assert errors[0][0] < 0.05 * ARCSEC_RAD
@@ -97,7 +111,10 @@ def test_it_is_better_at_the_ends_than_the_spline_of_rotation_vectors() -> None:
     assert ours < 0.01 * theirs
     middle = (t > 2) & (t < 4)
     np.testing.assert_allclose(
-        angle(attitudes(fit_spline(sampled()), t[middle]), RotationSpline(TIMES, tumble(TIMES))(t[middle])),
+        angle(
+            attitudes(fit_spline(sampled()), t[middle]),
+            RotationSpline(TIMES, tumble(TIMES))(t[middle]),
+        ),
         0,
         atol=3e-7,
     )
@@ -106,7 +123,9 @@ def test_it_is_better_at_the_ends_than_the_spline_of_rotation_vectors() -> None:
 def test_a_quaternion_and_its_negative_are_one_attitude() -> None:
     """The file may change the sign at any sample."""
     flipped = tumble(TIMES).as_quat() * np.where(np.arange(len(TIMES)) % 3, 1, -1)[:, None]
-    columns = {"t_s": TIMES} | {f"lab_from_body_q{end}": flipped[:, n] for n, end in enumerate("xyzw")}
+    columns = {"t_s": TIMES} | {
+        f"lab_from_body_q{end}": flipped[:, n] for n, end in enumerate("xyzw")
+    }
     spline = fit_spline(read_profile(columns, START))
     t = np.linspace(0, 6, 500)
     assert angle(attitudes(spline, t), attitudes(fit_spline(sampled()), t)).max() < 1e-14
@@ -116,11 +135,16 @@ def test_a_constant_rate_errs_with_the_fifth_power_of_the_step() -> None:
     """By 0.04 arcsec at the largest step that is allowed, 10 deg: of fourth order it errs only along the quaternion."""
     errors = []
     for step_deg in (9.99, 9.99 / 2):
-        rate, t = np.radians(step_deg) * np.array([0.6, 0, 0.8]), np.arange(0.0, 20.0)
+        rate = np.radians(step_deg) * np.array([0.6, 0, 0.8])
+        t = np.arange(0.0, 20.0)
         spin = Rotation.from_rotvec(np.outer(t, rate))
-        spline = fit_spline(check_samples(Samples("it", "row", np.arange(20), t, "lab", "body", spin)))
+        spline = fit_spline(
+            check_samples(Samples("it", "row", np.arange(20), t, "lab", "body", spin))
+        )
         between = np.linspace(0, 19, 4001)
-        errors.append(angle(attitudes(spline, between), Rotation.from_rotvec(np.outer(between, rate))).max())
+        errors.append(
+            angle(attitudes(spline, between), Rotation.from_rotvec(np.outer(between, rate))).max()
+        )
     assert errors[0] / ARCSEC_RAD == pytest.approx(0.04, abs=0.005)
     assert errors[0] / errors[1] == pytest.approx(32, rel=0.05)
 
@@ -130,7 +154,12 @@ def test_a_constant_rate_errs_with_the_fifth_power_of_the_step() -> None:
 
 def csv(path: Path, columns: dict[str, object]) -> Path:
     rows = zip(*(values for values in columns.values()), strict=True)  # type: ignore[call-overload]
-    lines = [", ".join(columns), "# a comment", *(",".join(str(cell) for cell in row) for row in rows), ""]
+    lines = [
+        ", ".join(columns),
+        "# a comment",
+        *(",".join(str(cell) for cell in row) for row in rows),
+        "",
+    ]
     path.write_text("\n".join(lines))
     return path
 
@@ -168,7 +197,9 @@ def test_columns_mean_what_their_names_say(name: str, tmp_path: Path) -> None:
         assert angle(read.a_from_b, MOTION).max() < 1e-14
 
 
-@pytest.mark.parametrize("name", ["icrs_from_cam", "cam_from_icrs", "icrs_from_body", "body_from_icrs"])
+@pytest.mark.parametrize(
+    "name", ["icrs_from_cam", "cam_from_icrs", "icrs_from_body", "body_from_icrs"]
+)
 def test_columns_of_the_sky_name_both_frames(name: str) -> None:
     read = read_profile(quaternion_columns(f"{name}_q", MOTION), START)
     assert read.direction == name
@@ -176,9 +207,13 @@ def test_columns_of_the_sky_name_both_frames(name: str) -> None:
 
 
 def test_right_ascension_declination_and_roll_are_the_camera_s() -> None:
-    ra, dec, roll = 80 + TIMES, 89.5 - TIMES / 10, -170 - 3 * TIMES
+    ra = 80 + TIMES
+    dec = 89.5 - TIMES / 10
+    roll = -170 - 3 * TIMES
     read = read_profile({"t_s": TIMES, "ra_deg": ra, "dec_deg": dec, "roll_deg": roll}, START)
-    expected = Rotation.concatenate([cam_from_icrs(*row) for row in np.column_stack([ra, dec, roll])])
+    expected = Rotation.concatenate(
+        [cam_from_icrs(*row) for row in np.column_stack([ra, dec, roll])]
+    )
     assert read.direction == "cam_from_icrs"
     assert angle(read.a_from_b, expected).max() < 1e-14
 
@@ -190,7 +225,10 @@ def test_tables_of_astropy_and_pandas_are_read_with_their_dates(tmp_path: Path) 
 
     moments = [START + datetime.timedelta(seconds=60 + float(t)) for t in TIMES]
     angles = {name: column for name, column in angles_columns().items() if name != "t_s"}
-    with_units = Table(angles_columns(), units={"t_s": "s", "roll_deg": "deg", "pitch_deg": "deg", "yaw_deg": "deg"})
+    with_units = Table(
+        angles_columns(),
+        units={"t_s": "s", "roll_deg": "deg", "pitch_deg": "deg", "yaw_deg": "deg"},
+    )
     with_units.write(tmp_path / "p.ecsv", format="ascii.ecsv")
     dated = [
         pd.DataFrame({"utc": pd.to_datetime(moments)} | angles),
@@ -214,10 +252,16 @@ def test_tables_of_astropy_and_pandas_are_read_with_their_dates(tmp_path: Path) 
 
 GOOD = "t_s,roll_deg,pitch_deg,yaw_deg\n0,0,0,0\n1,1,0,0\n2,2,0,0\n3,3,0,0\n"
 SLIPS = [
-    (GOOD.replace("roll_deg", "roll"), r"line 1: unknown column 'roll'; allowed: t_s or utc, with A_from_B_qx"),
+    (
+        GOOD.replace("roll_deg", "roll"),
+        r"line 1: unknown column 'roll'; allowed: t_s or utc, with A_from_B_qx",
+    ),
     (GOOD.replace("t_s", "t"), r"line 1: unknown column 't'"),
     (GOOD.replace("t_s", "yaw_deg"), r"line 1: two columns 'yaw_deg'"),
-    (GOOD.replace(",yaw_deg", ""), r"columns t_s, roll_deg, pitch_deg are not one time and one attitude"),
+    (
+        GOOD.replace(",yaw_deg", ""),
+        r"columns t_s, roll_deg, pitch_deg are not one time and one attitude",
+    ),
     (GOOD.replace("t_s,", "utc,t_s,"), r"columns utc, t_s, .* are not one time"),
     ("t_s,q_x,q_y,q_z,q_w\n", r"line 1: q_x, q_y, q_z, q_w do not say which rotation they are"),
     ("t_s,q1,q2,q3,q4\n", r"line 1: unknown column 'q1'"),
@@ -225,16 +269,32 @@ SLIPS = [
     (GOOD.replace("1,1,0,0", "1,1,0"), r"line 3: 3 values; allowed: 4"),
     (GOOD.replace("2,2,0,0", "2,2,0,zero"), r"line 4: 'zero' is not a number"),
     (GOOD.replace("2,2,0,0", "2,2,0,nan"), r"line 4: 'nan' is not a finite number"),
-    (GOOD.replace("3,3,0,0", "2,3,0,0"), r"line 5: time 2 s is not after 2 s, by a microsecond at least"),
-    (GOOD.replace("3,3,0,0", "3e9,3,0,0"), r"line 5: time 3e\+09 s; allowed: within 1e\+09 s of the start"),
-    (GOOD.replace("3,3,0,0", "3,30,0,0"), r"line 5: 28 deg from the attitude before it; allowed: up to 10 deg"),
+    (
+        GOOD.replace("3,3,0,0", "2,3,0,0"),
+        r"line 5: time 2 s is not after 2 s, by a microsecond at least",
+    ),
+    (
+        GOOD.replace("3,3,0,0", "3e9,3,0,0"),
+        r"line 5: time 3e\+09 s; allowed: within 1e\+09 s of the start",
+    ),
+    (
+        GOOD.replace("3,3,0,0", "3,30,0,0"),
+        r"line 5: 28 deg from the attitude before it; allowed: up to 10 deg",
+    ),
     (GOOD.replace("3,3,0,0\n", ""), r"3 attitudes; allowed: 4 to 1000000"),
     (
-        "t_s,lab_from_body_qw,lab_from_body_qx,lab_from_body_qy,lab_from_body_qz\n" + "0,1,0,0,0\n1,1.002,0,0,0\n",
+        "t_s,lab_from_body_qw,lab_from_body_qx,lab_from_body_qy,lab_from_body_qz\n"
+        + "0,1,0,0,0\n1,1.002,0,0,0\n",
         r"line 3: a quaternion of norm 1.002; allowed: 1, to 0.001",
     ),
-    ("utc,roll_deg,pitch_deg,yaw_deg\nnoon,0,0,0\n", r"line 2: 'noon' is not an epoch; allowed: 2012-06-22T21:00:00.5"),
-    ("utc,roll_deg,pitch_deg,yaw_deg\n2012-13-40T00:00:00,0,0,0\n", r"line 2: .* is not a date and time"),
+    (
+        "utc,roll_deg,pitch_deg,yaw_deg\nnoon,0,0,0\n",
+        r"line 2: 'noon' is not an epoch; allowed: 2012-06-22T21:00:00.5",
+    ),
+    (
+        "utc,roll_deg,pitch_deg,yaw_deg\n2012-13-40T00:00:00,0,0,0\n",
+        r"line 2: .* is not a date and time",
+    ),
     ("t_s,ra_deg,dec_deg,roll_deg\n0,1,91,0\n", r"line 2: dec_deg is beyond a pole"),
     ("<?xml version='1.0'?>", r"XML; allowed: CSV, ECSV, CCSDS AEM"),
 ]
@@ -256,7 +316,9 @@ def test_the_good_table_is_read(tmp_path: Path) -> None:
     assert len(check_samples(read_profile(tmp_path / "p.csv", START)).t_s) == 4
 
 
-def test_a_file_too_large_or_no_text_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_too_large_or_no_text_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "p.csv"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="cannot be read"):
@@ -266,12 +328,16 @@ def test_a_file_too_large_or_no_text_is_refused(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(InputError, match=r"bytes; allowed: up to 20"):
         read_profile(path, START)
     t = np.arange(MAX_SAMPLES + 1.0)
-    many = Samples("it", "row", t.astype(int), t, "lab", "body", Rotation.from_rotvec(np.zeros((len(t), 3))))
+    many = Samples(
+        "it", "row", t.astype(int), t, "lab", "body", Rotation.from_rotvec(np.zeros((len(t), 3)))
+    )
     with pytest.raises(InputError, match="1000001 attitudes; allowed: 4 to 1000000"):
         check_samples(many)
 
 
-@pytest.mark.parametrize("table", [3, "text", [1, 2], {"t_s": [0, 1], "roll_deg": ["a", "b"]}, {"t_s": [[1], [2]]}])
+@pytest.mark.parametrize(
+    "table", [3, "text", [1, 2], {"t_s": [0, 1], "roll_deg": ["a", "b"]}, {"t_s": [[1], [2]]}]
+)
 def test_what_is_no_table_is_refused(table: object) -> None:
     with pytest.raises(InputError, match=r"^profile"):
         read_profile(table, START)
@@ -279,7 +345,9 @@ def test_what_is_no_table_is_refused(table: object) -> None:
 
 def test_columns_of_different_lengths_are_refused() -> None:
     columns = angles_columns() | {"yaw_deg": np.zeros(3)}
-    with pytest.raises(InputError, match="profile: column yaw_deg has 3 values; allowed: 61, as the first"):
+    with pytest.raises(
+        InputError, match="profile: column yaw_deg has 3 values; allowed: 61, as the first"
+    ):
         read_profile(columns, START)
 
 
@@ -299,14 +367,28 @@ META = {
 }
 
 
-def segment(rotations: Rotation, t_s: np.ndarray, more: str = "", scalar_first: bool = False, **meta: str) -> str:
+def segment(
+    rotations: Rotation, t_s: np.ndarray, more: str = "", scalar_first: bool = False, **meta: str
+) -> str:
     rows = rotations.as_quat(scalar_first=scalar_first)
     lines = [f"{key} = {value}" for key, value in (META | meta).items() if value]
     data = [
         f"{(START + datetime.timedelta(seconds=float(t))).isoformat()} {' '.join(map(repr, row.tolist()))}{more}"
         for t, row in zip(t_s, rows, strict=True)
     ]
-    return "\n".join(["META_START", "COMMENT a = b", *lines, "META_STOP", "", "DATA_START", *data, "DATA_STOP", ""])
+    return "\n".join(
+        [
+            "META_START",
+            "COMMENT a = b",
+            *lines,
+            "META_STOP",
+            "",
+            "DATA_START",
+            *data,
+            "DATA_STOP",
+            "",
+        ]
+    )
 
 
 def aem(*segments: str, version: str = "1.0") -> str:
@@ -335,7 +417,8 @@ def test_what_we_write_is_read_as_it_was(frames: tuple[str, str], tmp_path: Path
 @pytest.mark.parametrize("direction", ["A2B", "B2A"])
 @pytest.mark.parametrize("reference_first", [True, False])
 @pytest.mark.parametrize(
-    ("kind", "more"), [("QUATERNION", ""), ("QUATERNION/RATE", " 1 2 3"), ("QUATERNION/DERIVATIVE", " 0 0 0 0")]
+    ("kind", "more"),
+    [("QUATERNION", ""), ("QUATERNION/RATE", " 1 2 3"), ("QUATERNION/DERIVATIVE", " 0 0 0 0")],
 )
 def test_order_direction_and_frames_of_version_1(
     order: str, direction: str, reference_first: bool, kind: str, more: str, tmp_path: Path
@@ -362,23 +445,42 @@ def test_order_direction_and_frames_of_version_1(
 
 
 def test_version_2_is_from_a_to_b_scalar_last(tmp_path: Path) -> None:
-    part = segment(MOTION, TIMES, " 0 0 0", ATTITUDE_DIR="", QUATERNION_TYPE="", ATTITUDE_TYPE="QUATERNION/ANGVEL")
+    part = segment(
+        MOTION,
+        TIMES,
+        " 0 0 0",
+        ATTITUDE_DIR="",
+        QUATERNION_TYPE="",
+        ATTITUDE_TYPE="QUATERNION/ANGVEL",
+    )
     assert angle(read_text(aem(part, version="2.0"), tmp_path).a_from_b, MOTION).max() < 1e-14
 
 
 def test_the_standard_s_own_example_is_read(tmp_path: Path) -> None:
     """CCSDS 504.0-B-1, figure 4-1, its useable span without the first line; EME2000 is turned by the frame bias."""
-    rows = ["21:29:07.2555 0.56748 0.03146 0.45689 0.68427", "22:08:03.5555 0.42319 -0.45697 0.23784 0.74533"]
+    rows = [
+        "21:29:07.2555 0.56748 0.03146 0.45689 0.68427",
+        "22:08:03.5555 0.42319 -0.45697 0.23784 0.74533",
+    ]
     rows += ["22:08:04.5555 -0.84532 0.26974 -0.06532 0.45652"]
-    meta = META | {"REF_FRAME_A": "EME2000", "CENTER_NAME": "mars barycenter", "INTERPOLATION_METHOD": "hermite"}
-    meta |= {"USEABLE_START_TIME": "1996-11-28T22:08:02.5555", "USEABLE_STOP_TIME": "1996-11-30T01:18:02.5555"}
+    meta = META | {
+        "REF_FRAME_A": "EME2000",
+        "CENTER_NAME": "mars barycenter",
+        "INTERPOLATION_METHOD": "hermite",
+    }
+    meta |= {
+        "USEABLE_START_TIME": "1996-11-28T22:08:02.5555",
+        "USEABLE_STOP_TIME": "1996-11-30T01:18:02.5555",
+    }
     lines = [f"{key} = {value}" for key, value in meta.items()]
     data = [f"1996-11-28T{row}" for row in rows]
     content = aem("\n".join(["META_START", *lines, "META_STOP", "DATA_START", *data, "DATA_STOP"]))
     (tmp_path / "p.aem").write_text(content)
     read = read_profile(tmp_path / "p.aem", datetime.datetime(1996, 11, 28, 22, 8, 0))
     np.testing.assert_allclose(read.t_s, [3.5555, 4.5555], rtol=0, atol=1e-9)
-    there = Rotation.from_quat([[0.42319, -0.45697, 0.23784, 0.74533], [-0.84532, 0.26974, -0.06532, 0.45652]])
+    there = Rotation.from_quat(
+        [[0.42319, -0.45697, 0.23784, 0.74533], [-0.84532, 0.26974, -0.06532, 0.45652]]
+    )
     assert angle(read.a_from_b, there).max() == pytest.approx(23e-3 * ARCSEC_RAD, rel=0.05)
 
 
@@ -392,9 +494,12 @@ def test_the_frame_bias_is_that_of_the_iers_conventions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("system", "ahead_s"), [("UTC", 0.0), ("TAI", 36.0), ("TT", 36.0 + 32.184), ("GPS", 17.0), ("TDB", 68.184)]
+    ("system", "ahead_s"),
+    [("UTC", 0.0), ("TAI", 36.0), ("TT", 36.0 + 32.184), ("GPS", 17.0), ("TDB", 68.184)],
 )
-def test_epochs_of_every_time_system_are_turned_into_utc(system: str, ahead_s: float, tmp_path: Path) -> None:
+def test_epochs_of_every_time_system_are_turned_into_utc(
+    system: str, ahead_s: float, tmp_path: Path
+) -> None:
     """At noon of 31 December 2016, before the leap second: TAI - UTC = 36 s, TT - TAI = 32.184 s, TAI - GPS = 19 s."""
     read = read_text(aem(segment(MOTION, TIMES + ahead_s, TIME_SYSTEM=system)), tmp_path)
     np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=2e-3 if system == "TDB" else 1e-6)
@@ -408,8 +513,15 @@ def test_epochs_may_count_the_days_of_the_year(tmp_path: Path) -> None:
 
 def test_segments_are_joined(tmp_path: Path) -> None:
     """One sample of both at the seam; then a step between them; the second with its frames the other way round."""
-    first, second = segment(MOTION[:21], TIMES[:21]), segment(MOTION[20:41], TIMES[20:41])
-    third = segment(MOTION[41:].inv(), TIMES[41:], REF_FRAME_A="SC_BODY_1", REF_FRAME_B="ICRF", QUATERNION_TYPE="LAST")
+    first = segment(MOTION[:21], TIMES[:21])
+    second = segment(MOTION[20:41], TIMES[20:41])
+    third = segment(
+        MOTION[41:].inv(),
+        TIMES[41:],
+        REF_FRAME_A="SC_BODY_1",
+        REF_FRAME_B="ICRF",
+        QUATERNION_TYPE="LAST",
+    )
     read = read_text(aem(first, second, third), tmp_path)
     np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=1e-9)
     assert angle(read.a_from_b, MOTION).max() < 1e-14
@@ -422,17 +534,44 @@ def test_segments_are_joined(tmp_path: Path) -> None:
         (aem(), "no segment"),
         (aem(segment(MOTION, TIMES, REF_FRAME_A="")), "REF_FRAME_A is missing"),
         (aem(segment(MOTION, TIMES, QUATERNION_TYPE="")), "QUATERNION_TYPE is missing"),
-        (aem(segment(MOTION, TIMES, ATTITUDE_DIR="A2C")), "line 12: ATTITUDE_DIR = 'A2C'; allowed: A2B, B2A"),
-        (aem(segment(MOTION, TIMES, REF_FRAME_A="TOD_EARTH")), "line 10: unknown frame 'TOD_EARTH'; allowed: ICRF"),
-        (aem(segment(MOTION, TIMES, REF_FRAME_B="EME2000")), "line 11: the attitude of EME2000 in ICRF; allowed: one"),
-        (aem(segment(MOTION, TIMES, TIME_SYSTEM="UT1")), "line 13: TIME_SYSTEM = 'UT1'; allowed: UTC, TAI"),
-        (aem(segment(MOTION, TIMES, ATTITUDE_TYPE="SPIN")), "line 16: ATTITUDE_TYPE = 'SPIN'; allowed: QUATERNION"),
+        (
+            aem(segment(MOTION, TIMES, ATTITUDE_DIR="A2C")),
+            "line 12: ATTITUDE_DIR = 'A2C'; allowed: A2B, B2A",
+        ),
+        (
+            aem(segment(MOTION, TIMES, REF_FRAME_A="TOD_EARTH")),
+            "line 10: unknown frame 'TOD_EARTH'; allowed: ICRF",
+        ),
+        (
+            aem(segment(MOTION, TIMES, REF_FRAME_B="EME2000")),
+            "line 11: the attitude of EME2000 in ICRF; allowed: one",
+        ),
+        (
+            aem(segment(MOTION, TIMES, TIME_SYSTEM="UT1")),
+            "line 13: TIME_SYSTEM = 'UT1'; allowed: UTC, TAI",
+        ),
+        (
+            aem(segment(MOTION, TIMES, ATTITUDE_TYPE="SPIN")),
+            "line 16: ATTITUDE_TYPE = 'SPIN'; allowed: QUATERNION",
+        ),
         (aem(segment(MOTION, TIMES, " 7")), "line 21: 6 values; allowed: an epoch and 4 numbers"),
-        (aem(segment(MOTION, TIMES)).replace("DATA_STOP", ""), "ends within a segment, after DATA_START"),
+        (
+            aem(segment(MOTION, TIMES)).replace("DATA_STOP", ""),
+            "ends within a segment, after DATA_START",
+        ),
         (aem(segment(MOTION, TIMES)).replace("META_STOP", ""), "DATA_START after META_START"),
-        (aem(segment(MOTION, TIMES)).replace("TIME_SYSTEM = ", "TIME_SYSTEM "), "is not KEYWORD = value"),
-        (aem(segment(MOTION, TIMES), segment(MOTION, TIMES)), "line 98: a segment that begins 6 s before the end"),
-        (aem(segment(MOTION, TIMES), segment(MOTION, TIMES + 9)), "a gap of 3 s between two segments"),
+        (
+            aem(segment(MOTION, TIMES)).replace("TIME_SYSTEM = ", "TIME_SYSTEM "),
+            "is not KEYWORD = value",
+        ),
+        (
+            aem(segment(MOTION, TIMES), segment(MOTION, TIMES)),
+            "line 98: a segment that begins 6 s before the end",
+        ),
+        (
+            aem(segment(MOTION, TIMES), segment(MOTION, TIMES + 9)),
+            "a gap of 3 s between two segments",
+        ),
         (
             aem(segment(MOTION, TIMES), segment(MOTION, TIMES + 6, REF_FRAME_B="STARTRACKER_1")),
             "a segment of icrs_from_cam after one of icrs_from_body",
@@ -449,18 +588,29 @@ def test_a_slip_in_an_aem_is_told_with_its_line(content: str, told: str, tmp_pat
 # --- STK ----------------------------------------------------------------------------------------------------
 
 
-def stk(rotations: Rotation, section: str = "AttitudeTimeQuaternions", more: str = "", **keywords: str) -> str:
+def stk(
+    rotations: Rotation, section: str = "AttitudeTimeQuaternions", more: str = "", **keywords: str
+) -> str:
     rows = rotations.as_quat(scalar_first="First" in section)
     told = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
     told |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
     lines = [f"  {key}\t{value}" for key, value in (told | keywords).items() if value]
-    data = [f"{t!r} {' '.join(map(repr, row))}{more}" for t, row in zip(TIMES.tolist(), rows.tolist(), strict=True)]
-    return "\n".join(["stk.v.11.0", "# by us", "BEGIN Attitude", *lines, section, *data, "END Attitude", ""])
+    data = [
+        f"{t!r} {' '.join(map(repr, row))}{more}"
+        for t, row in zip(TIMES.tolist(), rows.tolist(), strict=True)
+    ]
+    return "\n".join(
+        ["stk.v.11.0", "# by us", "BEGIN Attitude", *lines, section, *data, "END Attitude", ""]
+    )
 
 
 @pytest.mark.parametrize(
     ("section", "more"),
-    [("AttitudeTimeQuaternions", ""), ("attitudetimequatscalarfirst", ""), ("AttitudeTimeQuatAngVels", " 1 2 3")],
+    [
+        ("AttitudeTimeQuaternions", ""),
+        ("attitudetimequatscalarfirst", ""),
+        ("AttitudeTimeQuatAngVels", " 1 2 3"),
+    ],
 )
 def test_an_stk_file_has_reference_from_body(section: str, more: str, tmp_path: Path) -> None:
     content = stk(MOTION, "AttitudeTimeQuatScalarFirst" if "first" in section else section, more)
@@ -472,7 +622,11 @@ def test_an_stk_file_has_reference_from_body(section: str, more: str, tmp_path: 
 
 
 def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -> None:
-    read = read_text(stk(MOTION, ScenarioEpoch="", CoordinateAxes="LAB", NumberOfAttitudePoints="9"), tmp_path, "p.a")
+    read = read_text(
+        stk(MOTION, ScenarioEpoch="", CoordinateAxes="LAB", NumberOfAttitudePoints="9"),
+        tmp_path,
+        "p.a",
+    )
     assert (read.direction, read.absolute, len(read.t_s)) == ("lab_from_body", False, 9)
     biased = read_text(stk(MOTION, CoordinateAxes="J2000"), tmp_path, "p.a")
     assert angle(biased.a_from_b, MOTION) == pytest.approx(23e-3 * ARCSEC_RAD, rel=0.05)
@@ -488,27 +642,47 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
         (stk(MOTION, CoordinateAxes=""), "CoordinateAxes ''; allowed: ICRF"),
         (stk(MOTION, CentralBody="Mars"), "line 6: CentralBody 'Mars'; allowed: Earth"),
         (stk(MOTION, TimeFormat="UTCG"), "line 9: TimeFormat 'UTCG'; allowed: EpSec"),
-        (stk(MOTION, RepeatPattern="yes"), "line 9: unknown keyword 'RepeatPattern'; allowed: Numb"),
-        (stk(MOTION, ScenarioEpoch="yesterday"), "line 5: ScenarioEpoch 'yesterday'; allowed: 1 Jul 2005"),
+        (
+            stk(MOTION, RepeatPattern="yes"),
+            "line 9: unknown keyword 'RepeatPattern'; allowed: Numb",
+        ),
+        (
+            stk(MOTION, ScenarioEpoch="yesterday"),
+            "line 5: ScenarioEpoch 'yesterday'; allowed: 1 Jul 2005",
+        ),
         *(
-            (stk(MOTION, ScenarioEpoch=f"1 Jul 2005 {clock}"), f"line 5: ScenarioEpoch '1 Jul 2005 {clock}'; allowed")
+            (
+                stk(MOTION, ScenarioEpoch=f"1 Jul 2005 {clock}"),
+                f"line 5: ScenarioEpoch '1 Jul 2005 {clock}'; allowed",
+            )
             for clock in ("12:-1:00", "12:60:00", "-1:00:00", "24:00:00", "12:00:-1", "12:00:60")
         ),
         (
             stk(MOTION, NumberOfAttitudePoints="62"),
             "line 4: NumberOfAttitudePoints 62, but there are 61: the file is cut",
         ),
-        (stk(MOTION, NumberOfAttitudePoints="all"), "line 4: NumberOfAttitudePoints 'all'; allowed: a whole number"),
-        (stk(MOTION, "AttitudeTimeYPRAngles"), "line 9: unknown data 'AttitudeTimeYPRAngles'; allowed: AttitudeTimeQ"),
+        (
+            stk(MOTION, NumberOfAttitudePoints="all"),
+            "line 4: NumberOfAttitudePoints 'all'; allowed: a whole number",
+        ),
+        (
+            stk(MOTION, "AttitudeTimeYPRAngles"),
+            "line 9: unknown data 'AttitudeTimeYPRAngles'; allowed: AttitudeTimeQ",
+        ),
         (stk(MOTION, more=" 1"), "line 10: 6 numbers; allowed: 5"),
         (
             stk(MOTION).replace("BEGIN Attitude", "BEGIN Ephemeris"),
             "line 3: 'BEGIN Ephemeris'; allowed: BEGIN Attitude",
         ),
-        ("stk.v.11.0\nBEGIN Attitude\nEND Attitude\n", "no attitudes; allowed: AttitudeTimeQuaternions"),
+        (
+            "stk.v.11.0\nBEGIN Attitude\nEND Attitude\n",
+            "no attitudes; allowed: AttitudeTimeQuaternions",
+        ),
     ],
 )
-def test_a_slip_in_an_stk_file_is_told_with_its_line(content: str, told: str, tmp_path: Path) -> None:
+def test_a_slip_in_an_stk_file_is_told_with_its_line(
+    content: str, told: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=told) as raised:
         read_text(content, tmp_path, "p.a")
     assert "\n" not in str(raised.value)
@@ -555,19 +729,27 @@ def test_it_goes_on_at_the_rate_at_which_it_ended() -> None:
     motion = following().model_copy(update={"start": "profile"})
     reference = plan(motion, None, (spline,))
     attitude_at_end, rate, _ = spline.state_at(6.0)
-    after = Rotation.from_quat(attitude_at_end, scalar_first=True) * Rotation.from_rotvec(rate * 1.5)
+    after = Rotation.from_quat(attitude_at_end, scalar_first=True) * Rotation.from_rotvec(
+        rate * 1.5
+    )
     assert angle(reference.attitudes(np.array([7.5]))[0], after) < 1e-12
-    np.testing.assert_allclose(reference.state_at(0.0)[1], spline.state_at(0.0)[1], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        reference.state_at(0.0)[1], spline.state_at(0.0)[1], rtol=0, atol=1e-15
+    )
 
 
 def test_a_profile_that_does_not_join_on_is_refused() -> None:
     spline = fit_spline(sampled())
     with pytest.raises(
-        InputError, match=r"motion.maneuver: it: begins \S+ deg and \S+ deg/s away .* motion.start: pro"
+        InputError,
+        match=r"motion.maneuver: it: begins \S+ deg and \S+ deg/s away .* motion.start: pro",
     ):
         plan(following(), Rotation.identity(), (spline,))
     late = fit_spline(sampled(TIMES + 3.0))
-    with pytest.raises(InputError, match=r"attitudes from 3 s to 9 s after .* allowed: from 0.1 s \(a step\) at most"):
+    with pytest.raises(
+        InputError,
+        match=r"attitudes from 3 s to 9 s after .* allowed: from 0.1 s \(a step\) at most",
+    ):
         plan(following(), tumble(np.array([3.0]))[0], (late,))
     first = following(begin="first_sample").model_copy(update={"start": "profile"})
     assert plan(first, None, (late,)).duration_s == pytest.approx(6.0, abs=1e-12)
@@ -576,10 +758,13 @@ def test_a_profile_that_does_not_join_on_is_refused() -> None:
 
 
 def test_the_vehicle_starts_where_the_first_of_two_profiles_does() -> None:
-    first, second = fit_spline(sampled(TIMES + 3.0)), fit_spline(sampled(TIMES + 20.0))
+    first = fit_spline(sampled(TIMES + 3.0))
+    second = fit_spline(sampled(TIMES + 20.0))
     motion = following(begin="first_sample").model_copy(update={"start": "profile"})
     start_wxyz, _, _ = profile_start(motion, (first, second))
-    assert angle(Rotation.from_quat(start_wxyz, scalar_first=True), tumble(np.array([3.0]))[0]) < 1e-12
+    assert (
+        angle(Rotation.from_quat(start_wxyz, scalar_first=True), tumble(np.array([3.0]))[0]) < 1e-12
+    )
 
 
 def test_the_spline_is_scipys(tmp_path: Path) -> None:
@@ -588,5 +773,8 @@ def test_the_spline_is_scipys(tmp_path: Path) -> None:
     t = np.linspace(0, 6, 700)
     p = cubic(t)
     np.testing.assert_allclose(
-        fit_spline(sampled()).states_at(t)[0], p / np.linalg.norm(p, axis=1)[:, None], rtol=0, atol=1e-14
+        fit_spline(sampled()).states_at(t)[0],
+        p / np.linalg.norm(p, axis=1)[:, None],
+        rtol=0,
+        atol=1e-14,
     )

@@ -29,7 +29,8 @@ def trimmed(*position_mm: float, step: str = "1 um") -> multibody.VehicleModel:
 
 def test_moved_masses_change_center_and_inertia_as_mujoco_weighs_them() -> None:
     """In MuJoCo's own sum over bodies: the center moves by mass times travel over the total, the axes' inertia too."""
-    moved, still = trimmed(3, -5, 12), vehicle()
+    moved = trimmed(3, -5, 12)
+    still = vehicle()
     weighed = tree_mass(moved.model)
     np.testing.assert_allclose(moved.mass.center_m, weighed.center_m, rtol=0, atol=1e-12)
     np.testing.assert_allclose(moved.inertia_kg_m2, weighed.inertia_kg_m2, rtol=0, atol=1e-12)
@@ -44,30 +45,45 @@ def test_moved_masses_change_center_and_inertia_as_mujoco_weighs_them() -> None:
 
 def test_a_trimmed_vehicle_swings_with_its_new_period() -> None:
     """A pendulum about body x: T = 2 pi sqrt(J / (m g r)) for small swings, with the mass lowered by 15 mm."""
-    low = vehicle(center_of_mass=["0 m", "0 m", "-350 um"], trim={"position": ["0 m", "0 m", "-15 mm"]})
-    J, depth_m = low.inertia_kg_m2[0, 0], -low.mass.center_m[2]
+    low = vehicle(
+        center_of_mass=["0 m", "0 m", "-350 um"], trim={"position": ["0 m", "0 m", "-15 mm"]}
+    )
+    J = low.inertia_kg_m2[0, 0]
+    depth_m = -low.mass.center_m[2]
     period_s = 2 * np.pi * np.sqrt(J / (low.mass.mass_kg * low.gravity_m_s2 * depth_m))
-    flight = multibody.simulate(low, Rotation.from_rotvec([0.002, 0, 0]), np.zeros(3), 1.1 * period_s)
+    flight = multibody.simulate(
+        low, Rotation.from_rotvec([0.002, 0, 0]), np.zeros(3), 1.1 * period_s
+    )
     roll = flight.lab_from_body.as_rotvec()[:, 0]
     falling = np.flatnonzero((roll[:-1] > 0) & (roll[1:] <= 0))
-    assert 4 * flight.t_s[falling[0]] == pytest.approx(period_s, rel=0.02)  # products of inertia couple a little
+    assert 4 * flight.t_s[falling[0]] == pytest.approx(
+        period_s, rel=0.02
+    )  # products of inertia couple a little
 
 
 def test_masses_are_held_at_whole_steps_and_locked_without_the_section() -> None:
-    np.testing.assert_allclose(trimmed(1.0031, 0, 0, step="2 um").trims.position_m, [1.004e-3, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        trimmed(1.0031, 0, 0, step="2 um").trims.position_m, [1.004e-3, 0, 0], atol=1e-12
+    )
     assert len(vehicle().trims) == 0
     assert vehicle().model.nv == 3
     assert trimmed(1, 2, 3).trims.names == ("trim_x", "trim_y", "trim_z")
 
 
 def test_what_a_motor_cannot_hold_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^vehicle.trim.position: 2 values; allowed: 3, one for each of trim_x, "):
+    with pytest.raises(
+        InputError, match=r"^vehicle.trim.position: 2 values; allowed: 3, one for each of trim_x, "
+    ):
         trimmed(1, 2)
     with pytest.raises(ValidationError, match="position: beyond travel 20 mm"):
         trimmed(21, 0, 0)
-    with pytest.raises(ValidationError, match="trim: a free vehicle rotates about its center of mass"):
+    with pytest.raises(
+        ValidationError, match="trim: a free vehicle rotates about its center of mass"
+    ):
         vehicle(mount="free", trim={}, center_of_mass=["0 m"] * 3)
-    with pytest.raises(InputError, match=r"simsat.xml: no joint trim_\*, which vehicle.trim needs$"):
+    with pytest.raises(
+        InputError, match=r"simsat.xml: no joint trim_\*, which vehicle.trim needs$"
+    ):
         vehicle(model="vehicles/simsat.xml", trim={})
 
 
@@ -76,12 +92,22 @@ def test_slides_of_other_kinds_are_refused(tmp_path: Path) -> None:
     text = (SCENES / "vehicles/cubesat.xml").read_text(encoding="utf-8")
     for old, new, refusal in (
         ('name="trim_x" type="slide"', 'name="trim_x"', "must be slides"),
-        ('type="slide" axis="1', 'type="slide" range="-1 1" axis="1', "trim_x: range is set by the scene"),
-        ('<body name="trim_x" pos="0 -0.13 -0.01">', '<body><body name="trim_x">', "on a body directly in body bus"),
+        (
+            'type="slide" axis="1',
+            'type="slide" range="-1 1" axis="1',
+            "trim_x: range is set by the scene",
+        ),
+        (
+            '<body name="trim_x" pos="0 -0.13 -0.01">',
+            '<body><body name="trim_x">',
+            "on a body directly in body bus",
+        ),
     ):
         changed = text.replace(old, new)
         if "<body><body" in new:
-            changed = changed.replace('<geom class="trim"/>\n      </body>', '<geom class="trim"/></body></body>', 1)
+            changed = changed.replace(
+                '<geom class="trim"/>\n      </body>', '<geom class="trim"/></body></body>', 1
+            )
         path = tmp_path / "vehicle.xml"
         path.write_text(changed, encoding="utf-8")
         with pytest.raises(InputError, match=refusal):

@@ -49,7 +49,9 @@ class Vehicle:
 
 
 INERTIA = np.array([[0.11, 0.004, -0.002], [0.004, 0.13, 0.003], [-0.002, 0.003, 0.09]])
-SMALL = Vehicle(INERTIA, np.array([4e-6, -3e-6, -2e-5]), np.array([1e-6, -2e-6, 4e-6]), (2e-5, 1e-4))
+SMALL = Vehicle(
+    INERTIA, np.array([4e-6, -3e-6, -2e-5]), np.array([1e-6, -2e-6, 4e-6]), (2e-5, 1e-4)
+)
 
 
 def wheel_momenta(t_s: Floats) -> Floats:
@@ -62,17 +64,24 @@ def motion(
     vehicle: Vehicle, duration_s: float, rng: np.random.Generator, wheels: bool = True
 ) -> tuple[Floats, Rotation]:
     """Times and attitudes every PERIOD_S: J w' = T - h' - w x (J w + h), from rest, level (Runge-Kutta)."""
-    J, count, small = vehicle.inertia_kg_m2, round(duration_s / PERIOD_S), 1e-4
-    inverse, random_nm = np.linalg.inv(J), random_torque(vehicle, count, rng)
+    J = vehicle.inertia_kg_m2
+    count = round(duration_s / PERIOD_S)
+    small = 1e-4
+    inverse = np.linalg.inv(J)
+    random_nm = random_torque(vehicle, count, rng)
     half_s = np.arange(2 * count + 1) * PERIOD_S / 2
     stored = wheels * wheel_momenta(half_s)
     change = wheels * (wheel_momenta(half_s + small) - wheel_momenta(half_s - small)) / (2 * small)
 
     def slope(half: int, state: Floats) -> Floats:
-        rate, (x, y, z, s) = state[4:], state[:4] / np.linalg.norm(state[:4])
+        rate = state[4:]
+        (x, y, z, s) = state[:4] / np.linalg.norm(state[:4])
         lab_from_body = Rotation.from_quat([x, y, z, s]).as_matrix()
         lab_nm = vehicle.lab_torque_nm + random_nm[min(half // 2, count - 1)]
-        torque = np.cross(vehicle.moment_kg_m, -GRAVITY_M_S2 * lab_from_body[2]) + lab_from_body.T @ lab_nm
+        torque = (
+            np.cross(vehicle.moment_kg_m, -GRAVITY_M_S2 * lab_from_body[2])
+            + lab_from_body.T @ lab_nm
+        )
         torque -= (vehicle.drag[0] + vehicle.drag[1] * np.abs(rate)) * rate
         matrix = np.array([[s, -z, y], [z, s, -x], [-y, x, s], [-x, -y, -z]])
         gyroscopic = np.cross(rate, J @ rate + stored[half])
@@ -81,7 +90,8 @@ def motion(
     states = np.zeros((count + 1, 7))
     states[0, 3] = 1
     for k in range(count):
-        state, h = states[k], PERIOD_S
+        state = states[k]
+        h = PERIOD_S
         a = slope(2 * k, state)
         b = slope(2 * k + 1, state + h / 2 * a)
         c = slope(2 * k + 1, state + h / 2 * b)
@@ -92,21 +102,27 @@ def motion(
 
 def random_torque(vehicle: Vehicle, count: int, rng: np.random.Generator) -> Floats:
     """(count, 3) Ornstein-Uhlenbeck torques, a period apart."""
-    decay, value, rows = np.exp(-PERIOD_S / vehicle.correlation_s), rng.standard_normal(3), []
+    decay = np.exp(-PERIOD_S / vehicle.correlation_s)
+    value = rng.standard_normal(3)
+    rows = []
     for _ in range(count):
         rows.append(value)
         value = decay * value + np.sqrt(1 - decay**2) * rng.standard_normal(3)
     return vehicle.torque_rms_nm * np.array(rows)
 
 
-def record(vehicle: Vehicle, rng: np.random.Generator, duration_s: float = 62.0, wheels: bool = True) -> BearingRecord:
+def record(
+    vehicle: Vehicle, rng: np.random.Generator, duration_s: float = 62.0, wheels: bool = True
+) -> BearingRecord:
     """A record with an attitude a second; the wheels' inertias are wrong by the vehicle's errors."""
     t_s, lab_from_body = motion(vehicle, duration_s, rng, wheels)
     every = round(1 / PERIOD_S)
     noise = vehicle.attitude_sigma_rad * rng.standard_normal((len(t_s[::every]), 3))
     return BearingRecord(
         t_s[::every],
-        lab_from_body[::every] * Rotation.from_rotvec(vehicle.bias_rad) * Rotation.from_rotvec(noise),
+        lab_from_body[::every]
+        * Rotation.from_rotvec(vehicle.bias_rad)
+        * Rotation.from_rotvec(noise),
         np.tile(vehicle.attitude_sigma_rad**2 * np.eye(3), (len(noise), 1, 1)),
         t_s,
         wheels * wheel_momenta(t_s) / (1 + np.array(vehicle.wheel_errors)),
@@ -115,8 +131,11 @@ def record(vehicle: Vehicle, rng: np.random.Generator, duration_s: float = 62.0,
 
 def prior(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Prior, Vehicle]:
     """What is assumed of a vehicle, and the vehicle with bias and wheel errors drawn: all within their deviations."""
-    sigma = np.array([*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[5e-4] * 3, *[1e-3] * 3])
-    bias, wheels = 5e-4 * rng.standard_normal(3), 1e-3 * rng.standard_normal(3)
+    sigma = np.array(
+        [*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[5e-4] * 3, *[1e-3] * 3]
+    )
+    bias = 5e-4 * rng.standard_normal(3)
+    wheels = 1e-3 * rng.standard_normal(3)
     true = replace(vehicle, bias_rad=tuple(bias), wheel_errors=tuple(wheels))
     assumed = vehicle.truth + sigma * rng.standard_normal(20)
     assumed[14:] = 0

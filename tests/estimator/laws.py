@@ -90,7 +90,9 @@ def units(rng: np.random.Generator, count: int) -> Floats:
 
 def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
     """Stars anywhere, moving and near by more than real ones, brightest first."""
-    hip, ra, dec = np.arange(1, count + 1), rng.uniform(0, 7, count), np.arcsin(rng.uniform(-1, 1, count))
+    hip = np.arange(1, count + 1)
+    ra = rng.uniform(0, 7, count)
+    dec = np.arcsin(rng.uniform(-1, 1, count))
     motion = rng.normal(0, 1000, (2, count))
     light = rng.uniform(0, 800, count), np.sort(rng.uniform(-1, 6, count))
     return catalog.from_columns(hip, ra, dec, *motion, *light, rng.uniform(1900, 2100))

@@ -13,8 +13,12 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 
-CAMERA = Camera(1600, 1200, 3000.0, (810.0, 590.0), distortion=(-0.1, 0.05, 1e-3, 0.0, 0.0), row_time_s=80e-6)
-EXPOSURE_S, SIGMA_PX, STREAK_SIGMA_PX = 0.02, 0.05, 0.1
+CAMERA = Camera(
+    1600, 1200, 3000.0, (810.0, 590.0), distortion=(-0.1, 0.05, 1e-3, 0.0, 0.0), row_time_s=80e-6
+)
+EXPOSURE_S = 0.02
+SIGMA_PX = 0.05
+STREAK_SIGMA_PX = 0.1
 
 
 @dataclass
@@ -30,7 +34,8 @@ class Moving:
     @cached_property
     def place_ref(self) -> Floats:
         """(N, 3) unit vectors of stars, or places from the bearing."""
-        rays, lever = self.camera.rays(self.still_px), self.sight.lever_cam_m
+        rays = self.camera.rays(self.still_px)
+        lever = self.sight.lever_cam_m
         along = rays @ lever
         distance = -along + np.sqrt(along**2 - lever @ lever + np.asarray(self.sight.radius_m) ** 2)
         return self.cam_from_ref.inv().apply(lever + distance[:, None] * rays)
@@ -38,7 +43,9 @@ class Moving:
     def pixels(self, t_s: Floats) -> Floats:
         """(N, 2) of each light at a time of its own."""
         turn = Rotation.from_rotvec(-np.outer(t_s, self.rate_rad_s))
-        return self.camera.pixels(turn.apply(self.cam_from_ref.apply(self.place_ref)) - self.sight.lever_cam_m)
+        return self.camera.pixels(
+            turn.apply(self.cam_from_ref.apply(self.place_ref)) - self.sight.lever_cam_m
+        )
 
     def found_px(self, offset_s: float) -> Floats:
         """(N, 2) where a light is at a time after mid-exposure of the row where it is then."""
@@ -49,7 +56,8 @@ class Moving:
 
     def centroids(self, rng: np.random.Generator | None = None) -> Centroids:
         """Centroids and streaks, each streak with any sign; with errors if there is a generator."""
-        xy_px, streak_px = self.found_px(0.0), self.found_px(EXPOSURE_S / 2) - self.found_px(-EXPOSURE_S / 2)
+        xy_px = self.found_px(0.0)
+        streak_px = self.found_px(EXPOSURE_S / 2) - self.found_px(-EXPOSURE_S / 2)
         signs = np.where(np.arange(len(xy_px)) % 2, -1.0, 1.0)[:, None]
         if rng is not None:
             xy_px = xy_px + SIGMA_PX * rng.standard_normal(xy_px.shape)
@@ -60,7 +68,9 @@ class Moving:
         return Centroids(xy_px, sigma_px, np.ones(count), None, signs * streak_px, covariance_px2)
 
 
-def moving(rng: np.random.Generator, rate_deg_s: Floats, count: int = 30, sight: Sight = STARS) -> Moving:
+def moving(
+    rng: np.random.Generator, rate_deg_s: Floats, count: int = 30, sight: Sight = STARS
+) -> Moving:
     """Lights anywhere on the chip."""
     still_px = rng.uniform([20, 20], [1580, 1180], (count, 2))
     return Moving(Rotation.random(rng=rng), np.radians(rate_deg_s), still_px, sight)

@@ -30,7 +30,9 @@ def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MA
     """Tangents, magnitudes and rows of the stars in the field, brightest first, through a focal length `zoom` times."""
     x, y, z = truth.apply(vectors).T
     tangent = zoom * np.column_stack([x, y]) / np.where(z > 0.1, z, np.inf)[:, None]
-    inside = (z > 0.1) & (tangent > FIELD[[0, 2]]).all(axis=1) & (tangent < FIELD[[1, 3]]).all(axis=1)
+    inside = (
+        (z > 0.1) & (tangent > FIELD[[0, 2]]).all(axis=1) & (tangent < FIELD[[1, 3]]).all(axis=1)
+    )
     row = np.flatnonzero(inside)
     noisy = tangent[row] + sigma * rng.standard_normal((len(row), 2))
     shown = mag[row] + 0.25 * rng.standard_normal(len(row))
@@ -41,7 +43,9 @@ def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MA
 def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
     sigmas = np.full(len(tangent), sigma)
     weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
-    return evidence.Detections(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom, np.nan)
+    return evidence.Detections(
+        np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom, np.nan
+    )
 
 
 def attitude_error(solution: Solution, truth: Rotation):

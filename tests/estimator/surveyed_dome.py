@@ -13,7 +13,8 @@ from estimator.core.camera import Camera
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 AXES_M = np.array([0.99, 0.99, 0.73])
 CENTER_M = np.array([0.0, 0.0, 0.49])
-NOISE_PX, LIST_SIGMA_M = 0.05, 0.002
+NOISE_PX = 0.05
+LIST_SIGMA_M = 0.002
 
 
 def leds(count: int, half_deg: float = 40.0) -> LedMap:
@@ -22,7 +23,9 @@ def leds(count: int, half_deg: float = 40.0) -> LedMap:
     z = 1 - n / count * (1 - np.cos(np.radians(half_deg)))
     turn = n * np.pi * (3 - np.sqrt(5))
     along = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
-    place_m = on_surface(along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M))
+    place_m = on_surface(
+        along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M)
+    )
     return LedMap(np.arange(count), place_m, CENTER_M, AXES_M)
 
 
@@ -36,7 +39,9 @@ def attitudes(rng: np.random.Generator, count: int, tilt_deg: float = 25.0) -> R
     """body_from_lab of tilts evenly over the cap, all yaws."""
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     about = rng.uniform(0, 2 * np.pi, count)
-    lean = Rotation.from_rotvec(tilt[:, None] * np.column_stack([np.cos(about), np.sin(about), 0 * about]))
+    lean = Rotation.from_rotvec(
+        tilt[:, None] * np.column_stack([np.cos(about), np.sin(about), 0 * about])
+    )
     return (lean * Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, count)[:, None])).inv()
 
 

@@ -60,14 +60,18 @@ assert len(StarCatalog.read(CATALOG)) > 7000
 
 def test_what_is_blocked_cannot_be_imported() -> None:
     for name in ("skysim", "astropy", "erfa", "lazy_loader"):
-        done = subprocess.run([sys.executable, "-c", f"{BLOCK}import {name}"], capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-c", f"{BLOCK}import {name}"], capture_output=True, text=True
+        )
         assert f"No module named '{name}'" in done.stderr
 
 
 @pytest.mark.slow
 def test_it_solves_where_nothing_else_can_be_imported() -> None:
     catalog = f"CATALOG = {str(ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv')!r}"
-    done = subprocess.run([sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == (
         "a date needs pyerfa (pip install pyerfa); without it: StarTracker(camera, stars, vectors)"
@@ -77,7 +81,9 @@ def test_it_solves_where_nothing_else_can_be_imported() -> None:
 @pytest.mark.long
 def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     """With what pip brings along, and nothing of this environment; then with the extra for dates."""
-    wheels, bare, here = tmp_path / "wheels", tmp_path / "bare", tmp_path / "here"
+    wheels = tmp_path / "wheels"
+    bare = tmp_path / "bare"
+    here = tmp_path / "here"
     here.mkdir()
     quiet = ["-m", "pip", "--quiet", "--disable-pip-version-check"]
     source = ROOT / "packaging/estimator"
@@ -91,7 +97,9 @@ def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def told() -> str:
-        done = subprocess.run([python, "-c", f"{catalog}{WORK}"], cwd=here, env=clean, capture_output=True, text=True)
+        done = subprocess.run(
+            [python, "-c", f"{catalog}{WORK}"], cwd=here, env=clean, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
 

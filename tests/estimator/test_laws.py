@@ -14,7 +14,9 @@ import pytest
 # The property tests of each package; importing them records which functions they cover.
 FILES = sorted(Path(__file__).parent.rglob("test_laws_*.py"))
 for path in FILES:
-    importlib.import_module(".".join(path.relative_to(Path(__file__).parents[2]).with_suffix("").parts))
+    importlib.import_module(
+        ".".join(path.relative_to(Path(__file__).parents[2]).with_suffix("").parts)
+    )
 
 
 def test_every_public_function_has_a_law() -> None:
@@ -30,5 +32,7 @@ def test_the_laws_hold_for_hundreds_of_examples(checked: bool, tmp_path: Path) -
     """Compiled code reads beyond a table without a word, unless it is compiled to say so."""
     bounds = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)} if checked else {}
     call = [sys.executable, "-m", "pytest", "-x", *map(str, FILES)]
-    done = subprocess.run(call, env=os.environ | bounds | {"LAW_EXAMPLES": "300"}, capture_output=True, text=True)
+    done = subprocess.run(
+        call, env=os.environ | bounds | {"LAW_EXAMPLES": "300"}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-3000:]

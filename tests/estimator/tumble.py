@@ -9,12 +9,16 @@ from scipy.spatial.transform import Rotation
 
 def tumble_rad_s(t_s: np.ndarray) -> np.ndarray:
     """(..., 3) rate in body axes."""
-    return np.stack([0.2 * np.sin(0.5 * t_s), 0.1 * np.cos(0.4 * t_s), 0.05 + 0.1 * np.sin(0.3 * t_s)], -1)
+    return np.stack(
+        [0.2 * np.sin(0.5 * t_s), 0.1 * np.cos(0.4 * t_s), 0.05 + 0.1 * np.sin(0.3 * t_s)], -1
+    )
 
 
 def tumble_angle_rad(t_s: np.ndarray) -> np.ndarray:
     """The gyro's perfect increments: the integral of each rate between the times."""
-    integral = np.stack([-0.4 * np.cos(0.5 * t_s), 0.25 * np.sin(0.4 * t_s), 0.05 * t_s - np.cos(0.3 * t_s) / 3], -1)
+    integral = np.stack(
+        [-0.4 * np.cos(0.5 * t_s), 0.25 * np.sin(0.4 * t_s), 0.05 * t_s - np.cos(0.3 * t_s) / 3], -1
+    )
     return np.diff(integral, axis=0)
 
 

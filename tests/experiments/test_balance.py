@@ -28,14 +28,20 @@ UNCERTAINTY = assumptions.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg",
 BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
 
 
-def noisy_truth(flown: Flight, watch: Progress | None) -> list[tuple[float, Rotation, Floats, Floats]]:
+def noisy_truth(
+    flown: Flight, watch: Progress | None
+) -> list[tuple[float, Rotation, Floats, Floats]]:
     """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second, none shared."""
-    log, rng = flown.simulate_motion(watch).telemetry(), random_stream(flown.lab.scene.seed, 999)
+    log = flown.simulate_motion(watch).telemetry()
+    rng = random_stream(flown.lab.scene.seed, 999)
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
     attitudes = log.lab_from_body[::every] * turned
-    noise, shared = SIGMA_RAD**2 * np.eye(3), np.zeros((3, 3))
-    return [(float(t), one, noise, shared) for t, one in zip(log.t_s[::every], attitudes, strict=True)]
+    noise = SIGMA_RAD**2 * np.eye(3)
+    shared = np.zeros((3, 3))
+    return [
+        (float(t), one, noise, shared) for t, one in zip(log.t_s[::every], attitudes, strict=True)
+    ]
 
 
 def scene_of(name: str, **overrides: str) -> Scene:
@@ -43,7 +49,9 @@ def scene_of(name: str, **overrides: str) -> Scene:
 
 
 @pytest.mark.slow
-def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_table_is_balanced_below_the_published_torque(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """5e-5 N m (Bahu & Modenini 2020): MuJoCo's mass, center and inertia are the truth."""
     monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
     scene = scene_of("cubesat_table")
@@ -62,14 +70,17 @@ def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.Monkey
     assert '<p class="verdict good">balanced: ' in page
     assert page.count("<tr><td") == 1 + 9
     assert f"{last.true_torque_nm:.2g} N m" in page
-    assert json.loads((tmp_path / "balance.json").read_text())["report"] == str(tmp_path / "report.html")
+    assert json.loads((tmp_path / "balance.json").read_text())["report"] == str(
+        tmp_path / "report.html"
+    )
 
 
 @pytest.mark.slow
 def test_simsat_is_weighed_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
     """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
     monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
-    scene, plan = scene_of("simsat_slew"), replace(BALANCE, moves=False)
+    scene = scene_of("simsat_slew")
+    plan = replace(BALANCE, moves=False)
     (one,) = procedure.balance(scene, plan, UNCERTAINTY)
     rows = balance_report.statistics(scene.name, plan, [one])
     for row in rows["estimates"][:3]:
@@ -95,21 +106,28 @@ def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
     assert inertia * np.linalg.norm(accelerations, axis=1).max() < 0.6 * wheels.torque_limit_nm
     assert inertia * np.linalg.norm(rates, axis=1).max() < 0.6 * capacity
     attitudes = Rotation.from_quat([state[0] for state in states], scalar_first=True)
-    assert multibody.tilt_deg(attitudes).max() == pytest.approx(7.3, abs=0.1)  # the sine fades in and out
+    assert multibody.tilt_deg(attitudes).max() == pytest.approx(
+        7.3, abs=0.1
+    )  # the sine fades in and out
     turned = (attitudes[0].inv() * attitudes).as_rotvec()
     assert np.degrees(np.abs(turned[:, 2]).max()) > 115
 
 
 def test_masses_go_where_the_moment_vanishes() -> None:
-    scene = scene_of("cubesat_table", vehicle__trim="{position: [1 mm, 2 mm, -3 mm], step: 0.001 um}")
+    scene = scene_of(
+        "cubesat_table", vehicle__trim="{position: [1 mm, 2 mm, -3 mm], step: 0.001 um}"
+    )
     vehicle = multibody.build(scene.vehicle)
     moment = vehicle.mass.mass_kg * vehicle.mass.center_m
     position_m = procedure.balanced_position_m(vehicle, moment, scene)
-    moved = multibody.build(with_config(scene, "vehicle.trim", position_m=tuple(position_m)).vehicle)
+    moved = multibody.build(
+        with_config(scene, "vehicle.trim", position_m=tuple(position_m)).vehicle
+    )
     np.testing.assert_allclose(moved.mass.center_m, 0, atol=1e-10)
     assert np.abs(position_m - vehicle.trims.position_m).max() > 1e-3
     with pytest.raises(
-        InputError, match=r"trim_. would have to go to .* mm; allowed: vehicle.trim.travel 20 mm: first"
+        InputError,
+        match=r"trim_. would have to go to .* mm; allowed: vehicle.trim.travel 20 mm: first",
     ):
         procedure.balanced_position_m(vehicle, 10 * np.ones(3) * 1e-3, scene)
 
@@ -127,7 +145,9 @@ def test_masses_go_where_the_moment_vanishes() -> None:
         ),
     ],
 )
-def test_what_cannot_be_balanced_is_refused(name: str, overrides: dict[str, str], message: str) -> None:
+def test_what_cannot_be_balanced_is_refused(
+    name: str, overrides: dict[str, str], message: str
+) -> None:
     with pytest.raises(InputError) as refused:
         next(procedure.balance(loader.load(name, overrides), BALANCE, UNCERTAINTY))
     assert str(refused.value).startswith(message)
@@ -138,7 +158,9 @@ def record_of(rate_deg_s: float) -> BearingRecord:
     """Yaw at a constant rate, level."""
     t_s = np.arange(10.0)
     attitudes = Rotation.from_rotvec(np.outer(np.radians(rate_deg_s) * t_s, [0, 0, 1]))
-    return BearingRecord(t_s, attitudes, np.tile(1e-9 * np.eye(3), (10, 1, 1)), t_s, np.zeros((10, 3)))
+    return BearingRecord(
+        t_s, attitudes, np.tile(1e-9 * np.eye(3), (10, 1, 1)), t_s, np.zeros((10, 3))
+    )
 
 
 def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
@@ -154,19 +176,22 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
             observability.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
         return str(refused.value)
 
-    gained, needed = 0.04**-2 - 0.1**-2, 0.01**-2 - 0.1**-2
+    gained = 0.04**-2 - 0.1**-2
+    needed = 0.01**-2 - 0.1**-2
     times = needed / gained
     text = refusal(known)
     assert text == (
         f"balance: inertia about z is known to 4 %, not 1 %, after turns of 2 deg/s: turn"
         f" {np.sqrt(times):.1f} times as far, or fly {times:.1f} times as long"
     )
-    known[2], known[0] = 1e-3, 0.1
+    known[2] = 1e-3
+    known[0] = 0.1
     assert refusal(known) == (
         "balance: inertia about x is known to 10 %, not 1 %, after no turn about it: a turn is needed that the wheels'"
         " known momentum or a known trim weighs"
     )
-    known[0], known[8] = 1e-3, 1e-3
+    known[0] = 1e-3
+    known[8] = 1e-3
     assert refusal(known).startswith(
         "balance: moment along z is known to 1000 g mm, not 10, after tilts of 0.0 deg: a tilt"
     )
@@ -178,13 +203,24 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (("10", "500 um", "0.1%", "0.03 deg", 1.0), "balance.inertia_sigma: 10; allowed: 0.001 to 0.5"),
+        (
+            ("10", "500 um", "0.1%", "0.03 deg", 1.0),
+            "balance.inertia_sigma: 10; allowed: 0.001 to 0.5",
+        ),
         (("10%", "5 s", "0.1%", "0.03 deg", 1.0), "balance.offset_sigma: '5 s' is not a length"),
-        (("10%", "1 m", "0.1%", "0.03 deg", 1.0), "balance.offset_sigma: 1 m; allowed: 1e-07 to 0.01 m"),
-        (("10%", "1 mm", "0.1%", "0.03 deg", -1.0), "balance.tacho_sigma: -1; allowed: 0 to 1000 rpm"),
+        (
+            ("10%", "1 m", "0.1%", "0.03 deg", 1.0),
+            "balance.offset_sigma: 1 m; allowed: 1e-07 to 0.01 m",
+        ),
+        (
+            ("10%", "1 mm", "0.1%", "0.03 deg", -1.0),
+            "balance.tacho_sigma: -1; allowed: 0 to 1000 rpm",
+        ),
     ],
 )
-def test_wrong_uncertainties_are_refused(texts: tuple[str, str, str, str, float], message: str) -> None:
+def test_wrong_uncertainties_are_refused(
+    texts: tuple[str, str, str, str, float], message: str
+) -> None:
     with pytest.raises(InputError) as refused:
         assumptions.parse_uncertainty(*texts)
     assert str(refused.value).startswith(message)
@@ -202,8 +238,10 @@ def test_wrong_bars_are_refused() -> None:
     vehicle = multibody.build(scene_of("cubesat_table").vehicle)
     weight = vehicle.mass.mass_kg * vehicle.gravity_m_s2
     np.testing.assert_allclose(
-        procedure.parse_bars("4e-5 N m", 1.0, None).moment_kg_m(vehicle), 2e-5 / weight * vehicle.mass.mass_kg
+        procedure.parse_bars("4e-5 N m", 1.0, None).moment_kg_m(vehicle),
+        2e-5 / weight * vehicle.mass.mass_kg,
     )
     np.testing.assert_allclose(
-        procedure.parse_bars("4e-5 N m", 1.0, "1 um").moment_kg_m(vehicle), 1e-6 * vehicle.mass.mass_kg
+        procedure.parse_bars("4e-5 N m", 1.0, "1 um").moment_kg_m(vehicle),
+        1e-6 * vehicle.mass.mass_kg,
     )

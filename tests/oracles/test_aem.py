@@ -25,13 +25,19 @@ def utc(count: int) -> list[datetime.datetime]:
     return [START + n * datetime.timedelta(seconds=0.1) for n in range(count)]
 
 
-@pytest.mark.parametrize("frames", [(ccsds_aem.ICRF, ccsds_aem.CAMERA), (ccsds_aem.LAB, ccsds_aem.BODY)])
+@pytest.mark.parametrize(
+    "frames", [(ccsds_aem.ICRF, ccsds_aem.CAMERA), (ccsds_aem.LAB, ccsds_aem.BODY)]
+)
 @pytest.mark.parametrize("count", [1, 2, 200])
-def test_it_is_valid_and_says_what_was_meant(tmp_path: Path, frames: tuple[str, str], count: int) -> None:
+def test_it_is_valid_and_says_what_was_meant(
+    tmp_path: Path, frames: tuple[str, str], count: int
+) -> None:
     """Version, frames, span and every digit of every quaternion; and it survives being written by them as XML."""
     meant = Rotation.random(count, rng=np.random.default_rng(count))
     path = tmp_path / "truth.aem"
-    files.write_text(path, ccsds_aem.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant))
+    files.write_text(
+        path, ccsds_aem.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant)
+    )
     read = ndm.Aem.from_file(str(path), format="kvn")
     assert read.validate(strict=False) is None
     assert (read.version, read.header.originator) == ("2.0", "SKYSIM")
@@ -44,9 +50,14 @@ def test_it_is_valid_and_says_what_was_meant(tmp_path: Path, frames: tuple[str, 
             "QUATERNION",
             "AFIT_SIMSAT",
         )
-        epochs = [datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs]
+        epochs = [
+            datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs
+        ]
         assert epochs == utc(count)
-        assert (told.start_time, told.stop_time) == (ccsds_aem.epoch(epochs[0]), ccsds_aem.epoch(epochs[-1]))
+        assert (told.start_time, told.stop_time) == (
+            ccsds_aem.epoch(epochs[0]),
+            ccsds_aem.epoch(epochs[-1]),
+        )
         off = (Rotation.from_quat(segment.data.attitude_states_numpy) * meant.inv()).magnitude()
         assert off.max() < 1e-14
 
@@ -63,7 +74,9 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
         with pytest.raises(ValueError, match=r"REF_FRAME_A|QUATRNION|7\.0"):
             ndm.Aem.from_str(good.replace(old, new), "kvn")
     with pytest.raises(InputError):
-        ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2)[::-1], Rotation.identity(2))
+        ccsds_aem.message(
+            "x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2)[::-1], Rotation.identity(2)
+        )
 
 
 def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
@@ -86,9 +99,15 @@ def test_the_page_s_code_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
-    (block,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "ccsds_ndm" in block]
+    (block,) = [
+        block
+        for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+        if "ccsds_ndm" in block
+    ]
     (tmp_path / "out/shefex2").mkdir(parents=True)
-    meant = Rotation.from_euler("y", [[90]], degrees=True)  # the camera's boresight along the ICRF's x
+    meant = Rotation.from_euler(
+        "y", [[90]], degrees=True
+    )  # the camera's boresight along the ICRF's x
     text = ccsds_aem.message("shefex2", [], (ccsds_aem.ICRF, ccsds_aem.CAMERA), utc(1), meant)
     files.write_text(tmp_path / "out/shefex2/truth.aem", text)
     monkeypatch.chdir(tmp_path)

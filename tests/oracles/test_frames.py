@@ -12,7 +12,10 @@ import pytest
 
 from benchmarks import oracles
 
-MISSING = {"tetra3rs": "needs tetra3rs", "astrometry.net": "needs astrometry.net and its wide index files"}
+MISSING = {
+    "tetra3rs": "needs tetra3rs",
+    "astrometry.net": "needs astrometry.net and its wide index files",
+}
 SOLVED = {"tetra3rs": 0.95, "astrometry.net": 0.98}  # at least
 SHEFEX, WIDE = oracles.SCENES
 
@@ -81,10 +84,13 @@ def test_the_predicted_errors_are_those_of_least_squares() -> None:
     plate = oracles.plate_spread(found, sigma_px, believed)
     pixels = oracles.lattice(camera.width_px, camera.height_px)
     middle = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
-    turns, shifts = [], []
+    turns = []
+    shifts = []
     for _ in range(2000):
         off_px = sigma_px[:, None] * rng.standard_normal((20, 2))
-        turns.append(oracles.Rotation.align_vectors(believed.rays(xy_px + off_px), rays)[0].as_rotvec())
+        turns.append(
+            oracles.Rotation.align_vectors(believed.rays(xy_px + off_px), rays)[0].as_rotvec()
+        )
         fitted = np.linalg.lstsq(np.column_stack([np.ones(20), xy_px]), off_px, rcond=None)[0]
         moved = np.column_stack([np.ones(len(pixels)), pixels]) @ fitted
         arms = pixels - middle

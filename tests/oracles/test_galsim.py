@@ -44,7 +44,11 @@ ACCURATE = galsim.GSParams(
 
 
 def gaussian(sigma_px: float) -> tuple[Psf, CameraConfig, list[Any]]:
-    return GaussianPsfConfig(sigma_px=sigma_px), CAMERA, [galsim.Gaussian(sigma=sigma_px, gsparams=ACCURATE)]
+    return (
+        GaussianPsfConfig(sigma_px=sigma_px),
+        CAMERA,
+        [galsim.Gaussian(sigma=sigma_px, gsparams=ACCURATE)],
+    )
 
 
 def moffat(fwhm_px: float, beta: float) -> tuple[Psf, CameraConfig, list[Any]]:
@@ -60,7 +64,10 @@ def airy(sigma_px: float, camera: CameraConfig) -> tuple[Psf, CameraConfig, list
 
 
 def disk(radius_px: float, sigma_px: float) -> tuple[Psf, CameraConfig, list[Any]]:
-    theirs = [galsim.TopHat(radius_px, gsparams=ACCURATE), galsim.Gaussian(sigma=sigma_px, gsparams=ACCURATE)]
+    theirs = [
+        galsim.TopHat(radius_px, gsparams=ACCURATE),
+        galsim.Gaussian(sigma=sigma_px, gsparams=ACCURATE),
+    ]
     return DiskPsfConfig(kind="disk", radius_px=radius_px, sigma_px=sigma_px), CAMERA, theirs
 
 
@@ -106,7 +113,8 @@ def worst(image: Kernel, parts: list[Any], seed: int) -> float:
     differences = []
     for x, y in np.random.default_rng(seed).uniform(-0.5, 0.5, (2, 2)) + size // 2:
         circle = np.hypot(column - x, row - y) < max(image.reach_px - 2.5, image.reach_px / 2)
-        a, b = ours_px(image, x, y, size), theirs_px(parts, x, y, size)
+        a = ours_px(image, x, y, size)
+        b = theirs_px(parts, x, y, size)
         b *= a[circle].sum() / b[circle].sum()
         differences.append(np.abs(a - b).max() / b.max())
     return float(max(differences))
@@ -117,7 +125,9 @@ def worst(image: Kernel, parts: list[Any], seed: int) -> float:
 def test_every_kind_of_lens_and_an_emitting_disk_behind_it(name: str, radius_px: float) -> None:
     psf, camera, parts = LENSES[name]
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
-    error = worst(build_kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px))
+    error = worst(
+        build_kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px)
+    )
     assert error < TOLERANCE.get((name, radius_px), 5e-4)
 
 

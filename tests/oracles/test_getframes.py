@@ -13,7 +13,8 @@ from skysim.scene.sections.camera import CameraConfig
 
 gf = pytest.importorskip("getframes")
 
-SHAPE, FRAMES = (80, 100), 60
+SHAPE = (80, 100)
+FRAMES = 60
 
 
 def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +39,9 @@ def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarra
     built = Detector.from_camera(CameraConfig.model_validate(lens | {"detector": ours}))
     rng = np.random.default_rng(1)
     light = np.full(SHAPE, mean_e, np.float32)
-    mine = np.array([detector.expose(light.copy(), exposure_s, built, rng) for _ in range(FRAMES)], float)
+    mine = np.array(
+        [detector.expose(light.copy(), exposure_s, built, rng) for _ in range(FRAMES)], float
+    )
     config = gf.CameraConfig(
         name="oracle",
         sensor_type=gf.SensorType.CCD,
@@ -56,7 +59,9 @@ def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarra
         fixed_pattern_seed=9,
     )
     made = gf.Camera(config, seed=2)
-    theirs = np.array([made.expose(mean_e / exposure_s, exposure_s).data for _ in range(FRAMES)], float)
+    theirs = np.array(
+        [made.expose(mean_e / exposure_s, exposure_s).data for _ in range(FRAMES)], float
+    )
     return mine, theirs
 
 
@@ -71,7 +76,9 @@ def test_mean_and_variance_of_the_numbers_agree(mean_e: float) -> None:
 
 def test_fixed_pattern_spreads_pixels_alike() -> None:
     """PRNU of 2 % and a dark current that varies by 30 %: the scatter of the pixels' own means."""
-    spread = [frames.mean(axis=0).std() for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)]
+    spread = [
+        frames.mean(axis=0).std() for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)
+    ]
     assert spread[0] == pytest.approx(spread[1], rel=5 * np.sqrt(2 / (2 * SHAPE[0] * SHAPE[1])))
 
 

@@ -16,7 +16,8 @@ from skysim.camera.optics import Optics
 from skysim.dynamics.multibody.model import CAM_FROM_MJCAM
 from skysim.scene.sections.camera import CameraConfig
 
-WIDTH, HEIGHT = 640, 480
+WIDTH = 640
+HEIGHT = 480
 CAMERA = CameraConfig.model_validate(
     {
         "width_px": WIDTH,
@@ -34,11 +35,23 @@ POSES = {  # lab_from_mjcam as a quaternion wxyz, and where the camera stands
         tuple(Rotation.from_euler("xz", [180, 35], True).as_quat(scalar_first=True)),
         (0.3, -0.2, 1.0),
     ),
-    "aslant": (tuple(Rotation.from_rotvec([0.7, -1.9, 0.4]).as_quat(scalar_first=True)), (-1.0, 2.0, 0.5)),
+    "aslant": (
+        tuple(Rotation.from_rotvec([0.7, -1.9, 0.4]).as_quat(scalar_first=True)),
+        (-1.0, 2.0, 0.5),
+    ),
 }
 # Directions in camera axes, +x right, +y down: each side of both axes, the diagonals, near and far.
 TOWARD_CAM_M = np.array(
-    [[0, 0, 2], [0.7, 0, 2], [-0.7, 0, 2], [0, 0.5, 2], [0, -0.5, 2], [0.8, -0.55, 2], [-1.5, 1.1, 4]], float
+    [
+        [0, 0, 2],
+        [0.7, 0, 2],
+        [-0.7, 0, 2],
+        [0, 0.5, 2],
+        [0, -0.5, 2],
+        [0.8, -0.55, 2],
+        [-1.5, 1.1, 4],
+    ],
+    float,
 )
 
 # In a process of its own: MuJoCo chooses its OpenGL once, when it is first imported.
@@ -68,7 +81,9 @@ np.save(task["file"], np.array(images))
 def world_xml(quaternion_wxyz: tuple[float, ...], place_m: tuple[float, ...]) -> str:
     """A ball that glows, a camera whose vertical field is our chip's, and no other light."""
     fovy_deg = float(np.degrees(2 * np.arctan(HEIGHT / 2 / CAMERA.focal_px)))
-    place, turn = (" ".join(map(repr, map(float, numbers))) for numbers in (place_m, quaternion_wxyz))
+    place, turn = (
+        " ".join(map(repr, map(float, numbers))) for numbers in (place_m, quaternion_wxyz)
+    )
     return f"""
     <mujoco>
       <statistic extent="1"/>
@@ -87,7 +102,13 @@ def world_xml(quaternion_wxyz: tuple[float, ...], place_m: tuple[float, ...]) ->
 
 def drawn(xml: str, places_m: np.ndarray, file: Path) -> np.ndarray:
     """(N, H, W) pictures of the ball at N places. Skips where no OpenGL context can be made."""
-    task = {"xml": xml, "places_m": places_m.tolist(), "width": WIDTH, "height": HEIGHT, "file": str(file)}
+    task = {
+        "xml": xml,
+        "places_m": places_m.tolist(),
+        "width": WIDTH,
+        "height": HEIGHT,
+        "file": str(file),
+    }
     done = subprocess.run(
         [sys.executable, "-c", DRAW],
         input=json.dumps(task),
@@ -121,7 +142,9 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
     lab_from_cam = lab_from_mjcam * CAM_FROM_MJCAM.inv()
     balls_m = np.array(place_m) + lab_from_cam.apply(TOWARD_CAM_M)
     found = middles(drawn(world_xml(quaternion_wxyz, place_m), balls_m, tmp_path / "balls.npy"))
-    wanted = Optics.from_camera(CAMERA).project(lab_from_cam.inv().apply(balls_m - np.array(place_m)))
+    wanted = Optics.from_camera(CAMERA).project(
+        lab_from_cam.inv().apply(balls_m - np.array(place_m))
+    )
     # A ball's outline is an ellipse whose middle is off by (r / z)^2 of the offset, and OpenGL draws it as facets.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.25)
 

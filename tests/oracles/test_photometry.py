@@ -28,7 +28,8 @@ def stars() -> dict[str, Any]:
     """A still frame of bright stars, background off, and the truth of those that stand alone and inside."""
     loaded = loader.load("shefex2", CLEAN)
     frame, truth = simulate_motion(loaded).render(0)
-    part, seen = loaded.camera.detector, truth.sources
+    part = loaded.camera.detector
+    seen = truth.sources
     image_e = (frame.image_dn.astype(float) - part.offset_dn) * part.gain_e_dn
     image_e -= part.dark_e_s * frame.exposure_s
     apart = np.linalg.norm(seen.xy_px[:, None] - seen.xy_px, axis=2) + 1e9 * np.eye(len(seen.id))
@@ -36,7 +37,12 @@ def stars() -> dict[str, Any]:
     good = inside & (apart.min(axis=1) > 25) & ~seen.saturated
     assert good.sum() >= 10
     noise_e = np.hypot(part.read_noise_e, part.gain_e_dn / np.sqrt(12))
-    return {"image": image_e, "xy": seen.xy_px[good], "electrons": seen.electrons[good], "noise_e": noise_e}
+    return {
+        "image": image_e,
+        "xy": seen.xy_px[good],
+        "electrons": seen.electrons[good],
+        "noise_e": noise_e,
+    }
 
 
 def within_its_noise(flux: np.ndarray, stars: dict[str, Any], area_px: float) -> None:

@@ -20,10 +20,13 @@ from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit import earth, elements, satellites
 from skysim.sources.solar_system import magnitudes, observer, places
 
-LIMIT_ARCSEC, LIMIT_MAG = 0.1, 0.001
+LIMIT_ARCSEC = 0.1
+LIMIT_MAG = 0.001
 BARYCENTERS = ("jupiter", "saturn", "uranus", "neptune")
 NAMES = ("sun", "moon", "mercury", "venus", "mars", *BARYCENTERS)
-FIRST, DAYS = datetime.datetime(1972, 1, 2), 19_700  # to the end of 2025, where both have tables of UT1
+# to the end of 2025, where both have tables of UT1
+FIRST = datetime.datetime(1972, 1, 2)
+DAYS = 19_700
 COUNT = 60
 
 
@@ -38,7 +41,9 @@ def skyfield() -> Skyfield:
     api = pytest.importorskip("skyfield.api")
     data = pytest.importorskip("skyfield_data")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # tables of UT1 that it has, but does not use here, are old
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # tables of UT1 that it has, but does not use here, are old
         load = api.Loader(data.get_skyfield_data_path())
     return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
 
@@ -48,10 +53,14 @@ def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Ob
     rng = np.random.default_rng(26)
     for _ in range(COUNT):
         time = FIRST + datetime.timedelta(days=rng.uniform(0, DAYS))
-        latitude_deg, longitude_deg = rng.uniform(-85, 85), rng.uniform(-180, 180)
-        site, theirs = SiteConfig(), skyfield.bodies["earth"]
+        latitude_deg = rng.uniform(-85, 85)
+        longitude_deg = rng.uniform(-180, 180)
+        site = SiteConfig()
+        theirs = skyfield.bodies["earth"]
         if on_ground:
-            site = SiteConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg, height="2000 m")
+            site = SiteConfig(
+                latitude_deg=latitude_deg, longitude_deg=longitude_deg, height="2000 m"
+            )
             theirs = theirs + skyfield.at_site(latitude_deg, longitude_deg, 2000.0)
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
         yield observer.observe_from(time, site), theirs.at(their_time), their_time
@@ -80,11 +89,13 @@ def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
     """
     from skyfield.api import EarthSatellite
 
-    rng, path = np.random.default_rng(27), tmp_path / "orbits.tle"
+    rng = np.random.default_rng(27)
+    path = tmp_path / "orbits.tle"
     lines = [line for n in range(1, 41) for line in circular_tle(n, rng)]
     path.write_text("\n".join(lines), encoding="utf-8")
     ours = elements.read_elements(str(path))
-    site, theirs = SiteConfig(latitude_deg=40, longitude_deg=10, height="500 m"), skyfield.at_site(40, 10, 500.0)
+    site = SiteConfig(latitude_deg=40, longitude_deg=10, height="500 m")
+    theirs = skyfield.at_site(40, 10, 500.0)
     for hours in (0.0, 5.2, 19.0):
         time = datetime.datetime(2024, 4, 10, 3) + datetime.timedelta(hours=hours)
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
@@ -124,12 +135,16 @@ def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
     for ours, theirs, time in observers(skyfield, False):
         for name in worst:
             seen = theirs.observe(named(skyfield, name))
-            to_body, from_sun = seen.xyz.au, theirs.xyz.au + seen.xyz.au - skyfield.bodies["sun"].at(time).xyz.au
+            to_body = seen.xyz.au
+            from_sun = theirs.xyz.au + seen.xyz.au - skyfield.bodies["sun"].at(time).xyz.au
             args = [np.linalg.norm(from_sun), np.linalg.norm(to_body)]
             args.append(np.degrees(np.arccos(from_sun @ to_body / args[0] / args[1])))
             if name in ("saturn", "uranus"):
                 pole = getattr(library, f"_{name.upper()}_POLE")
-                args += [np.degrees(np.arccos(pole @ v / np.linalg.norm(v))) - 90 for v in (from_sun, to_body)]
+                args += [
+                    np.degrees(np.arccos(pole @ v / np.linalg.norm(v))) - 90
+                    for v in (from_sun, to_body)
+                ]
             if name == "neptune":
                 args.append(time.J)
             wanted = float(getattr(library, f"_{name}_magnitude")(*args))

@@ -28,9 +28,12 @@ tetra3rs = pytest.importorskip("tetra3rs")
 
 def test_its_camera_is_ours() -> None:
     """Distorted, off-center: both turn pixels to the same tangents, by two pieces of code."""
-    f, center, bent = 2500.0, (331.0, 244.0), (-0.1, 0.05, 1e-3, -2e-3, 0.01)
+    f = 2500.0
+    center = (331.0, 244.0)
+    bent = (-0.1, 0.05, 1e-3, -2e-3, 0.01)
     setup = Setup("icrs", "2012-06-22T21:00:00", 659, 493, f, center, bent, 1.0, 4095.0, 1)
-    theirs, middle = tetra3rs_tracker.camera_model(tetra3rs, setup), tetra3rs_tracker.image_center_px(setup)
+    theirs = tetra3rs_tracker.camera_model(tetra3rs, setup)
+    middle = tetra3rs_tracker.image_center_px(setup)
     xy_px = np.array([[20.0, 30.0], [600.0, 400.0], [330.0, 10.0]])
     told = [theirs.pixel_to_tanplane(*(xy - middle)) for xy in xy_px]
     ours = Camera(659, 493, f, center, bent).tangents(xy_px)
@@ -67,11 +70,21 @@ COMMANDS = re.findall(r"^skysim (.*--tracker tetra3rs.*)$", PAGE, re.MULTILINE)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> None:
     """Every frame has its line or its share, and none is wrong."""
-    words = [sys.executable, "-m", "skysim", *shlex.split(command), "--json", "--out", str(tmp_path)]
+    words = [
+        sys.executable,
+        "-m",
+        "skysim",
+        *shlex.split(command),
+        "--json",
+        "--out",
+        str(tmp_path),
+    ]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
-    lines = told.get("scoreboard", [told | {"right": told.get("solved", 0) / told.get("frames", 1)}])
+    lines = told.get(
+        "scoreboard", [told | {"right": told.get("solved", 0) / told.get("frames", 1)}]
+    )
     assert [line["wrong"] for line in lines] == [0] * len(lines)
     assert min(line["right"] for line in lines) > 0.9
 

@@ -31,7 +31,9 @@ POINTINGS = [
 ] + [(10.0, 89.9, 30.0), (200.0, -89.5, -75.0), (0.0, 0.0, 0.0), (359.99, 20.0, 180.0)]
 
 
-def both_ways(pointing: tuple[float, float, float], stars: SkyCoord) -> tuple[np.ndarray, np.ndarray]:
+def both_ways(
+    pointing: tuple[float, float, float], stars: SkyCoord
+) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2) pixels by our optics, and by astropy from the header."""
     cam_from_icrs = star_sources.cam_from_icrs(*pointing)
     ours = Optics.from_camera(CAMERA).project(cam_from_icrs.apply(stars.cartesian.xyz.value.T))
@@ -44,7 +46,9 @@ def test_stars_are_where_astropy_sees_them(pointing: tuple[float, float, float])
     """Stars up to ten degrees off in all directions, laid out by astropy itself."""
     rng = np.random.default_rng(2)
     center = SkyCoord(*pointing[:2], unit="deg")
-    stars = center.directional_offset_by(rng.uniform(0, 360, 200) * u.deg, rng.uniform(0, 10, 200) * u.deg)
+    stars = center.directional_offset_by(
+        rng.uniform(0, 360, 200) * u.deg, rng.uniform(0, 10, 200) * u.deg
+    )
     ours, theirs = both_ways(pointing, stars)
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6)
     assert np.ptp(ours, axis=0).min() > 1000  # they cover the frame

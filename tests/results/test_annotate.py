@@ -12,7 +12,8 @@ from skysim.results import annotate
 
 def seen(xy_px: list[tuple[float, float]], saturated: list[bool]) -> SourceTruth:
     count = len(xy_px)
-    one, place = np.ones(count), np.array(xy_px)
+    one = np.ones(count)
+    place = np.array(xy_px)
     return SourceTruth(
         np.arange(count) + 1, place, place, one * 1e4, one, 0 * one, one, np.rint(place).astype(int),
         np.array(saturated), 9 * one,
@@ -26,7 +27,9 @@ def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
 
 def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
-    picture = annotate.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[:1000]
+    picture = annotate.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[
+        :1000
+    ]
     for place, bgr in (((300, 401), annotate.TRUTH_BGR), ((900, 650), annotate.DETECTED_BGR)):
         away = np.abs(colored(picture, bgr) - place).max(axis=1)
         assert away.min() >= 8
@@ -39,14 +42,19 @@ def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
     )
     assert picture.shape == (400 + annotate.LEGEND_PX, 600, 3)
     ticks = colored(picture[:400], annotate.TRUTH_BGR)
-    assert np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80  # the label leans to one side
+    assert (
+        np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80
+    )  # the label leans to one side
 
 
 def test_what_nobody_can_see_is_not_marked_and_a_legend_names_the_colors() -> None:
     """Of two sources the one with a signal-to-noise ratio of 2 has no ticks; one of unknown ratio has."""
     image = np.random.default_rng(1).normal(100, 5, (1200, 1000))
     sources = seen([(300.0, 400.0), (700.0, 800.0)], [False, False])
-    for snr, shown in ((np.array([9.0, 2.0]), [True, False]), (np.array([9.0, np.nan]), [True, True])):
+    for snr, shown in (
+        (np.array([9.0, 2.0]), [True, False]),
+        (np.array([9.0, np.nan]), [True, True]),
+    ):
         picture = annotate.annotate_truth(image, replace(sources, snr=snr))
         ticks = colored(picture, annotate.TRUTH_BGR)
         near = [(np.hypot(*(ticks - place).T) < 60).any() for place in ((300, 400), (700, 800))]
@@ -58,10 +66,13 @@ def test_what_nobody_can_see_is_not_marked_and_a_legend_names_the_colors() -> No
 def test_a_contact_sheet_stretches_all_frames_alike() -> None:
     rng = np.random.default_rng(2)
     bright, dim = (rng.normal(100, 1, (40, 50)) for _ in range(2))
-    bright[18:23, 23:28], dim[18:23, 23:28] = 1000, 300
+    bright[18:23, 23:28] = 1000
+    dim[18:23, 23:28] = 300
     sheet = annotate.contact_sheet([bright, dim], ["a", "b"], scale=2)
     left, right = np.array_split(sheet, 2, axis=1)
     assert left.shape == right.shape == (80 + 26, 100 + 4)
     peaks = [part[24 + 41, 2 + 51] for part in (left, right)]
     assert peaks[0] == 255
-    assert 0.3 < (peaks[1] / 255) ** 2 / (200 / 900) < 3  # the square root's share, not a maximum of its own
+    assert (
+        0.3 < (peaks[1] / 255) ** 2 / (200 / 900) < 3
+    )  # the square root's share, not a maximum of its own

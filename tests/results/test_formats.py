@@ -45,7 +45,9 @@ def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
 
 def sky_flight(folder: Path) -> Flight:
     """A scene under the stars run into a folder: frames, truths, solutions."""
-    flight = open_flight(loader.load("shefex2", {"exposure.frames": "3", "camera.distortion": LENS}))
+    flight = open_flight(
+        loader.load("shefex2", {"exposure.frames": "3", "camera.distortion": LENS})
+    )
     scene = flight.lab.scene
     rows = []
     for shot in flight.shots():
@@ -87,7 +89,11 @@ def dome(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 def read_aem(path: Path) -> tuple[dict[str, str], list[datetime.datetime], Floats]:
     """Keywords, epochs and (K, 4) Q1 Q2 Q3 QC, by the notation's rules alone."""
     head, _, rest = path.read_text("ascii").partition("DATA_START\n")
-    pairs = (line.split(" = ", 1) for line in head.splitlines() if " = " in line and "COMMENT" not in line)
+    pairs = (
+        line.split(" = ", 1)
+        for line in head.splitlines()
+        if " = " in line and "COMMENT" not in line
+    )
     lines = [line.split() for line in rest.removesuffix("DATA_STOP\n").splitlines()]
     epochs = [datetime.datetime.fromisoformat(line[0]) for line in lines]
     return dict(pairs), epochs, np.array([line[1:] for line in lines], dtype=float)
@@ -108,27 +114,39 @@ def matrix_b_from_a(q: Floats) -> Floats:
 def test_the_standard_s_own_examples() -> None:
     """Annex F2.2: B is A turned by 90 deg about Z. F5.4: by 90, 10 and 45 deg about Z, X and Z, one after the other."""
     turns = Rotation.from_euler("ZXZ", [[90, 0, 0], [90, 10, 45]], degrees=True)
-    text = ccsds_aem.message("x", [], (ccsds_aem.ICRF, ccsds_aem.BODY), [START, START + SECOND], turns)
+    text = ccsds_aem.message(
+        "x", [], (ccsds_aem.ICRF, ccsds_aem.BODY), [START, START + SECOND], turns
+    )
     rows = [[float(word) for word in line.split()[1:]] for line in text.splitlines()[-3:-1]]
     np.testing.assert_allclose(rows[0], [0, 0, 0.7071, 0.7071], rtol=0, atol=5e-5)
     np.testing.assert_allclose(rows[1], [0.0805, 0.0334, 0.9204, 0.3812], rtol=0, atol=5e-5)
-    np.testing.assert_allclose(matrix_b_from_a(np.array(rows[0])) @ [1, 0, 0], [0, -1, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        matrix_b_from_a(np.array(rows[0])) @ [1, 0, 0], [0, -1, 0], rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.slow
-def test_under_the_stars_the_message_puts_every_star_on_its_pixel(stars: Flown, tmp_path: Path) -> None:
+def test_under_the_stars_the_message_puts_every_star_on_its_pixel(
+    stars: Flown, tmp_path: Path
+) -> None:
     """Star directions by the annex's matrix into the camera, by the lens onto the chip, where the truth has them."""
     flight, run = stars
     camera = flight.lab.camera
     export.export(run, ["aem"], tmp_path, quiet)
     told, epochs, quaternions = read_aem(tmp_path / "truth.aem")
-    assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == ("ICRF", "STARTRACKER_1", "UTC")
+    assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == (
+        "ICRF",
+        "STARTRACKER_1",
+        "UTC",
+    )
     place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
     for stem, epoch, q in zip(run.stems, epochs, quaternions, strict=True):
         seen = Table.read(f"{stem}.ecsv")
         directions = np.array([place[hip] for hip in seen["id"].tolist()])
         pixels = camera.optics.project(directions @ matrix_b_from_a(q).T)
-        np.testing.assert_allclose(pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(
+            pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5
+        )
         assert epoch == camera.scene.start_time + SECOND * seen.meta["t_mid_s"]
     _, when, answers = read_aem(tmp_path / "solutions.aem")
     assert when == epochs
@@ -136,7 +154,9 @@ def test_under_the_stars_the_message_puts_every_star_on_its_pixel(stars: Flown, 
     assert 1e-8 < np.degrees(off).max() < 0.01
 
 
-def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(dome: Flown, tmp_path: Path) -> None:
+def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
+    dome: Flown, tmp_path: Path
+) -> None:
     """LEDs in lab coordinates by the annex's matrix into the body, by the mount into the camera."""
     flight, run = dome
     camera = flight.lab.camera
@@ -149,7 +169,9 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(dome: Flown, 
         leds_m = np.array([place[led] for led in seen["id"].tolist()])
         from_camera_m = leds_m @ matrix_b_from_a(q).T - camera.mount.camera_body_m
         pixels = camera.optics.project(camera.mount.cam_from_body.apply(from_camera_m))
-        np.testing.assert_allclose(pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(
+            pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5
+        )
     assert not (tmp_path / "solutions.aem").exists()  # nobody solved
 
 
@@ -161,7 +183,9 @@ def test_angles_of_a_solution_are_its_attitude(which: str, request: pytest.Fixtu
     cam_from_lab = Rotation.random(50, rng=np.random.default_rng(3))
     angles = np.array([scoring.angles_deg(one, camera.scene, camera.mount) for one in cam_from_lab])
     back = recording.attitudes(angles, run.is_celestial)
-    meant = cam_from_lab.inv() * (Rotation.identity() if which == "stars" else camera.mount.cam_from_body)
+    meant = cam_from_lab.inv() * (
+        Rotation.identity() if which == "stars" else camera.mount.cam_from_body
+    )
     np.testing.assert_allclose((back * meant.inv()).magnitude(), 0, rtol=0, atol=1e-12)
 
 
@@ -170,8 +194,12 @@ def test_a_message_is_what_the_notation_allows() -> None:
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
     text = ccsds_aem.message("ünïcode", ["″" * 400], (ccsds_aem.LAB, ccsds_aem.BODY), utc, spin)
-    assert all(line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines())
-    rows = np.array([line.split()[1:] for line in text.splitlines() if line.startswith("2012-")], dtype=float)
+    assert all(
+        line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines()
+    )
+    rows = np.array(
+        [line.split()[1:] for line in text.splitlines() if line.startswith("2012-")], dtype=float
+    )
     assert (np.sum(rows[1:] * rows[:-1], axis=1) > 0.9).all()
     for epochs in ([], [START, START]):
         with pytest.raises(InputError):
@@ -189,15 +217,28 @@ def test_parquet_is_the_ecsv_with_units(stars: Flown, tmp_path: Path) -> None:
     assert answers.column_names == kept.colnames
     np.testing.assert_array_equal(answers["ra_deg"].to_numpy(), kept["ra_deg"])
     assert answers["status"].to_pylist() == ["solved"] * 3
-    units = {name: (answers.schema.field(name).metadata or {}).get(b"unit") for name in answers.column_names}
+    units = {
+        name: (answers.schema.field(name).metadata or {}).get(b"unit")
+        for name in answers.column_names
+    }
     assert (units["t_s"], units["ra_deg"], units["cross_arcsec"]) == (b"s", b"deg", b"arcsec")
-    assert (units["status"], units["frame"], units["rms_px"], units["time_ms"]) == (None, None, b"px", b"ms")
+    assert (units["status"], units["frame"], units["rms_px"], units["time_ms"]) == (
+        None,
+        None,
+        b"px",
+        b"ms",
+    )
     lights = pyarrow.parquet.read_table(tmp_path / "sources.parquet")
     each = [Table.read(f"{stem}.ecsv") for stem in run.stems]
-    np.testing.assert_array_equal(lights["x_px"].to_numpy(), np.concatenate([one["x_px"] for one in each]))
-    np.testing.assert_array_equal(lights["frame"].to_numpy(), np.repeat([0, 1, 2], [len(one) for one in each]))
+    np.testing.assert_array_equal(
+        lights["x_px"].to_numpy(), np.concatenate([one["x_px"] for one in each])
+    )
+    np.testing.assert_array_equal(
+        lights["frame"].to_numpy(), np.repeat([0, 1, 2], [len(one) for one in each])
+    )
     assert lights.schema.metadata[b"skysim.seed"] == b"2"
-    truth, same = pyarrow.parquet.read_table(tmp_path / "truth.parquet"), Table.read(tmp_path / "truth.ecsv")
+    truth = pyarrow.parquet.read_table(tmp_path / "truth.parquet")
+    same = Table.read(tmp_path / "truth.ecsv")
     for name in ("t_mid_s", "cam_from_lab_qw", "rate_cam_x_rad_s"):
         np.testing.assert_array_equal(truth[name].to_numpy(), same[name])
     assert same["cam_from_lab_qw"][1] == each[1].meta["cam_from_lab_xyzw"][3]
@@ -225,7 +266,9 @@ def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> No
     assert image.dtype.itemsize == 8
     np.testing.assert_array_equal(cv2.imread(str(written[1]), cv2.IMREAD_UNCHANGED), image)
     np.testing.assert_array_equal(skimage.io.imread(written[1]), image)
-    np.testing.assert_array_equal(zarr.open_group(tmp_path / frames.ZARR, mode="r")["frames"][1], image)
+    np.testing.assert_array_equal(
+        zarr.open_group(tmp_path / frames.ZARR, mode="r")["frames"][1], image
+    )
 
 
 @pytest.mark.slow
@@ -255,7 +298,9 @@ def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> 
     for stem in run.stems:
         there, picture = film.read()
         assert there
-        meant = stretch.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[:492, :658]
+        meant = stretch.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
+            :492, :658
+        ]
         assert np.corrcoef(picture[:, :, 0].ravel(), meant.ravel())[0, 1] > 0.8
     assert not film.read()[0]
 
@@ -273,7 +318,8 @@ def camera(distortion: tuple[float, ...], focal_length: str) -> CameraConfig:
     }
     detector = {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12}
     return CameraConfig.model_validate(
-        part | {"principal_point_px": (790.25, 611.5), "distortion": distortion, "detector": detector}
+        part
+        | {"principal_point_px": (790.25, 611.5), "distortion": distortion, "detector": detector}
     )
 
 
@@ -289,7 +335,9 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
     back = Optics.from_camera(lens).project(cam_from_icrs.apply(directions))
     straight = header.wcs_world2pix(np.degrees([ra, dec]).T, 0)  # of a lens without distortion
     inverse = header.sip_foc2pix(straight + 1 - header.wcs.crpix, 1) - 1
-    return float(np.linalg.norm(back - pixels, axis=1).max()), float(np.linalg.norm(inverse - back, axis=1).max())
+    return float(np.linalg.norm(back - pixels, axis=1).max()), float(
+        np.linalg.norm(inverse - back, axis=1).max()
+    )
 
 
 @pytest.mark.parametrize(
@@ -301,7 +349,9 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
         ((-0.3, 0.1, 0.0, 0.0, -0.02), "10 mm"),
     ],
 )
-def test_the_header_s_polynomials_are_the_renderer_s_lens(distortion: tuple[float, ...], focal_length: str) -> None:
+def test_the_header_s_polynomials_are_the_renderer_s_lens(
+    distortion: tuple[float, ...], focal_length: str
+) -> None:
     """Distortion of up to 100 px: forwards to 0.01 px, backwards exactly, as Brown's law is a polynomial."""
     lens = camera(distortion, focal_length)
     forwards, backwards = misfits(lens)
@@ -319,7 +369,9 @@ def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
     assert told == pytest.approx(forwards, rel=2 / 3)
     assert backwards < 1e-6
     assert f"{told:.2g} px" in wcs.accuracy_warning(lens)
-    wide = loader.load("shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"})
+    wide = loader.load(
+        "shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"}
+    )
     assert any(line.startswith("camera.distortion: ") for line in check(build_lab(wide)).findings)
 
 
@@ -331,12 +383,19 @@ def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
     place = dict(zip(sources.id.tolist(), sources.place[:, :3], strict=True))
     x, y, z = np.array([place[hip] for hip in seen["id"].tolist()]).T
     header = fits.getheader(f"{run.stems[2]}.fits")
-    pixels = np.column_stack(WCS(header).all_world2pix(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0))
+    pixels = np.column_stack(
+        WCS(header).all_world2pix(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0)
+    )
     true = np.column_stack([seen["x_px"], seen["y_px"]])
     assert len(true) > 50
     np.testing.assert_allclose(pixels, true, rtol=0, atol=2 * wcs.TARGET_ERROR_PX)
-    bare = WCS({key: value for key, value in header.items() if key[:2] not in ("A_", "B_", "AP", "BP")})
-    assert np.abs(bare.wcs_world2pix(np.degrees([np.arctan2(y, x), np.arcsin(z)]).T, 0) - true).max() > 1.0
+    bare = WCS(
+        {key: value for key, value in header.items() if key[:2] not in ("A_", "B_", "AP", "BP")}
+    )
+    assert (
+        np.abs(bare.wcs_world2pix(np.degrees([np.arctan2(y, x), np.arcsin(z)]).T, 0) - true).max()
+        > 1.0
+    )
 
 
 # What cannot be
@@ -345,14 +404,19 @@ def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
 def test_bad_input_is_one_line_and_leaves_nothing(stars: Flown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of a run"):
         recording.open_recording(tmp_path)
-    with pytest.raises(InputError, match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video"):
+    with pytest.raises(
+        InputError, match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video"
+    ):
         export.export(stars[1], ["aem", "jpeg"], tmp_path / "out", quiet)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["zarr", "video"])
-def test_a_damaged_frame_leaves_no_half_of_a_sequence(stars: Flown, tmp_path: Path, name: str) -> None:
-    folder, out = tmp_path / "run", tmp_path / "out"
+def test_a_damaged_frame_leaves_no_half_of_a_sequence(
+    stars: Flown, tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / "run"
+    out = tmp_path / "out"
     folder.mkdir()
     for stem in stars[1].stems:
         for suffix in (".fits", ".ecsv"):
@@ -372,7 +436,9 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(stars: Flown, tmp_path: Pa
         ("# %ECSV 1.0", "# ECSV", "not an ECSV table"),
     ],
 )
-def test_a_damaged_truth_is_one_line(stars: Flown, tmp_path: Path, old: str, new: str, complaint: str) -> None:
+def test_a_damaged_truth_is_one_line(
+    stars: Flown, tmp_path: Path, old: str, new: str, complaint: str
+) -> None:
     text = Path(f"{stars[1].stems[0]}.ecsv").read_text()
     assert old in text
     path = tmp_path / "frame_0000.ecsv"

@@ -27,9 +27,15 @@ def test_no_error_is_none() -> None:
 
 
 def test_cross_and_roll_are_the_turn_s_parts() -> None:
-    assert metrics.cross_and_roll_rad(turned(3e-4, -4e-4, 0), TRUTH) == pytest.approx((5e-4, 0), abs=1e-15)
-    assert metrics.cross_and_roll_rad(turned(0, 0, 7e-4), TRUTH) == pytest.approx((0, 7e-4), abs=1e-15)
-    assert metrics.cross_and_roll_rad(turned(0, 0, -7e-4), TRUTH) == pytest.approx((0, -7e-4), abs=1e-15)
+    assert metrics.cross_and_roll_rad(turned(3e-4, -4e-4, 0), TRUTH) == pytest.approx(
+        (5e-4, 0), abs=1e-15
+    )
+    assert metrics.cross_and_roll_rad(turned(0, 0, 7e-4), TRUTH) == pytest.approx(
+        (0, 7e-4), abs=1e-15
+    )
+    assert metrics.cross_and_roll_rad(turned(0, 0, -7e-4), TRUTH) == pytest.approx(
+        (0, -7e-4), abs=1e-15
+    )
 
 
 small = st.floats(-1e-4, 1e-4)
@@ -66,7 +72,13 @@ def test_an_error_that_the_tracker_claims_is_wrong_beyond_one_degree() -> None:
     limit = 40.13
     tail = math.erfc(math.sqrt(limit / 2)) + math.sqrt(2 * limit / math.pi) * math.exp(-limit / 2)
     assert tail == pytest.approx(1e-8, rel=1e-3)
-    cases = [(11, limit - 0.01, False), (11, limit + 0.01, True), (59.9, 3, False), (60.1, 3, True), (9, 1e9, False)]
+    cases = [
+        (11, limit - 0.01, False),
+        (11, limit + 0.01, True),
+        (59.9, 3, False),
+        (60.1, 3, True),
+        (9, 1e9, False),
+    ]
     for arcmin, nees, wrong in cases:
         assert metrics.is_wrong(arcmin * ARCMIN_RAD, nees) == wrong
 
@@ -96,6 +108,8 @@ def test_overconfident_begins_where_one_correct_error_in_1e8_lies() -> None:
 
     limit = float(brentq(lambda x: math.log(tail(x) / 1e-8), 10.0, 100.0))
     nees = np.array([0.1, 0.99 * limit, 1.01 * limit, 2 * limit, np.nan, 2 * limit])
-    frames = np.array([1, 1, 1, 1, 1, 20])  # no solution in the fifth trial, a mean over many frames in the sixth
+    frames = np.array(
+        [1, 1, 1, 1, 1, 20]
+    )  # no solution in the fifth trial, a mean over many frames in the sixth
     share = metrics.overconfident({"nees": nees, "frames": frames})
     assert (share.value, share.trials) == (0.5, 4)

@@ -28,13 +28,21 @@ def digest(path: Path) -> str:
 
 def digests(folder: Path) -> dict[str, str]:
     """Of all files but the reports, which name their command."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".html"]
+    files = [
+        path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".html"
+    ]
     return {str(path.relative_to(folder)): digest(path) for path in files}
 
 
-@pytest.mark.parametrize(("name", "frames"), [("shefex2", 2), pytest.param("two_heads", 2, marks=pytest.mark.slow)])
-def test_the_command_and_python_write_the_same_files(tmp_path: Path, name: str, frames: int) -> None:
-    by_command = CliRunner().invoke(app, ["run", name, "--frames", str(frames), "--out", str(tmp_path / "command")])
+@pytest.mark.parametrize(
+    ("name", "frames"), [("shefex2", 2), pytest.param("two_heads", 2, marks=pytest.mark.slow)]
+)
+def test_the_command_and_python_write_the_same_files(
+    tmp_path: Path, name: str, frames: int
+) -> None:
+    by_command = CliRunner().invoke(
+        app, ["run", name, "--frames", str(frames), "--out", str(tmp_path / "command")]
+    )
     assert by_command.exit_code == 0, by_command.output
     skysim.simulate(skysim.load_scene(name, {"exposure.frames": frames})).save(tmp_path / "python")
     written = digests(tmp_path / "command")
@@ -43,8 +51,12 @@ def test_the_command_and_python_write_the_same_files(tmp_path: Path, name: str, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "cameras"), [("shefex2", 1), ("simsat_bump", 1), ("two_heads", 2)])
-def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(name: str, cameras: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "cameras"), [("shefex2", 1), ("simsat_bump", 1), ("two_heads", 2)]
+)
+def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(
+    name: str, cameras: int
+) -> None:
     with mock.patch.object(exposure, "expose", wraps=exposure.expose) as exposed:
         skysim.simulate(skysim.load_scene(name, {"exposure.frames": 2}))
     assert exposed.call_count == 2 * cameras
@@ -53,6 +65,13 @@ def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(name
 def test_a_run_along_a_given_table_is_saved(tmp_path: Path) -> None:
     """The table has no file that the check of the plan could read again."""
     level = [0.0] * 4
-    table = Table({"t_s": [0.0, 1.0, 2.0, 3.0], "roll_deg": [0.0, 0.5, 1.0, 1.5], "pitch_deg": level, "yaw_deg": level})
+    table = Table(
+        {
+            "t_s": [0.0, 1.0, 2.0, 3.0],
+            "roll_deg": [0.0, 0.5, 1.0, 1.5],
+            "pitch_deg": level,
+            "yaw_deg": level,
+        }
+    )
     run = skysim.simulate(skysim.load_scene("afit_simsat", {"exposure.frames": 1}), profile=table)
     assert (run.save(tmp_path / "run") / "report.html").is_file()

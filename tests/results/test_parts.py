@@ -36,9 +36,13 @@ def bought(**settings: str) -> dict[str, float]:
 
 def test_a_sphere_of_single_leds() -> None:
     """Wire: the arcs R (40 deg - t) from each LED to the rim, t uniform in cos t."""
-    found, radius_m, rim_rad = bought(), 1.2, math.radians(40)
+    found = bought()
+    radius_m = 1.2
+    rim_rad = math.radians(40)
     assert found["led"] == found["mounting_led"] == found["resistor"] == 300
-    assert found["shell"] == pytest.approx(2 * math.pi * radius_m**2 * (1 - math.cos(rim_rad)), rel=1e-9)
+    assert found["shell"] == pytest.approx(
+        2 * math.pi * radius_m**2 * (1 - math.cos(rim_rad)), rel=1e-9
+    )
     cosine = 1 - (np.arange(300) + 0.5) / 300 * (1 - math.cos(rim_rad))
     assert found["wire"] == pytest.approx(radius_m * np.sum(rim_rad - np.arccos(cosine)), rel=1e-4)
     assert found["power_supply"] == 1
@@ -48,7 +52,11 @@ def test_a_sphere_of_single_leds() -> None:
 
 def test_a_drive_of_its_own_and_a_code_take_channels() -> None:
     pwm = bought(light__led__drive="{kind: pwm, filter: {time_constant: 20 ms}}")
-    assert (pwm["driver"], pwm["microcontroller"], pwm["filter"]) == (19, 1, 300)  # 300 / 16, rounded up
+    assert (pwm["driver"], pwm["microcontroller"], pwm["filter"]) == (
+        19,
+        1,
+        300,
+    )  # 300 / 16, rounded up
     assert "resistor" not in pwm
     coded = bought(light__led__code="{kind: hamming}", tracker__decoder="{}")
     assert (coded["driver"], coded["trigger"]) == (19, 1)
@@ -72,7 +80,10 @@ def test_tape_is_as_long_as_its_pitches(winding: str) -> None:
         assert found["wire"] < 0.1
     # Half of them covered is as much tape; a spiral covers the area, one turn every 100 mm.
     half = TAPE % winding
-    assert bought(light__layout=half.replace("cap_deg", "lit_fraction: 0.5, cap_deg"))["tape"] == found["tape"]
+    assert (
+        bought(light__layout=half.replace("cap_deg", "lit_fraction: 0.5, cap_deg"))["tape"]
+        == found["tape"]
+    )
     if winding != "meridian":
         assert found["tape"] == pytest.approx(found["shell"] / 0.1, rel=0.1)
 
@@ -100,18 +111,26 @@ def test_boards_hold_their_leds() -> None:
 
 
 def test_a_survey_is_the_cheapest_that_is_good_enough() -> None:
-    for sigma, part in {"1 mm": "survey_pattern", "0.9 mm": "survey_total_station", "0.1 mm": "survey_arm"}.items():
+    for sigma, part in {
+        "1 mm": "survey_pattern",
+        "0.9 mm": "survey_total_station",
+        "0.1 mm": "survey_arm",
+    }.items():
         assert bought(tracker__survey__led_sigma=sigma)[part] == 300
     assert not any("survey" in part for part in bought(tracker__survey__led_sigma="0 mm"))
     with pytest.raises(InputError, match=r"no survey reaches 0.01 mm; allowed: a line survey_NAME"):
         listed(tracker__survey__led_sigma="0.01 mm")
     station = "{kind: total_station, position: [0 m, 0 m, -0.4 m], angle_sigma_arcsec: 2, distance_sigma: 1 mm}"
-    assert "survey_total_station" in bought(tracker__survey__instrument=station, tracker__survey__led_sigma="0.1 mm")
+    assert "survey_total_station" in bought(
+        tracker__survey__instrument=station, tracker__survey__led_sigma="0.1 mm"
+    )
 
 
 def test_the_table_adds_up() -> None:
     parts = listed()
-    rows = [row for row in csv.reader(to_csv(parts, "mine").splitlines()) if not row[0].startswith("#")]
+    rows = [
+        row for row in csv.reader(to_csv(parts, "mine").splitlines()) if not row[0].startswith("#")
+    ]
     assert tuple(rows[0]) == COLUMNS
     sums = [float(row[COLUMNS.index("sum")]) for row in rows[1:]]
     assert sum(sums[:-1]) == pytest.approx(sums[-1], abs=1e-9)
@@ -142,7 +161,10 @@ def test_the_sky_has_no_parts() -> None:
         ("part,unit,price,color\nled,each,1,red", "not a table of prices"),
         ("part,unit,price\nled,each", "line 2: 2 cells; allowed: 3"),
         ("part,unit,price\nlid,each,1", "line 2: unknown part 'lid'"),
-        ("part,unit,price\ndrivers,each,1", "line 2: unknown part 'drivers'; did you mean driver[?]; allowed: shell, "),
+        (
+            "part,unit,price\ndrivers,each,1",
+            "line 2: unknown part 'drivers'; did you mean driver[?]; allowed: shell, ",
+        ),
         ("part,unit,price\ntape,ft,1", "line 2: unit of tape: 'ft'; allowed: m"),
         ("part,unit,price\nled,each,-1", "line 2: price: '-1'; allowed: a number from 0"),
         ("part,unit,price\nled,each,nan", "line 2: price: 'nan'"),
@@ -166,7 +188,10 @@ def test_a_missing_price_and_a_missing_file_get_one_line(tmp_path: Path) -> None
     path = tmp_path / "prices.csv"
     path.write_text("# mine\npart,unit,price\nshell,m2,100\n")
     with pytest.raises(InputError, match=r"no price of led; allowed: a line that begins with it"):
-        parts_list(loader.load("afit_simsat", SPHERE | {"tracker.survey.led_sigma": "0 mm"}), read_prices(path))
+        parts_list(
+            loader.load("afit_simsat", SPHERE | {"tracker.survey.led_sigma": "0 mm"}),
+            read_prices(path),
+        )
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: No such file or directory$"):
         read_prices(tmp_path / "none.csv")
 
@@ -174,4 +199,6 @@ def test_a_missing_price_and_a_missing_file_get_one_line(tmp_path: Path) -> None
 def test_a_spreadsheet_s_byte_order_mark_is_no_part_of_the_table(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_bytes(b"\xef\xbb\xbf" + find_prices("assumed").read_bytes())
-    assert repr(read_prices(path).parts) == repr(read_prices(find_prices("assumed")).parts)  # NaN differs from NaN
+    assert repr(read_prices(path).parts) == repr(
+        read_prices(find_prices("assumed")).parts
+    )  # NaN differs from NaN

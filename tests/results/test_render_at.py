@@ -36,7 +36,9 @@ def test_the_truth_is_what_the_plant_says_at_mid_exposure(lab: Lab, attitude: Ro
     frame, truth = skysim.render_at(lab, attitude, RATE, t_s=7.5)
     assert frame.t_mid_s == truth.t_s == pytest.approx(7.5, abs=1e-12)
     assert (truth.lab_from_body * attitude.inv()).magnitude() < 1e-12
-    np.testing.assert_allclose(truth.rate_cam_rad_s, lab.camera.mount.cam_from_body.apply(RATE), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        truth.rate_cam_rad_s, lab.camera.mount.cam_from_body.apply(RATE), rtol=0, atol=1e-15
+    )
     sources = lab.camera.sources.take(np.isin(lab.camera.sources.id, truth.sources.id))
     order = np.argsort(truth.sources.id)
     rows = np.searchsorted(truth.sources.id, sources.id, sorter=order)
@@ -73,7 +75,9 @@ def test_a_moving_frame_is_that_of_a_scene_that_moves_so() -> None:
     np.testing.assert_allclose(outside.image_dn, frame.image_dn, rtol=0, atol=1e-3)
 
 
-def test_the_same_number_gives_the_same_bits_and_another_independent_noise(lab: Lab, attitude: Rotation) -> None:
+def test_the_same_number_gives_the_same_bits_and_another_independent_noise(
+    lab: Lab, attitude: Rotation
+) -> None:
     """Of frames of one attitude: differences of disjoint pairs have one variance and no correlation."""
     frames = [skysim.render_at(lab, attitude, index=index)[0] for index in range(4)]
     again = skysim.render_at(lab, attitude, index=2)[0]
@@ -87,7 +91,9 @@ def test_the_same_number_gives_the_same_bits_and_another_independent_noise(lab: 
     assert np.corrcoef(pairs[0], shared)[0, 1] == pytest.approx(0.5, abs=5 / np.sqrt(size))
 
 
-def test_a_lab_that_is_built_once_gives_the_frames_of_its_scene(lab: Lab, attitude: Rotation) -> None:
+def test_a_lab_that_is_built_once_gives_the_frames_of_its_scene(
+    lab: Lab, attitude: Rotation
+) -> None:
     frame, _ = skysim.render_at(lab, attitude, RATE, 3.0, index=5)
     built_again, _ = skysim.render_at(lab.scene, attitude, RATE, 3.0, index=5)
     np.testing.assert_array_equal(frame.image_dn, built_again.image_dn)
@@ -96,9 +102,13 @@ def test_a_lab_that_is_built_once_gives_the_frames_of_its_scene(lab: Lab, attitu
 def test_each_camera_of_the_lab_gives_its_own_frame() -> None:
     side_head = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}
     lab = skysim.build_lab(skysim.load_scene("two_heads", {"thermal": None, "heads": [side_head]}))
-    (main, of_main), (side, of_side) = (skysim.render_at(lab, lab.start, camera=number) for number in (0, 1))
+    (main, of_main), (side, of_side) = (
+        skysim.render_at(lab, lab.start, camera=number) for number in (0, 1)
+    )
     boresight = of_side.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(boresight, of_main.cam_from_lab.inv().apply([1.0, 0.0, 0.0]), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        boresight, of_main.cam_from_lab.inv().apply([1.0, 0.0, 0.0]), rtol=0, atol=1e-9
+    )
     assert np.mean(main.image_dn == side.image_dn) < 0.5
 
 

@@ -38,10 +38,19 @@ def of(*blocks: Block) -> Report:
 
 def everywhere(text: str) -> Report:
     """A report with a text wherever it may come from outside."""
-    table = Table([Column(text), Column("note", kind="aside")], [[text, text], [Cell(text, "bad", 3.0), ""]])
-    blocks = [Verdict(text, "bad"), Text(text), Items([text], text, "warning"), Facts([(text, [text, Cell(text)])])]
+    table = Table(
+        [Column(text), Column("note", kind="aside")], [[text, text], [Cell(text, "bad", 3.0), ""]]
+    )
+    blocks = [
+        Verdict(text, "bad"),
+        Text(text),
+        Items([text], text, "warning"),
+        Facts([(text, [text, Cell(text)])]),
+    ]
     inner = Section(text, [table, Figure(PICTURE, text), Code(text)])
-    return Report(text, [*blocks, Section(text, [inner]), Section(text, [Text(text)], folded=True)], text)
+    return Report(
+        text, [*blocks, Section(text, [inner]), Section(text, [Text(text)], folded=True)], text
+    )
 
 
 class Parsed(HTMLParser):
@@ -105,10 +114,16 @@ def test_a_row_of_markdown_has_as_many_cells_as_its_head() -> None:
     assert len(re.findall(r"(?<!\\)\|", row)) == len(re.findall(r"\|", head)) == 3
 
 
-def test_backticks_are_code_in_html_and_letters_elsewhere(capsys: pytest.CaptureFixture[str]) -> None:
+def test_backticks_are_code_in_html_and_letters_elsewhere(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     one = of(Text("set `tracker.map` to <b>`a<b`</b> or a lone ` mark"))
     page = Parsed(one.html())
-    assert [text for tag, text in page.texts if tag == "code"] == ["skysim run x", "tracker.map", "a<b"]
+    assert [text for tag, text in page.texts if tag == "code"] == [
+        "skysim run x",
+        "tracker.map",
+        "a<b",
+    ]
     assert "".join(text for tag, text in page.texts if tag == "p").endswith("or a lone ` mark")
     assert "`tracker.map`" in one.markdown()
     one.print()
@@ -117,12 +132,20 @@ def test_backticks_are_code_in_html_and_letters_elsewhere(capsys: pytest.Capture
 
 def test_a_page_needs_nothing_from_elsewhere() -> None:
     page = of(Figure(PICTURE, "a"), Figure(b"GIF89a", "b", "gif")).html()
-    assert [one.partition(";")[0] for one in Parsed(page).images] == ["data:image/png", "data:image/gif"]
-    assert not re.search(r"https?:|//[a-z]|@import|url\(", re.sub(r"data:image/\w+;base64,[\w+/=]+", "", page))
+    assert [one.partition(";")[0] for one in Parsed(page).images] == [
+        "data:image/png",
+        "data:image/gif",
+    ]
+    assert not re.search(
+        r"https?:|//[a-z]|@import|url\(", re.sub(r"data:image/\w+;base64,[\w+/=]+", "", page)
+    )
 
 
 def test_a_number_has_its_columns_format_and_sorts_by_its_value() -> None:
-    table = Table([Column("error", "″", ".2f")], [[1.239], [None], [float("nan")], [7], ["text"], [Cell("b", key=2.5)]])
+    table = Table(
+        [Column("error", "″", ".2f")],
+        [[1.239], [None], [float("nan")], [7], ["text"], [Cell("b", key=2.5)]],
+    )
     assert [row[0].text for row in table.cells()] == ["1.24", "–", "–", "7.00", "text", "b"]
     assert Parsed(of(table).html()).keys == ["1.239", "", "", "7", "2.5"]
     assert "| error ″ |" in of(table).markdown()
@@ -130,7 +153,9 @@ def test_a_number_has_its_columns_format_and_sorts_by_its_value() -> None:
 
 def test_json_holds_the_numbers_themselves(tmp_path: Path) -> None:
     table = Table([Column("error", "″", ".2f")], [[1.239], [None], [Cell("WRONG", "bad")]])
-    path = of(Verdict("yes"), Section("s", [table, Figure(PICTURE, "seen")])).save(tmp_path / "report.json")
+    path = of(Verdict("yes"), Section("s", [table, Figure(PICTURE, "seen")])).save(
+        tmp_path / "report.json"
+    )
     told = json.loads(path.read_text())
     assert (told["title"], told["command"]) == ("a report", "skysim run x")
     verdict, section = told["blocks"]
@@ -141,13 +166,21 @@ def test_json_holds_the_numbers_themselves(tmp_path: Path) -> None:
 
 
 def test_what_holds_nothing_is_left_out() -> None:
-    nothing = [Text(""), Items([], "title"), Facts([]), Section("deep", [Section("deeper", [Text("")])])]
+    nothing = [
+        Text(""),
+        Items([], "title"),
+        Facts([]),
+        Section("deep", [Section("deeper", [Text("")])]),
+    ]
     assert of(*nothing).blocks == []
     assert "deep" not in of(*nothing, Text("something")).html()
 
 
 def test_markdown_links_its_pictures_where_it_writes_them(tmp_path: Path) -> None:
-    one = of(Figure(PICTURE, "first [1]", name="named"), Section("s", [Figure(PICTURE, "second", "jpeg")]))
+    one = of(
+        Figure(PICTURE, "first [1]", name="named"),
+        Section("s", [Figure(PICTURE, "second", "jpeg")]),
+    )
     for pictures, folder in (("", "page/"), ("page_", "page_")):
         path = one.save(tmp_path / "page.md", pictures)
         linked = re.findall(r"^!\[[^]]*\]\((.+)\)$", path.read_text(), re.MULTILINE)
@@ -161,22 +194,39 @@ def test_another_suffix_is_refused(tmp_path: Path) -> None:
         of().save(tmp_path / "report.pdf")
 
 
-def test_the_terminal_ends_with_the_answer_and_shows_what_is_for_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_ends_with_the_answer_and_shows_what_is_for_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     aside = Table([Column("what", kind="text"), Column("note", kind="aside")], [["row", "why so"]])
     hidden = Section("hidden", [Text("page alone")], on_terminal=False)
-    of(Verdict("the answer"), hidden, Section("shown", [aside]), Section("drawn", [Figure(PICTURE, "c")])).print()
+    of(
+        Verdict("the answer"),
+        hidden,
+        Section("shown", [aside]),
+        Section("drawn", [Figure(PICTURE, "c")]),
+    ).print()
     lines = capsys.readouterr().out.splitlines()
-    assert [line.strip() for line in lines if line.strip()] == ["shown", "what", "row", "row: why so", "the answer"]
+    assert [line.strip() for line in lines if line.strip()] == [
+        "shown",
+        "what",
+        "row",
+        "row: why so",
+        "the answer",
+    ]
 
 
-def test_a_long_table_is_cut_on_the_terminal_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_long_table_is_cut_on_the_terminal_and_says_so(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     as_text.print_table(Table([Column("n")], [[n] for n in range(100)]))
     *_, last, more = capsys.readouterr().out.splitlines()
     assert int(last) == as_text.MAX_ROWS - 1
     assert more == f"and {100 - as_text.MAX_ROWS} more rows in the report"
 
 
-@pytest.mark.parametrize(("width", "count"), [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)])
+@pytest.mark.parametrize(
+    ("width", "count"), [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)]
+)
 def test_a_narrow_terminal_leaves_out_optional_columns_alone(
     width: int, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,8 +28,20 @@ def test_a_share_has_wilsons_interval(hits, of):
 @pytest.mark.parametrize("count", [1, 12, 1200])
 def test_none_and_all_have_the_exact_bound_of_the_words(count: int) -> None:
     """0 of n: 1 - 0.05^(1/n), the same in tables and in words; n of n mirrored."""
-    assert metrics.proportion(0, count) == (0.0, 0.0, pytest.approx(1 - 0.05 ** (1 / count)), count, 0)
-    assert metrics.proportion(count, count) == (1.0, pytest.approx(0.05 ** (1 / count)), 1.0, count, 0)
+    assert metrics.proportion(0, count) == (
+        0.0,
+        0.0,
+        pytest.approx(1 - 0.05 ** (1 / count)),
+        count,
+        0,
+    )
+    assert metrics.proportion(count, count) == (
+        1.0,
+        pytest.approx(0.05 ** (1 / count)),
+        1.0,
+        count,
+        0,
+    )
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.001, 2995), (0.01, 299), (0.05, 59)])
@@ -56,8 +68,12 @@ def test_intervals_hold_what_they_promise():
             told = metrics.STATISTICS[name](sample)
             inside[name] += told.low <= value <= told.high
     error = math.sqrt(0.95 * 0.05 / 400)
-    assert min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error  # at least, for they are ranks
-    assert 0.85 < inside["mean"] / 400 < 0.95 + 4 * error  # the bootstrap's is short on few of a skew law
+    assert (
+        min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error
+    )  # at least, for they are ranks
+    assert (
+        0.85 < inside["mean"] / 400 < 0.95 + 4 * error
+    )  # the bootstrap's is short on few of a skew law
     assert 0.80 < inside["rms"] / 400 < 0.95 + 4 * error
 
 
@@ -79,10 +95,14 @@ def test_none_in_ten_thousand_is_less_than_three_hundredths_of_a_percent() -> No
 
 
 @pytest.mark.parametrize(("probability", "fewest"), [(0.5, 6), (0.9, 29), (0.95, 59), (0.99, 299)])
-def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(probability: float, fewest: int) -> None:
+def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(
+    probability: float, fewest: int
+) -> None:
     """n with 1 - p^n >= 95 % (Wilks 1941: 59 and 299); at the median both ends count, 1 - 2 / 2^n."""
     values = np.arange(float(fewest))
-    enough, too_few = (metrics.quantile(values[:count], probability) for count in (fewest, fewest - 1))
+    enough, too_few = (
+        metrics.quantile(values[:count], probability) for count in (fewest, fewest - 1)
+    )
     assert (enough.high, enough.needs) == (fewest - 1, 0)
     assert math.isnan(too_few.low)
     assert math.isnan(too_few.high)
@@ -96,7 +116,12 @@ def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(probab
 def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability: float) -> None:
     """By enumeration of all pairs, with the binomial's own sum."""
     mass = stats.binom.pmf(np.arange(count + 1), count, probability)
-    pairs = [(r, s) for r in range(1, count + 1) for s in range(r + 1, count + 1) if mass[r:s].sum() >= 0.95]
+    pairs = [
+        (r, s)
+        for r in range(1, count + 1)
+        for s in range(r + 1, count + 1)
+        if mass[r:s].sum() >= 0.95
+    ]
     found = metrics.quantile_ranks(count, probability)
     assert (found is None) == (not pairs)
     if found is not None:
@@ -104,14 +129,18 @@ def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability:
         assert mass[low + 1 : high + 1].sum() >= 0.95 - 1e-9
         closest = min(s - r for r, s in pairs)
         below = np.cumsum(mass)
-        uneven = {(r, s): abs(below[r - 1] - (1 - below[s - 1])) for r, s in pairs if s - r == closest}
+        uneven = {
+            (r, s): abs(below[r - 1] - (1 - below[s - 1])) for r, s in pairs if s - r == closest
+        }
         assert uneven[low + 1, high + 1] == pytest.approx(min(uneven.values()), abs=1e-9)
 
 
 @pytest.mark.long
 def test_the_interval_of_a_p95_holds_it() -> None:
     """Of 2,000 samples of 100 from a skew law: at least 95 %, to four standard errors, and not always."""
-    rng, truth, inside = np.random.default_rng(5), math.log(20), 0
+    rng = np.random.default_rng(5)
+    truth = math.log(20)
+    inside = 0
     for sample in rng.exponential(size=(2000, 100)):
         told = metrics.STATISTICS["p95"](sample)
         inside += told.low <= truth <= told.high
@@ -130,7 +159,9 @@ SKEW = {  # samples of a size, from a generator
     "counts": lambda rng, n: rng.poisson(9, n).astype(float),
     "rare": lambda rng, n: (np.arange(n) < 7).astype(float),
     "one of degrees": lambda rng, n: np.where(np.arange(n) < 1, 1e5, rng.rayleigh(10, n)),
-    "five of degrees": lambda rng, n: np.where(np.arange(n) < 5, rng.uniform(1e4, 4e5, n), rng.rayleigh(10, n)),
+    "five of degrees": lambda rng, n: np.where(
+        np.arange(n) < 5, rng.uniform(1e4, 4e5, n), rng.rayleigh(10, n)
+    ),
 }
 
 
@@ -147,7 +178,9 @@ def test_the_bootstrap_of_many_is_the_bootstrap_where_it_takes_over(name: str, s
     assert found.trials == metrics.MANY_VALUES + 1
     width = by_hand.high - by_hand.low
     assert found.value == pytest.approx(float(statistic(more)), rel=1e-12)
-    assert [found.low, found.high] == pytest.approx([by_hand.low, by_hand.high], abs=4 * math.sqrt(2) * 0.022 * width)
+    assert [found.low, found.high] == pytest.approx(
+        [by_hand.low, by_hand.high], abs=4 * math.sqrt(2) * 0.022 * width
+    )
 
 
 @pytest.mark.parametrize("name", SKEW)
@@ -155,7 +188,10 @@ def test_the_bootstrap_of_many_is_the_bootstrap_where_it_takes_over(name: str, s
 def test_the_bootstrap_of_few_is_that_of_scipy(name: str, count: int) -> None:
     """With the same draws, but for the order of additions."""
     values = SKEW[name](np.random.default_rng(count), count)
-    for found, statistic in ((metrics.mean_of(values), np.mean), (metrics.rms_of(values), metrics.rms)):
+    for found, statistic in (
+        (metrics.mean_of(values), np.mean),
+        (metrics.rms_of(values), metrics.rms),
+    ):
         assert found == pytest.approx(metrics.resampled(values, statistic), rel=1e-12, nan_ok=True)
 
 
@@ -175,11 +211,18 @@ def test_the_interval_of_many_is_skew_as_that_of_the_bootstrap() -> None:
 def test_the_interval_of_many_holds_the_truth(name: str) -> None:
     """Of 1,000 samples: 95 % to four standard errors for an exponential law. Rare wrong attitudes are of a number that
     is itself random, and seldom none at all."""
-    rng, inside, runs = np.random.default_rng(6), 0, 1000
+    rng = np.random.default_rng(6)
+    inside = 0
+    runs = 1000
     rate = 5 / 3000
     truth = {"exponential": 1.0, "five of degrees": rate * 1e4}[name]
     for _ in range(runs):
-        values = rng.exponential(size=3000) if name == "exponential" else 1e4 * (rng.random(3000) < rate)
+        values = (
+            rng.exponential(size=3000) if name == "exponential" else 1e4 * (rng.random(3000) < rate)
+        )
         told = metrics.mean_of(values)
         inside += told.low <= truth <= told.high
-    assert inside / runs > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[name]
+    assert (
+        inside / runs
+        > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[name]
+    )

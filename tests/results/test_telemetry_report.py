@@ -40,7 +40,8 @@ def bare() -> Telemetry:
 
 def full() -> Telemetry:
     """Told to be 2 deg farther in yaw, the IMU 0.5 deg off in roll at the end, the filter 3 arcsec all along."""
-    log, bias = bare(), np.full((len(T_S), 3), 5 * DEG / 3600)
+    log = bare()
+    bias = np.full((len(T_S), 3), 5 * DEG / 3600)
     return replace(
         log,
         lab_from_ref=turned("z", 10 * T_S + 2),
@@ -90,14 +91,18 @@ def test_the_table_has_what_the_flight_has_in_degrees() -> None:
     np.testing.assert_allclose(table["wheel_2_rpm"], -200 * T_S * 30 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(table["gimbal_1_deg"], T_S / DEG, rtol=1e-12)
     np.testing.assert_allclose(table["assumed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9)
-    assert {"commanded_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(telemetry_report.table(bare()).colnames)
+    assert {"commanded_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(
+        telemetry_report.table(bare()).colnames
+    )
 
 
 def test_every_sample_of_the_imu_is_in_its_table() -> None:
     """At rest, rolled by 30 deg: the force of 1 g points up, which is (0, sin 30, cos 30) in body axes."""
     ends = np.arange(1, 9) * 2.5e-3
     force = 9.80665 * 2.5e-3 * np.array([0, 0.5, np.sqrt(0.75)])
-    record = Increments(ends, 2.5e-3, np.full((8, 3), 1e-6), np.tile(force, (8, 1)), ends > 0.01, ends < 0.004)
+    record = Increments(
+        ends, 2.5e-3, np.full((8, 3), 1e-6), np.tile(force, (8, 1)), ends > 0.01, ends < 0.004
+    )
     table = telemetry_report.imu_table(record)
     assert len(table) == 8
     np.testing.assert_allclose(table["level_roll_deg"], 30, rtol=0, atol=1e-9)
@@ -110,7 +115,9 @@ def test_every_sample_of_the_imu_is_in_its_table() -> None:
 @pytest.mark.slow
 def test_the_plot_shows_a_panel_for_everything_there_is() -> None:
     heights = [
-        cv2.imdecode(np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR).shape[0]
+        cv2.imdecode(np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR).shape[
+            0
+        ]
         for log in (bare(), full())
     ]
     assert [len(telemetry_report.panels(log)) for log in (bare(), full())] == [1, 7]

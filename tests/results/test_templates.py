@@ -29,12 +29,15 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 @pytest.fixture(scope="module")
 def lab() -> Lab:
-    return build_lab(loader.load("afit_simsat", DOME | {"motion.maneuver": "[]", "motion.control": "null"}))
+    return build_lab(
+        loader.load("afit_simsat", DOME | {"motion.maneuver": "[]", "motion.control": "null"})
+    )
 
 
 def rays(count: int) -> Floats:
     rng = np.random.default_rng(3)
-    tilt_rad, azimuth_rad = rng.uniform(0.05, 0.7, count), rng.uniform(-0.3, 0.3, count)
+    tilt_rad = rng.uniform(0.05, 0.7, count)
+    azimuth_rad = rng.uniform(-0.3, 0.3, count)
     return templates.directions(tilt_rad, azimuth_rad)
 
 
@@ -47,7 +50,8 @@ def test_on_a_sphere_the_paper_has_cassini_s_coordinates() -> None:
 
 
 def test_a_flat_panel_is_its_own_paper() -> None:
-    some, height_m = rays(200), 1.5
+    some = rays(200)
+    height_m = 1.5
     place_m = height_m * some / some[:, 2:]
     paper_m = templates.on_paper_m(Plane(np.array([0.0, 0.0, height_m])), some, 0.0)
     assert paper_m == pytest.approx(place_m[:, 1::-1], abs=1e-12)
@@ -55,26 +59,40 @@ def test_a_flat_panel_is_its_own_paper() -> None:
 
 def test_the_printed_leds_are_where_the_scene_has_them(lab: Lab) -> None:
     """Each circle, measured from its gore's apex, names its LED's direction from the bearing."""
-    place_m = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True))
+    place_m = dict(
+        zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True)
+    )
     root = ElementTree.fromstring(templates.template(lab, ".svg"))
     assert root.get("width") == f"{root.get('viewBox', '').split()[2]}mm"
-    gores, seen = 0, set()
+    gores = 0
+    seen = set()
     for element, after in zip(root, [*root[3:], None, None, None], strict=True):
         if element.tag == SVG + "polygon":
-            points = np.array([pair.split(",") for pair in str(element.get("points")).split()], float)
+            points = np.array(
+                [pair.split(",") for pair in str(element.get("points")).split()], float
+            )
             assert np.ptp(points[:, 0]) <= 1e3 * templates.MAX_WIDTH_M + 1
-            apex_mm, gores = points[0], gores + 1
+            apex_mm = points[0]
+            gores = gores + 1
         elif element.tag == SVG + "circle":
             assert after is not None
             number = int(str(after.text))
             seen.add(number)
             left, y = np.array([float(str(element.get(key))) for key in ("cx", "cy")]) - apex_mm
             # From inside, with the apex up, azimuths grow to the left.
-            across, along = -left / 1e3 / RADIUS_M, y / 1e3 / RADIUS_M
-            own = np.array([np.cos(across) * np.sin(along), np.sin(across), np.cos(across) * np.cos(along)])
+            across = -left / 1e3 / RADIUS_M
+            along = y / 1e3 / RADIUS_M
+            own = np.array(
+                [np.cos(across) * np.sin(along), np.sin(across), np.cos(across) * np.cos(along)]
+            )
             meridian_rad = 2 * np.pi * (gores - 1) / 18
-            cosine, sine = np.cos(meridian_rad), np.sin(meridian_rad)
-            expected = place_m[number] / RADIUS_M @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            cosine = np.cos(meridian_rad)
+            sine = np.sin(meridian_rad)
+            expected = (
+                place_m[number]
+                / RADIUS_M
+                @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            )
             assert own == pytest.approx(expected, abs=2e-5)
     assert gores == 18  # 2 pi 1.2 m sin 35 deg over 0.25 m, rounded up
     assert seen == place_m.keys()
@@ -90,8 +108,13 @@ def test_the_pattern_to_cut_is_that_to_print(lab: Lab, tmp_path: Path) -> None:
     root = ElementTree.fromstring(templates.template(lab, ".svg"))
     height_mm = float(str(root.get("viewBox")).split()[3])
     drawn = document.modelspace()
-    circles = [(c.dxf.center.x, height_mm - c.dxf.center.y, c.dxf.radius) for c in drawn.query("CIRCLE[layer=='LEDS']")]
-    printed = [[float(str(c.get(key))) for key in ("cx", "cy", "r")] for c in root.iter(SVG + "circle")]
+    circles = [
+        (c.dxf.center.x, height_mm - c.dxf.center.y, c.dxf.radius)
+        for c in drawn.query("CIRCLE[layer=='LEDS']")
+    ]
+    printed = [
+        [float(str(c.get(key))) for key in ("cx", "cy", "r")] for c in root.iter(SVG + "circle")
+    ]
     assert len(printed) == 150
     assert np.array(circles) == pytest.approx(np.array(printed), abs=1e-3)
     outlines = [
@@ -100,17 +123,22 @@ def test_the_pattern_to_cut_is_that_to_print(lab: Lab, tmp_path: Path) -> None:
         if one.is_closed
     ]
     polygons = [
-        np.array([p.split(",") for p in str(g.get("points")).split()], float) for g in root.iter(SVG + "polygon")
+        np.array([p.split(",") for p in str(g.get("points")).split()], float)
+        for g in root.iter(SVG + "polygon")
     ]
     assert len(outlines) == len(polygons) == 18
     for cut, paper in zip(outlines, polygons, strict=True):
         assert cut == pytest.approx(paper, abs=1e-3)
     words = [(one.dxf.text, one.dxf.height) for one in drawn.query("TEXT")]
-    assert words == [(one.text, float(str(one.get("font-size")))) for one in root.iter(SVG + "text")]
+    assert words == [
+        (one.text, float(str(one.get("font-size")))) for one in root.iter(SVG + "text")
+    ]
     assert len(drawn.query("POLYLINE[layer=='HELP']")) == 18
     assert len(drawn.query("POLYLINE[layer=='CENTERS']")) == 300
     rule = [one for one in drawn.query("POLYLINE[layer=='OUTLINE']") if not one.is_closed]
-    assert [abs(one.vertices[1].dxf.location.x - one.vertices[0].dxf.location.x) for one in rule] == [100]
+    assert [
+        abs(one.vertices[1].dxf.location.x - one.vertices[0].dxf.location.x) for one in rule
+    ] == [100]
 
 
 def test_words_of_a_cutting_pattern_are_ascii() -> None:
@@ -122,7 +150,9 @@ def test_words_of_a_cutting_pattern_are_ascii() -> None:
 def test_the_mesh_is_the_surface_with_a_mark_at_each_led(lab: Lab) -> None:
     objects = re.split(r"^o ", templates.template(lab, ".obj"), flags=re.M)[1:]
     vertices = {
-        one.split("\n", 1)[0]: np.array([line.split()[1:] for line in one.split("\n") if line.startswith("v ")], float)
+        one.split("\n", 1)[0]: np.array(
+            [line.split()[1:] for line in one.split("\n") if line.startswith("v ")], float
+        )
         for one in objects
     }
     shell_mm = vertices.pop("shell")
@@ -134,7 +164,11 @@ def test_the_mesh_is_the_surface_with_a_mark_at_each_led(lab: Lab) -> None:
         assert mark_mm[:3].mean(axis=0) == pytest.approx(1e3 * place[:3], abs=1e-3)
         assert np.linalg.norm(mark_mm[3]) == pytest.approx(1204, abs=1e-3)
     used = [
-        int(word) for one in objects for line in one.split("\n") if line.startswith("f ") for word in line.split()[1:]
+        int(word)
+        for one in objects
+        for line in one.split("\n")
+        if line.startswith("f ")
+        for word in line.split()[1:]
     ]
     assert set(used) == set(range(1, len(shell_mm) + 4 * len(vertices) + 1))
 

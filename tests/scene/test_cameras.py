@@ -30,7 +30,9 @@ def camera(name: str, **own: Any) -> CameraConfig:
 
 def field_deg(made: CameraConfig) -> tuple[float, float]:
     """The chip's width and height as angles, by the tangent of their halves, for a lens focused at infinity."""
-    half = [size * made.pixel_m / 2 / made.focal_length_m for size in (made.width_px, made.height_px)]
+    half = [
+        size * made.pixel_m / 2 / made.focal_length_m for size in (made.width_px, made.height_px)
+    ]
     return 2 * math.degrees(math.atan(half[0])), 2 * math.degrees(math.atan(half[1]))
 
 
@@ -60,7 +62,9 @@ def test_a_preset_and_a_lens_are_a_camera(name: str) -> None:
     made = camera(name)
     assert made.focal_length_m == 0.025
     # The preset is a body without a lens: the lens's keys are the scene's.
-    assert not {"focal_length", "f_number", "transmission", "psf"} & set(with_preset(bare(name))["camera"])
+    assert not {"focal_length", "f_number", "transmission", "psf"} & set(
+        with_preset(bare(name))["camera"]
+    )
 
 
 def bare(name: str) -> dict[str, Any]:
@@ -83,7 +87,11 @@ def test_the_converter_ends_a_little_above_the_full_well(name: str) -> None:
 def test_rows_are_read_at_a_camera_s_pace() -> None:
     """The slowest, lu205c, does 10 frames a second, the fastest, EC655, 90 (reference §2)."""
     made = {name: camera(name) for name in NAMES}
-    read = {name: one.height_px * one.shutter.row_time_s for name, one in made.items() if one.shutter.kind != "global"}
+    read = {
+        name: one.height_px * one.shutter.row_time_s
+        for name, one in made.items()
+        if one.shutter.kind != "global"
+    }
     assert {"lu205c", "ec655", "imx178", "imx477"} <= set(read)
     assert {name: time_s for name, time_s in read.items() if not 0.011 < time_s <= 0.1} == {}
 
@@ -142,7 +150,9 @@ def test_ec655_has_the_reference_s_field_and_dynamic_range() -> None:
     diagonal_m = math.hypot(made.width_px, made.height_px) * made.pixel_m
     assert 2 * math.degrees(math.atan(diagonal_m / 2 / 0.025)) == pytest.approx(18.51, abs=0.005)
     detector = made.detector
-    assert 20 * math.log10(detector.full_well_e / detector.read_noise_e) == pytest.approx(68.7, abs=0.05)
+    assert 20 * math.log10(detector.full_well_e / detector.read_noise_e) == pytest.approx(
+        68.7, abs=0.05
+    )
     assert detector.full_well_e / 255 == pytest.approx(157, abs=0.5)
     assert detector.full_well_e / 255 / math.sqrt(12) == pytest.approx(45, abs=0.5)
     assert 1 / (made.height_px * made.shutter.row_time_s) == pytest.approx(90, rel=0.01)

@@ -65,16 +65,25 @@ def test_every_assumption_is_marked_and_has_its_consequence(tmp_path: Path) -> N
     assert all(one.assumed and one.consequence for one in sheet.missing)
     comments = dict(re.findall(r"^ +(\w+): \S.*?# (.*)$", text(sheet, "x"), re.MULTILINE))
     assert {key for key, note in comments.items() if note == "[S1]"} == {
-        *("width_px", "height_px", "pixel", "focal_length", "f_number"),
+        "width_px",
+        "height_px",
+        "pixel",
+        "focal_length",
+        "f_number",
     }
     assert comments["full_well_e"] == "assumed: 900 e- a square micrometer, as in the IMX264"
     chip = load(tmp_path, answers).detector
-    assert chip.full_well_e == pytest.approx(900 * 3.45**2, rel=1e-3)  # 10,712 e-; the IMX250's measured 10,700
+    assert chip.full_well_e == pytest.approx(
+        900 * 3.45**2, rel=1e-3
+    )  # 10,712 e-; the IMX250's measured 10,700
     assert 0.99 * 4095 < chip.full_well_e / chip.gain_e_dn + chip.offset_dn <= 4095
 
 
 def test_a_stated_gain_bounds_an_unknown_full_well() -> None:
-    lines = {line.key: line.value for line in fill(PLACEHOLDERS | {"gain": "2", "bits": "8", "black_level": "5"}).lines}
+    lines = {
+        line.key: line.value
+        for line in fill(PLACEHOLDERS | {"gain": "2", "bits": "8", "black_level": "5"}).lines
+    }
     assert lines["detector.full_well_e"] == 2 * (255 - 5)
 
 
@@ -82,14 +91,18 @@ def test_without_a_lens_the_file_is_a_body_that_says_so(tmp_path: Path) -> None:
     sheet = fill({"pixels": "2048x2048", "pitch": "5.5 um", "shutter": "interline"})
     written = text(sheet, "x")
     assert "# Not stated: focal_length; the file has no lens" in written
-    assert not {"focal_length", "f_number", "transmission", "psf"} & set(yaml.safe_load(written)["camera"])
+    assert not {"focal_length", "f_number", "transmission", "psf"} & set(
+        yaml.safe_load(written)["camera"]
+    )
     assert "curve: interline" in written
     camera = load(tmp_path, {"pixels": "2048x2048", "pitch": "5.5 um"}, focal_length="50 mm")
     assert (camera.width_px, camera.focal_length_m) == (2048, 0.05)
 
 
 def test_a_lens_without_an_f_number_says_that_a_scene_must_give_it() -> None:
-    (missing,) = [one for one in fill(PLACEHOLDERS | {"focal_length": "16 mm"}).missing if not one.assumed]
+    (missing,) = [
+        one for one in fill(PLACEHOLDERS | {"focal_length": "16 mm"}).missing if not one.assumed
+    ]
     assert missing[::2] == ("f_number", "a scene must give camera.f_number")
 
 
@@ -98,22 +111,39 @@ def test_a_lens_without_an_f_number_says_that_a_scene_must_give_it() -> None:
     [
         ({"pixels": "1936"}, "answers.pixels: '1936'; allowed: width x height, such as 1936x1216"),
         ({"pixels": "99999x9"}, "answers.pixels: '99999x9'; allowed: less than or equal to 20000"),
-        ({"pitch": "5.86"}, "answers.pitch: '5.86'; allowed: a length with its unit, such as \"5.86 um\""),
+        (
+            {"pitch": "5.86"},
+            "answers.pitch: '5.86'; allowed: a length with its unit, such as \"5.86 um\"",
+        ),
         ({"pitch": "5 m"}, "answers.pitch: '5 m'; allowed: less than or equal to 0.01 m"),
         ({"bits": "40"}, "answers.bits: '40'; allowed: 1 to 16"),
-        ({"quantum_efficiency": "65"}, "answers.quantum_efficiency: '65'; allowed: less than or equal to 1"),
+        (
+            {"quantum_efficiency": "65"},
+            "answers.quantum_efficiency: '65'; allowed: less than or equal to 1",
+        ),
         ({"full_well": "1e999"}, "answers.full_well: '1e999'; allowed: a number such as 10700"),
         ({"full_well": "0"}, "answers.full_well: '0'; allowed: greater than or equal to 1"),
-        ({"black_level": "5000"}, "answers.black_level: '5000': 5000 is beyond the range of 12 bits"),
-        ({"gain": "0 DN/e-"}, "answers.gain: '0 DN/e-'; allowed: greater than or equal to 0.000001"),
-        ({"shutter": "leaf"}, "answers.shutter: 'leaf'; allowed: global, rolling, frame_transfer, interline"),
+        (
+            {"black_level": "5000"},
+            "answers.black_level: '5000': 5000 is beyond the range of 12 bits",
+        ),
+        (
+            {"gain": "0 DN/e-"},
+            "answers.gain: '0 DN/e-'; allowed: greater than or equal to 0.000001",
+        ),
+        (
+            {"shutter": "leaf"},
+            "answers.shutter: 'leaf'; allowed: global, rolling, frame_transfer, interline",
+        ),
         ({"row_time": "9 us"}, "answers.row_time: has no effect with a global shutter"),
         ({"f_number": "2"}, "answers.f_number: has no effect without focal_length"),
         ({"read_noise": "nan"}, "answers.read_noise: 'nan'; allowed: a number such as 3"),
         ({"prnu": "-1 %"}, "answers.prnu: '-1 %'; allowed: greater than or equal to 0"),
     ],
 )
-def test_a_wrong_answer_is_refused_with_what_is_allowed(answers: dict[str, str], message: str) -> None:
+def test_a_wrong_answer_is_refused_with_what_is_allowed(
+    answers: dict[str, str], message: str
+) -> None:
     with pytest.raises(InputError) as caught:
         outstanding(answers)
     assert str(caught.value) == message

@@ -25,7 +25,8 @@ TOLD = Calibration(1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-
 
 def by_opencv(path: Path, **more: Any) -> Path:
     """A file as OpenCV itself writes it."""
-    focal, (x, y) = TOLD.focal_px, TOLD.center_px
+    focal = TOLD.focal_px
+    (x, y) = TOLD.center_px
     keys = {
         "calibration_time": "Sun 22 Nov 2026 14:00:00 UTC",
         "image_width": TOLD.width_px,
@@ -45,7 +46,9 @@ def by_opencv(path: Path, **more: Any) -> Path:
 numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     st.builds(
         Calibration,
@@ -76,7 +79,9 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     text = path.read_text()
     (tmp_path / "four.yml").write_text(text.replace("%YAML 1.2", "%YAML:1.0"))
     assert opencv_calibration.read(tmp_path / "four.yml") == TOLD
-    ros = text.replace("!!opencv-matrix", "").replace("%YAML 1.2\n---\n", "distortion_model: plumb_bob\n")
+    ros = text.replace("!!opencv-matrix", "").replace(
+        "%YAML 1.2\n---\n", "distortion_model: plumb_bob\n"
+    )
     (tmp_path / "ros.yaml").write_text(ros)
     assert opencv_calibration.looks_like_calibration(tmp_path / "ros.yaml")
     assert opencv_calibration.read(tmp_path / "ros.yaml") == TOLD
@@ -92,9 +97,15 @@ MATRIX = np.array([[900.0, 0, 800], [0, 900, 600], [0, 0, 1]])
             {"camera_matrix": MATRIX * [1, 1.01, 1]},
             "fx 900 and fy 909 differ by 0.99 %; allowed: square pixels",
         ),
-        ({"camera_matrix": MATRIX + np.eye(3, k=1)}, "camera_matrix: another form; allowed: [fx, 0, cx"),
+        (
+            {"camera_matrix": MATRIX + np.eye(3, k=1)},
+            "camera_matrix: another form; allowed: [fx, 0, cx",
+        ),
         ({"camera_matrix": -MATRIX}, "camera_matrix: another form; allowed: [fx, 0, cx"),
-        ({"camera_matrix": MATRIX * np.nan}, "camera_matrix: other data; allowed: 9 finite numbers"),
+        (
+            {"camera_matrix": MATRIX * np.nan},
+            "camera_matrix: other data; allowed: 9 finite numbers",
+        ),
         ({"camera_matrix": np.eye(4)}, "camera_matrix: 4 rows and 4 cols; allowed: 3x3"),
         ({"camera_matrix": 7}, "camera_matrix: missing"),
         ({"distortion_coefficients": np.full((1, 8), 0.1)}, "8 terms; allowed: k1, k2, p1, p2, k3"),
@@ -102,10 +113,15 @@ MATRIX = np.array([[900.0, 0, 800], [0, 900, 600], [0, 0, 1]])
         ({"image_width": 0}, "image_width: 0 is not allowed"),
         ({"image_height": 1200.5}, "image_height: 1200.5 is not allowed"),
         ({"fisheye_model": 1}, "fisheye_model: 1; allowed: 0"),
-        ({"distortion_model": "equidistant"}, "distortion_model: 'equidistant'; allowed: plumb_bob"),
+        (
+            {"distortion_model": "equidistant"},
+            "distortion_model: 'equidistant'; allowed: plumb_bob",
+        ),
     ],
 )
-def test_another_lens_is_refused_in_one_line(tmp_path: Path, more: dict[str, Any], complaint: str) -> None:
+def test_another_lens_is_refused_in_one_line(
+    tmp_path: Path, more: dict[str, Any], complaint: str
+) -> None:
     path = by_opencv(tmp_path / "camera.yml", **more)
     with pytest.raises(InputError) as raised:
         opencv_calibration.read(path)
@@ -152,13 +168,18 @@ def lens(tmp_path: Path) -> Path:
 def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> None:
     """A file beside the scene; directions go through `cv2.projectPoints` and our lens to the same pixels."""
     own = lens.parent / "mine.yaml"
-    own.write_text(f"schema: 1\nbase: shefex2\ncamera: {{calibration: lens.yml, focal_length: null, focus: {focus}}}\n")
+    own.write_text(
+        f"schema: 1\nbase: shefex2\ncamera: {{calibration: lens.yml, focal_length: null, focus: {focus}}}\n"
+    )
     camera = loader.load(own).camera
     file = cv2.FileStorage(str(lens), cv2.FILE_STORAGE_READ)
-    matrix, bent = file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat()
+    matrix = file.getNode("camera_matrix").mat()
+    bent = file.getNode("distortion_coefficients").mat()
     points = np.random.default_rng(1).uniform((-0.13, -0.09, 1), (0.13, 0.09, 1), (200, 3))
     theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, bent)[0][:, 0]
-    np.testing.assert_allclose(Optics.from_camera(camera).project(points), theirs, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        Optics.from_camera(camera).project(points), theirs, rtol=0, atol=1e-7
+    )
     assert (camera.width_px, camera.height_px) == (659, 493)
 
 
@@ -169,7 +190,10 @@ def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> N
             "calibration: lens.yml",
             "camera.focal_length: conflicts with camera.calibration; allowed: one of the two",
         ),
-        ("calibration: none.yml, focal_length: null", "camera.calibration: none.yml: cannot be read"),
+        (
+            "calibration: none.yml, focal_length: null",
+            "camera.calibration: none.yml: cannot be read",
+        ),
         (
             "calibration: lens.yml, focal_length: null, preset: lu205c",
             "for frames of 659x493; the preset's are 1600x1200",
@@ -199,7 +223,9 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     frames.write_frame(lens.parent, frame, truth, loaded)
     told = opencv_calibration.read(lens)
     off = opencv_calibration.text(
-        Calibration(told.width_px, told.height_px, told.focal_px * 1.001, told.center_px, told.distortion)
+        Calibration(
+            told.width_px, told.height_px, told.focal_px * 1.001, told.center_px, told.distortion
+        )
     )
     files.write_text(lens, off)
     how = plate_solver.make_solver(None, lens)
@@ -214,7 +240,8 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
 
 def scene_pointing(truth: Any, told: Calibration) -> list[float]:
     """RA and Dec, deg, of the image's middle by OpenCV's way back through the lens."""
-    focal, (x, y) = told.focal_px, told.center_px
+    focal = told.focal_px
+    (x, y) = told.center_px
     matrix = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
     middle = np.array([[[329.0, 246.0]]])
     ray = np.append(cv2.undistortPoints(middle, matrix, np.array(told.distortion)).ravel(), 1)

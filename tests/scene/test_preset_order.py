@@ -43,7 +43,9 @@ def test_a_preset_s_lens_and_shutter_replace_those_of_the_base(folder: Path) -> 
 
 
 def test_the_scene_s_own_keys_replace_the_preset_s(folder: Path) -> None:
-    camera = loader.load(write(folder, '{preset: mine.yaml, focal_length: "25 mm", shutter: {kind: global}}')).camera
+    camera = loader.load(
+        write(folder, '{preset: mine.yaml, focal_length: "25 mm", shutter: {kind: global}}')
+    ).camera
     assert (camera.focal_length_m, camera.shutter.kind) == (0.025, "global")
 
 
@@ -58,14 +60,18 @@ def test_a_preset_of_the_base_is_dropped_whole(folder: Path) -> None:
     assert (detector.prnu, detector.hot_pixels, detector.offset_dn) == (0, 0, 0)
 
 
-def test_an_overridden_preset_replaces_the_file_s_keys_but_not_other_overrides(folder: Path) -> None:
+def test_an_overridden_preset_replaces_the_file_s_keys_but_not_other_overrides(
+    folder: Path,
+) -> None:
     over = {"camera.focal_length": "50 mm", "camera.preset": str(folder / "mine.yaml")}
     camera = loader.load("afit_simsat", over).camera
     assert (camera.focal_length_m, camera.f_number, camera.shutter.kind) == (0.05, 2.8, "rolling")
 
 
 def test_an_unknown_preset_over_a_base_is_an_error_with_its_line(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"unknown preset 'nosuch'; allowed: .*scene.yaml, line 3\)"):
+    with pytest.raises(
+        InputError, match=r"unknown preset 'nosuch'; allowed: .*scene.yaml, line 3\)"
+    ):
         loader.load(write(folder, "{preset: nosuch}"))
 
 
@@ -98,14 +104,20 @@ def test_a_rate_of_the_base_is_dropped_where_a_profile_gives_it(folder: Path) ->
     assert (scene.motion.start, scene.motion.rate_deg_s) == ("profile", (0.0, 0.0, 0.0))
     shown = {".".join(entry.path): entry for entry in provenance.effective(on_profile(folder))}
     assert shown["motion.rate_deg_s"].origin.what == "default"
-    with pytest.raises(InputError, match=r"rate_deg_s: has no effect with start: profile.*scene\.yaml"):
+    with pytest.raises(
+        InputError, match=r"rate_deg_s: has no effect with start: profile.*scene\.yaml"
+    ):
         loader.load(on_profile(folder, ", rate_deg_s: [0.1, 0, 0]"))
 
 
 def test_a_start_on_the_command_line_drops_the_rate_too(folder: Path) -> None:
     on_profile(folder)
     maneuver = f"[{{kind: profile, file: {folder / 'sky.csv'}}}]"
-    overrides = {"motion.control": "prescribed", "motion.maneuver": maneuver, "motion.start": "profile"}
+    overrides = {
+        "motion.control": "prescribed",
+        "motion.maneuver": maneuver,
+        "motion.start": "profile",
+    }
     assert loader.load("shefex2", overrides).motion.rate_deg_s == (0.0, 0.0, 0.0)
     with pytest.raises(InputError, match="rate_deg_s: has no effect with start: profile"):
         loader.load("shefex2", overrides | {"motion.rate_deg_s": "[0.1, 0, 0]"})

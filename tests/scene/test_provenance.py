@@ -14,7 +14,9 @@ from skysim.scene.provenance import Entry, Origin
 
 
 def by_key(name: str | Path, **overrides: str) -> dict[str, Entry]:
-    found = provenance.effective(name, {key.replace("__", "."): value for key, value in overrides.items()})
+    found = provenance.effective(
+        name, {key.replace("__", "."): value for key, value in overrides.items()}
+    )
     return {".".join(entry.path): entry for entry in found}
 
 
@@ -33,12 +35,17 @@ def test_what_is_shown_is_the_scene(name: str, tmp_path: Path) -> None:
 
 
 def test_every_leaf_of_the_schema_is_shown() -> None:
-    shown, scene = set(by_key("simsat_slew")), loader.load("simsat_slew")
+    shown = set(by_key("simsat_slew"))
+    scene = loader.load("simsat_slew")
     tree = scene.model_dump(by_alias=True, mode="json")
 
     def leaves(node: object, path: str) -> set[str]:
         if isinstance(node, dict) and node:
-            return {leaf for key, inner in node.items() for leaf in leaves(inner, f"{path}.{key}" if path else key)}
+            return {
+                leaf
+                for key, inner in node.items()
+                for leaf in leaves(inner, f"{path}.{key}" if path else key)
+            }
         return {path}
 
     assert leaves(tree, "") == shown
@@ -47,7 +54,9 @@ def test_every_leaf_of_the_schema_is_shown() -> None:
 def test_each_value_has_the_place_that_it_comes_from() -> None:
     """Its own file, a base, a preset, or the default."""
     found = by_key("simsat_bump")
-    own, base, preset = SCENES / "simsat_bump.yaml", SCENES / "afit_simsat.yaml", DATA / "cameras" / "lu205c.yaml"
+    own = SCENES / "simsat_bump.yaml"
+    base = SCENES / "afit_simsat.yaml"
+    preset = DATA / "cameras" / "lu205c.yaml"
     for key, value, what, path, words in (
         ("seed", 6, "this file", own, "seed: 6"),
         ("vehicle.imu.gyro.rate_limit_deg_s", 10, "this file", own, "rate_limit_deg_s"),
@@ -65,7 +74,10 @@ def test_each_value_has_the_place_that_it_comes_from() -> None:
 def test_overrides_are_named_and_replace_what_was_there() -> None:
     """A section with another kind drops the file's keys; an element of a list makes the list the override's."""
     found = by_key(
-        "afit_simsat", light__led__drive="{kind: direct}", vehicle__inertia__0="5 kg m2", motion__control="pd"
+        "afit_simsat",
+        light__led__drive="{kind: direct}",
+        vehicle__inertia__0="5 kg m2",
+        motion__control="pd",
     )
     assert found["light.led.drive.kind"].origin.what == "--set"
     assert found["vehicle.inertia"].origin.what == "--set"
@@ -81,7 +93,9 @@ def test_a_calibration_is_named(tmp_path: Path) -> None:
     lens = Calibration(1600, 1200, 9000.0, (800.0, 600.0), (0.1, 0.0, 0.0, 0.0, 0.0))
     (tmp_path / "lens.yml").write_text(opencv_calibration.text(lens))
     path = tmp_path / "mine.yaml"
-    path.write_text("schema: 1\nbase: afit_simsat\ncamera: {calibration: lens.yml, focal_length: null, pixel: 4 um}\n")
+    path.write_text(
+        "schema: 1\nbase: afit_simsat\ncamera: {calibration: lens.yml, focal_length: null, pixel: 4 um}\n"
+    )
     found = by_key(path)
     assert found["camera.distortion"].origin.what == "calibration lens.yml"
     assert found["camera.distortion"].value == [0.1, 0, 0, 0, 0]
@@ -100,6 +114,10 @@ def test_a_key_without_effect_is_marked() -> None:
 def test_the_text_is_yaml_with_aligned_comments() -> None:
     text = provenance.text(provenance.effective("shefex2"))
     assert yaml.safe_load(text)["camera"]["focal_length"] == "25 mm"
-    short = [line.index("#") for line in text.splitlines() if "#" in line and len(line.partition("#")[0].rstrip()) < 44]
+    short = [
+        line.index("#")
+        for line in text.splitlines()
+        if "#" in line and len(line.partition("#")[0].rstrip()) < 44
+    ]
     assert len(short) > 100
     assert len(set(short)) == 1

@@ -31,7 +31,8 @@ from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.led import DRIVES, LOBES
 from skysim.sources.dome.shell.surface import SURFACES
 
-AFIT, SHEFEX = SCENES / "afit_simsat.yaml", SCENES / "shefex2.yaml"
+AFIT = SCENES / "afit_simsat.yaml"
+SHEFEX = SCENES / "shefex2.yaml"
 
 
 def line_number(text: str, fragment: str) -> int:
@@ -106,7 +107,12 @@ def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
 @pytest.mark.parametrize(
     ("part", "given", "name", "value"),
     [
-        (vehicle.AirCurrentConfig, {"rms": ["1 mN m", "2 uN m", "0 N m"]}, "rms_nm", (1e-3, 2e-6, 0.0)),
+        (
+            vehicle.AirCurrentConfig,
+            {"rms": ["1 mN m", "2 uN m", "0 N m"]},
+            "rms_nm",
+            (1e-3, 2e-6, 0.0),
+        ),
         (
             vehicle.AirCurrentConfig,
             {"rms": ["0 N m"] * 3, "correlation": "1500 ms"},
@@ -121,10 +127,20 @@ def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
         ),
         (motion.DesaturationConfig, {"start": "2 N m s", "stop": "800 mN m s"}, "stop_nms", 0.8),
         (motion.DesaturationConfig, {"start": "2 kg m2 / s", "stop": "1 N m s"}, "start_nms", 2.0),
-        (motion.DesaturationConfig, {"start": "2 N m s", "stop": "1 N m s", "time": "1 min"}, "time_s", 60.0),
+        (
+            motion.DesaturationConfig,
+            {"start": "2 N m s", "stop": "1 N m s", "time": "1 min"},
+            "time_s",
+            60.0,
+        ),
         (
             motion.BumpConfig,
-            {"kind": "bump", "rate_deg_s": [1, 2, 3], "duration": "40 ms", "caught_after": "200 ms"},
+            {
+                "kind": "bump",
+                "rate_deg_s": [1, 2, 3],
+                "duration": "40 ms",
+                "caught_after": "200 ms",
+            },
             "caught_after_s",
             0.2,
         ),
@@ -151,22 +167,48 @@ def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
     parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
     sizes = [one.quantity for one in metadata if isinstance(one, ErrorSchema)]
     own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(
-        parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers
+        parser is camera.focus_distance or parser.__qualname__.startswith("quantity")
+        for parser in parsers
     )
-    return own or any(is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation))
+    return own or any(
+        is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation)
+    )
 
 
-SUFFIXES = ("_w_sr", "_nm_rad", "_kg_m2", "_kg_m", "_nms2", "_nms", "_nm", "_kg", "_cd", "_n", "_m", "_s")
+SUFFIXES = (
+    "_w_sr",
+    "_nm_rad",
+    "_kg_m2",
+    "_kg_m",
+    "_nms2",
+    "_nms",
+    "_nm",
+    "_kg",
+    "_cd",
+    "_n",
+    "_m",
+    "_s",
+)
 TOLERANCES = set(ToleranceConfig.__subclasses__())
-FIELDS = [(part, name) for part in sorted(parts_of(scene.Scene) | TOLERANCES, key=str) for name in part.model_fields]
+FIELDS = [
+    (part, name)
+    for part in sorted(parts_of(scene.Scene) | TOLERANCES, key=str)
+    for name in part.model_fields
+]
 
 
-@pytest.mark.parametrize(("part", "name"), FIELDS, ids=[f"{part.__name__}.{name}" for part, name in FIELDS])
-def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(part: type[ConfigModel], name: str) -> None:
+@pytest.mark.parametrize(
+    ("part", "name"), FIELDS, ids=[f"{part.__name__}.{name}" for part, name in FIELDS]
+)
+def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(
+    part: type[ConfigModel], name: str
+) -> None:
     """A quantity's key is its Python name less the SI suffix; every other key is the name itself."""
     field = part.model_fields[name]
     suffix = next((one for one in SUFFIXES if name.endswith(one)), "")
-    bare = name.removesuffix(suffix if is_quantity(field.annotation, field.metadata) else "").rstrip("_")  # class_
+    bare = name.removesuffix(
+        suffix if is_quantity(field.annotation, field.metadata) else ""
+    ).rstrip("_")  # class_
     own = {"schema_version": "schema", "name": scene.NAME_ALIAS} if part is scene.Scene else {}
     assert field.alias == own.get(name, bare)
 
@@ -175,7 +217,9 @@ def test_afit_says_what_the_thesis_says() -> None:
     loaded = loader.load("afit_simsat")
     # Reference §1.1: apex 48 in, semi-axes 38.88 and 28.60 in, pitch 8 mm, tilt +-30 deg, 35 mm, 1600 x 1200.
     assert loaded.light.surface.apex_m == pytest.approx(48 * 0.0254, abs=1e-12)
-    assert loaded.light.surface.semi_axes_m == pytest.approx((0.987552, 0.987552, 0.72644), abs=1e-12)
+    assert loaded.light.surface.semi_axes_m == pytest.approx(
+        (0.987552, 0.987552, 0.72644), abs=1e-12
+    )
     assert loaded.light.layout.pitch_m == pytest.approx(0.008, abs=1e-15)
     assert loaded.vehicle.tilt_stop_deg == 30
     assert (loaded.camera.width_px, loaded.camera.height_px) == (1600, 1200)
@@ -206,14 +250,18 @@ def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
 
 
 def test_an_override_takes_the_place_of_the_file_s_value() -> None:
-    changed = loader.load("afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"})
+    changed = loader.load(
+        "afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"}
+    )
     assert changed.camera.detector.bits == 8
     assert changed.motion.start == motion.AttitudeConfig(yaw_deg=40)
 
 
 def test_an_override_may_add_a_section() -> None:
     text = {"tracker.assumed_camera_body": "['1 in', '0 m', '15 in']"}
-    assert loader.load("afit_simsat_ideal", text).tracker.assumed_camera_body_m == pytest.approx((0.0254, 0, 0.381))
+    assert loader.load("afit_simsat_ideal", text).tracker.assumed_camera_body_m == pytest.approx(
+        (0.0254, 0, 0.381)
+    )
 
 
 @pytest.mark.parametrize(
@@ -237,11 +285,17 @@ def test_an_override_may_add_a_section() -> None:
         ("seed.x", "3", "seed.x: seed holds a value, not keys (overrides)"),
         ("seed", "[", "seed: '[' is not YAML (overrides)"),
         ("camera..bits", "3", "overrides: camera..bits=3; allowed: path.to.key=value"),
-        ("camera", "", "camera: None is not allowed; allowed: a mapping of keys to values (overrides)"),
+        (
+            "camera",
+            "",
+            "camera: None is not allowed; allowed: a mapping of keys to values (overrides)",
+        ),
         ("exposure.time", "a\nb", "is not a time; allowed: a time such as"),
     ],
 )
-def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: str, says: str) -> None:
+def test_a_bad_override_is_one_line_and_blamed_on_the_option(
+    key: str, value: str, says: str
+) -> None:
     message = complaint(SHEFEX, {key: value})
     assert says in message
     assert "overrides" in message
@@ -325,8 +379,16 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ),
         ("lit: [3, 6]", "lit: [3, 12]", "allowed: 1 <= least <= most <= 9"),
         ("lit: [3, 6]", "lit: [3]", "light.layout.lit.1: missing"),
-        ("pwm_levels: [1.0, 0.7, 0.5, 0.35]", "pwm_levels: []", "light.layout.pwm_levels: [] is not allowed"),
-        ("hardware_seed: 2012", "hardware_seed: -1", "light.layout.hardware_seed: -1 is not allowed"),
+        (
+            "pwm_levels: [1.0, 0.7, 0.5, 0.35]",
+            "pwm_levels: []",
+            "light.layout.pwm_levels: [] is not allowed",
+        ),
+        (
+            "hardware_seed: 2012",
+            "hardware_seed: -1",
+            "light.layout.hardware_seed: -1 is not allowed",
+        ),
         (
             '"9.0 kg m2"',
             '"90 kg m2"',
@@ -406,14 +468,21 @@ def test_a_slip_in_where_the_camera_points_is_not_taken_for_a_vehicle_s(
 def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
     right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
     message, place = spoilt(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
-    assert message == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
+    assert (
+        message == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
+    )
 
 
 # Unions: of each the allowed kinds, as a wrong one is answered
 
 UNIONS = [
     ("kind: gaussian", "kind: gauss", "camera.psf.kind", "gaussian, moffat, airy, disk, measured"),
-    ("kind: global", "kind: shut", "camera.shutter.kind", "global, rolling, frame_transfer, interline"),
+    (
+        "kind: global",
+        "kind: shut",
+        "camera.shutter.kind",
+        "global, rolling, frame_transfer, interline",
+    ),
     (
         "transmission: 0.85",
         "vignetting: {kind: cos4}\n  transmission: 0.85",
@@ -427,7 +496,12 @@ UNIONS = [
         "background.1.kind",
         "uniform, sky, moon, stray, faint_stars",
     ),
-    ("control: pid", "jitter: [{kind: white}]\n  control: pid", "motion.jitter.0.kind", "line, band"),
+    (
+        "control: pid",
+        "jitter: [{kind: white}]\n  control: pid",
+        "motion.jitter.0.kind",
+        "line, band",
+    ),
     (
         "preset: lu205c",
         "preset: lu206c",
@@ -442,7 +516,9 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
     tmp_path: Path, right: str, wrong: str, key: str, allowed: str
 ) -> None:
     message, place = spoilt(tmp_path, AFIT, right, wrong)
-    assert re.fullmatch(rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message)
+    assert re.fullmatch(
+        rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message
+    )
 
 
 @pytest.mark.slow
@@ -459,15 +535,31 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
             "{kind: rolling, row_time: 1 ms}",
             "camera.shutter: readout takes 1.199 s, longer than the frame period 0.5 s",
         ),
-        ("light.led.intensity", "null", "light.led: an LED takes either intensity or radiant_intensity"),
-        ("light.led.radiant_intensity", "3 mW/sr", "light.led: an LED takes either intensity or radiant_"),
+        (
+            "light.led.intensity",
+            "null",
+            "light.led: an LED takes either intensity or radiant_intensity",
+        ),
+        (
+            "light.led.radiant_intensity",
+            "3 mW/sr",
+            "light.led: an LED takes either intensity or radiant_",
+        ),
         (
             "light.led.lobe",
             "{kind: table, angle_deg: [0, 60], intensity: [20, 1]}",
             "light.led.lobe: the table does not begin with an intensity of 1 at 0 deg",
         ),
-        ("camera.shutter", "{kind: global, row_time: '3 us'}", "camera.shutter.row_time: unknown key"),
-        ("camera.vignetting", "{kind: two_stops, cutoff_deg: 90}", "camera.vignetting.cutoff_deg: 90 is not"),
+        (
+            "camera.shutter",
+            "{kind: global, row_time: '3 us'}",
+            "camera.shutter.row_time: unknown key",
+        ),
+        (
+            "camera.vignetting",
+            "{kind: two_stops, cutoff_deg: 90}",
+            "camera.vignetting.cutoff_deg: 90 is not",
+        ),
         (
             "camera.vignetting",
             "{kind: two_stops, cutof_deg: 9}",
@@ -503,7 +595,11 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
             "ccd",
             "unknown curve 'ccd'; allowed: cmos, interline, thick_ccd",
         ),
-        ("camera.detector.offset_dn", "1024", "camera.detector.offset_dn: 1024 is beyond the range of 10 bits"),
+        (
+            "camera.detector.offset_dn",
+            "1024",
+            "camera.detector.offset_dn: 1024 is beyond the range of 10 bits",
+        ),
     ],
 )
 def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, says: str) -> None:
@@ -582,7 +678,9 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
             "filter.bias_time: shorter than ten samples of the IMU, 0.1 s",
         ),
         (
-            {"motion.maneuver": "[{kind: sine, amplitude_deg: [1, 0, 0], frequency_hz: 50, duration: 1 s}]"},
+            {
+                "motion.maneuver": "[{kind: sine, amplitude_deg: [1, 0, 0], frequency_hz: 50, duration: 1 s}]"
+            },
             "motion.maneuver: a sine of 50 Hz requires a motion.control.rate_hz above 100",
         ),
         (
@@ -590,7 +688,9 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
             "motion.control.desaturation.stop: 1 N m s is not below start 0.5 N m s",
         ),
         (
-            {"motion.maneuver": "[{kind: bump, rate_deg_s: [1, 2, 3], duration: 40 ms, caught_after: 30 ms}]"},
+            {
+                "motion.maneuver": "[{kind: bump, rate_deg_s: [1, 2, 3], duration: 40 ms, caught_after: 30 ms}]"
+            },
             "motion.maneuver.0.caught_after: 0.03 s is before the impulse ends",
         ),
     ],
@@ -603,7 +703,11 @@ def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: st
     ("key", "value", "says"),
     [
         *(
-            ("vehicle.disturbances", value, "vehicle.disturbances: a free vehicle has none; allowed: mount:")
+            (
+                "vehicle.disturbances",
+                value,
+                "vehicle.disturbances: a free vehicle has none; allowed: mount:",
+            )
             for value in (
                 "{earth_rotation: true}",
                 "{turbine: [0 N m, 0 N m, 1 mN m]}",
@@ -630,7 +734,11 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("vehicle.wheels", "{coulomb: 1 mN}", "coulomb: '1 mN' is not a torque; allowed: a torque such as"),
+        (
+            "vehicle.wheels",
+            "{coulomb: 1 mN}",
+            "coulomb: '1 mN' is not a torque; allowed: a torque such as",
+        ),
         (
             "vehicle.wheels",
             "{coulomb: -1 mN m}",
@@ -641,10 +749,26 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
             "{torque: 1 N m}",
             "vehicle.wheels.torque: unknown key; did you mean torque_limit?; allo",
         ),
-        ("vehicle.wheels", "{static_imbalance: 1 g}", "'1 g' is not a mass times offset; allowed: a mass ti"),
-        ("vehicle.fans", "{thrust_limit: 1 N m}", "'1 N m' is not a force; allowed: a force such as"),
-        ("vehicle.drag", "{viscous: 1 N m}", "vehicle.drag.viscous: '1 N m' is not a torque per rate; allow"),
-        ("vehicle.drag", "{quadratic: 1 N m s}", "'1 N m s' is not a torque per squared rate; allowed: a t"),
+        (
+            "vehicle.wheels",
+            "{static_imbalance: 1 g}",
+            "'1 g' is not a mass times offset; allowed: a mass ti",
+        ),
+        (
+            "vehicle.fans",
+            "{thrust_limit: 1 N m}",
+            "'1 N m' is not a force; allowed: a force such as",
+        ),
+        (
+            "vehicle.drag",
+            "{viscous: 1 N m}",
+            "vehicle.drag.viscous: '1 N m' is not a torque per rate; allow",
+        ),
+        (
+            "vehicle.drag",
+            "{quadratic: 1 N m s}",
+            "'1 N m s' is not a torque per squared rate; allowed: a t",
+        ),
         ("vehicle.cmgs", "{steering: magic}", "allowed: 'pseudo_inverse' or 'singularity_robust'"),
         ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "allowed: greater than or equal to 0.005"),
         ("vehicle.disturbances", "{cable: {}}", "vehicle.disturbances.cable.stiffness: missing"),
@@ -659,25 +783,61 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
             "vehicle.disturbances.air_current.rms.1: missing",
         ),
         ("vehicle.imu", "{earth_rate: maybe}", "allowed: 'none', 'uncompensated' or 'compensated'"),
-        ("vehicle.imu", "{gyro: {arw: 3}}", "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, "),
-        ("motion.control", "{law: pid, options: {a: 1}}", "motion.control: options has no effect with law pid; allo"),
-        ("motion.control", "{law: prescribed, damping: 1}", "motion.control: damping has no effect with law prescr"),
-        ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; allowed: gr"),
-        ("motion.control", "true", "motion.control: True is not allowed; allowed: a mapping of keys to"),
+        (
+            "vehicle.imu",
+            "{gyro: {arw: 3}}",
+            "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, ",
+        ),
+        (
+            "motion.control",
+            "{law: pid, options: {a: 1}}",
+            "motion.control: options has no effect with law pid; allo",
+        ),
+        (
+            "motion.control",
+            "{law: prescribed, damping: 1}",
+            "motion.control: damping has no effect with law prescr",
+        ),
+        (
+            "motion.control",
+            "{rate_hz: 0.5}",
+            "motion.control.rate_hz: 0.5 is not allowed; allowed: gr",
+        ),
+        (
+            "motion.control",
+            "true",
+            "motion.control: True is not allowed; allowed: a mapping of keys to",
+        ),
         (
             "site",
             "{latitude_deg: 91}",
             "site.latitude_deg: 91 is not allowed; allowed: less than or equal",
         ),
-        ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; allowed: greater than or"),
+        (
+            "filter",
+            "{latency: -1 s}",
+            "filter.latency: '-1 s' is not allowed; allowed: greater than or",
+        ),
         (
             "filter",
             "{considered: [gain]}",
             "allowed: 'bias', 'scale', 'misalignment', 'mounting' or 'systematic'",
         ),
-        ("filter", "{wrong_share: 1}", "filter.wrong_share: 1 is not allowed; allowed: less than 1"),
-        ("filter", "{scale_ppm: -1}", "filter.scale_ppm: -1 is not allowed; allowed: greater than or"),
-        ("filter", "{systematic_time: 0 s}", "filter.systematic_time: '0 s' is not allowed; allowed: greater than"),
+        (
+            "filter",
+            "{wrong_share: 1}",
+            "filter.wrong_share: 1 is not allowed; allowed: less than 1",
+        ),
+        (
+            "filter",
+            "{scale_ppm: -1}",
+            "filter.scale_ppm: -1 is not allowed; allowed: greater than or",
+        ),
+        (
+            "filter",
+            "{systematic_time: 0 s}",
+            "filter.systematic_time: '0 s' is not allowed; allowed: greater than",
+        ),
     ],
 )
 def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:
@@ -698,7 +858,9 @@ def test_nobody_need_fly_a_vehicle_that_is_told_nothing(kind: str) -> None:
 
 
 def test_a_controller_s_name_is_short_for_its_section() -> None:
-    loaded = [loader.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")]
+    loaded = [
+        loader.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")
+    ]
     assert loaded[0] == loaded[1] == motion.ControlConfig(law="pd")
 
 
@@ -720,7 +882,8 @@ def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
         "schema: 1\nbase: afit_simsat\ntitle: Mine\nexposure: {frames: 3}\nlight: {led: {scatter: 0.01}}\n"
         'motion:\n  maneuver: [{kind: hold, duration: "2 s"}]\n',
     )
-    base, loaded = loader.load("afit_simsat"), loader.load(mine)
+    base = loader.load("afit_simsat")
+    loaded = loader.load(mine)
     assert (loaded.name, loaded.title) == ("mine", "Mine")
     assert loaded.exposure == base.exposure.model_copy(update={"frames": 3})
     led = base.light.led.model_copy(update={"scatter": 0.01})
@@ -732,7 +895,9 @@ def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
 
 def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path) -> None:
     surface = "light: {surface: {kind: sphere, apex: 1 m, radius: 90 cm}}"
-    loaded = loader.load(written(tmp_path, "mine.yaml", f"schema: 1\nbase: afit_simsat\n{surface}\n"))
+    loaded = loader.load(
+        written(tmp_path, "mine.yaml", f"schema: 1\nbase: afit_simsat\n{surface}\n")
+    )
     assert loaded.light.surface == light.SurfaceConfig.model_validate(
         {"kind": "sphere", "apex": "1 m", "radius": "90 cm"}
     )
@@ -750,7 +915,11 @@ def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -
     """And the files that it names are those beside itself, not beside the scene on top of it."""
     model = (SCENES / "vehicles" / "simsat.xml").read_text()
     written(tmp_path, "below/own.xml", model)
-    written(tmp_path, "below/lower.yaml", "schema: 1\nbase: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n")
+    written(
+        tmp_path,
+        "below/lower.yaml",
+        "schema: 1\nbase: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n",
+    )
     mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: below/lower.yaml\ntitle: Mine on top\n")
     loaded = loader.load(mine)
     assert loaded.vehicle.model == str(tmp_path / "below" / "own.xml")
@@ -794,18 +963,30 @@ def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
 
 def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None:
     """Its own where it is above, the base's where it is there; a section between is in both."""
-    lower = written(tmp_path, "lower.yaml", "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n")
-    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
+    lower = written(
+        tmp_path,
+        "lower.yaml",
+        "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n",
+    )
+    mine = written(
+        tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n"
+    )
     says = "exposure.frames: 0 is not allowed; allowed: greater than or equal to 1"
     assert complaint(mine) == f"{says} ({lower}, line 4)"
-    mine.write_text("schema: 1\nbase: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
+    mine.write_text(
+        "schema: 1\nbase: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n"
+    )
     assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 7)"
     assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (overrides)"
 
 
 def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
     """The base has a first element with a duration; but this list has taken its place."""
-    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nmotion:\n  maneuver:\n    - {kind: hold}\n")
+    mine = written(
+        tmp_path,
+        "mine.yaml",
+        "schema: 1\nbase: afit_simsat\nmotion:\n  maneuver:\n    - {kind: hold}\n",
+    )
     assert complaint(mine) == f"motion.maneuver.0.duration: missing ({mine}, line 5)"
 
 
@@ -827,9 +1008,14 @@ def test_what_the_scene_says_stands_above_its_camera_s_preset(tmp_path: Path) ->
             "preset: ec655\n  width_px: 640\n  detector: {read_noise_e: 9}\n  shutter: {kind: global}",
         )
     )
-    plain, mine = loader.load("shefex2").camera, loader.load(path).camera
+    plain = loader.load("shefex2").camera
+    mine = loader.load(path).camera
     assert (mine.width_px, mine.detector.read_noise_e, mine.shutter.kind) == (640, 9.0, "global")
-    assert (plain.width_px, plain.detector.read_noise_e, plain.shutter.kind) == (659, 14.7, "interline")
+    assert (plain.width_px, plain.detector.read_noise_e, plain.shutter.kind) == (
+        659,
+        14.7,
+        "interline",
+    )
     changed = {"width_px": 640, "shutter": mine.shutter, "detector": mine.detector}
     assert mine == plain.model_copy(update=changed)
     assert mine.detector == plain.detector.model_copy(update={"read_noise_e": 9.0})
@@ -861,7 +1047,10 @@ def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, f
         ("0 m", "camera.focus: '0 m' is not allowed; allowed: greater than 0"),
         ("-33 in", "camera.focus: '-33 in' is not allowed; allowed: greater than 0"),
         ("nan m", "camera.focus: 'nan m' is not allowed"),
-        ("far", "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity"),
+        (
+            "far",
+            "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity",
+        ),
         ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
     ],
 )
@@ -920,7 +1109,9 @@ def test_bytes_that_are_no_text_are_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["nosuch", "nosuch.yaml", "scenes/nosuch", "", "."])
 def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
-    with pytest.raises(InputError, match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2"):
+    with pytest.raises(
+        InputError, match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2"
+    ):
         loader.load(name)
 
 
@@ -933,7 +1124,9 @@ def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
 
 def kinds(union: object) -> set[str]:
     """The kinds of a discriminated union."""
-    return {get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(union)[0])}
+    return {
+        get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(union)[0])
+    }
 
 
 def test_every_algorithm_that_the_schema_names_exists() -> None:
@@ -942,7 +1135,9 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert kinds(leds.Drive) == set(DRIVES)
     assert set(vehicle.CmgsConfig.model_fields["steering"].annotation.__args__) == set(STEERING)
     assert kinds(camera.Psf) == set(PSFS)
-    assert kinds(get_args(camera.CameraConfig.model_fields["vignetting"].annotation)[0]) == set(VIGNETTING)
+    assert kinds(get_args(camera.CameraConfig.model_fields["vignetting"].annotation)[0]) == set(
+        VIGNETTING
+    )
     assert kinds(Lobe) == set(LOBES)
     assert kinds(light.Glow) == set(BACKGROUNDS)
     assert kinds(motion.JitterPart) == set(SPECTRA)

@@ -13,7 +13,9 @@ from skysim.scene import loader, scene
 
 
 def loaded(**sets: str) -> scene.Scene:
-    return loader.load("afit_simsat", {key.replace("__", "."): value for key, value in sets.items()})
+    return loader.load(
+        "afit_simsat", {key.replace("__", "."): value for key, value in sets.items()}
+    )
 
 
 # --- units --------------------------------------------------------------------------------------------------
@@ -30,7 +32,8 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         " air_current: {rms: [1 mN m, 2 mN m, 3 mN m], correlation: 900 ms}}",
         motion__control="{law: pd, actuators: wheels, desaturation: {start: 1.7 N m s, stop: 800 mN m s, time: 5 s}}",
     )
-    vehicle, told = given.vehicle, given.motion.control
+    vehicle = given.vehicle
+    told = given.motion.control
     assert vehicle.wheels is not None
     assert vehicle.fans is not None
     assert vehicle.cmgs is not None
@@ -76,7 +79,10 @@ WRONG = [
         {"motion.control": "{actuators: wheels}"},
         "motion.control.actuators: requires the section vehicle.wheels",
     ),
-    ({"motion.control": "{feedback: imu}"}, "motion.control.feedback: imu requires the section vehicle.imu"),
+    (
+        {"motion.control": "{feedback: imu}"},
+        "motion.control.feedback: imu requires the section vehicle.imu",
+    ),
     (
         {"motion.control": "{feedback: filter}", "vehicle.imu": "{}"},
         "motion.control.feedback: filter requires the section filter",
@@ -114,14 +120,19 @@ WRONG = [
     ),
     ({"motion.control": "none"}, "a maneuver requires a controller, such as control: pid"),
     (
-        {"motion.maneuver": "[{kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms, caught_after: 40 ms}]"},
+        {
+            "motion.maneuver": "[{kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms, caught_after: 40 ms}]"
+        },
         "caught_after: 0.04 s is before the impulse ends",
     ),
     ({"vehicle.wheels": "{coulomb: 2 mN}"}, "'2 mN' is not a torque"),
     ({"vehicle.drag": "{viscous: 0.1}"}, "0.1 has no unit"),
     ({"vehicle.cmgs": "{steering: moore_penrose}"}, "'pseudo_inverse' or 'singularity_robust'"),
     ({"vehicle.wheels": "{speed_limit: 3000}"}, "did you mean speed_limit_rpm?"),
-    ({"vehicle.disturbances": "{air_current: {rms: [0 N m, 0 N m, -1 N m]}}"}, "greater than or equal to 0"),
+    (
+        {"vehicle.disturbances": "{air_current: {rms: [0 N m, 0 N m, -1 N m]}}"},
+        "greater than or equal to 0",
+    ),
 ]
 
 
@@ -153,9 +164,21 @@ def written(folder: Path, name: str, **tree: object) -> Path:
 def test_a_scene_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
     below = loader.load("afit_simsat")
     mine = loader.load(
-        written(tmp_path, "mine", base="afit_simsat", seed=77, vehicle={"mass": "90 kg"}, camera={"f_number": 11})
+        written(
+            tmp_path,
+            "mine",
+            base="afit_simsat",
+            seed=77,
+            vehicle={"mass": "90 kg"},
+            camera={"f_number": 11},
+        )
     )
-    assert (mine.seed, mine.vehicle.mass_kg, mine.camera.f_number, mine.name) == (77, 90, 11, "mine")
+    assert (mine.seed, mine.vehicle.mass_kg, mine.camera.f_number, mine.name) == (
+        77,
+        90,
+        11,
+        "mine",
+    )
     assert mine.vehicle.inertia_kg_m2 == below.vehicle.inertia_kg_m2
     assert mine.camera.focal_length_m == below.camera.focal_length_m
     assert (mine.light, mine.motion, mine.title) == (below.light, below.motion, below.title)
@@ -177,7 +200,8 @@ def test_a_section_of_another_kind_and_a_list_replace_and_null_switches_off(tmp_
 
 def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path) -> None:
     """The base's vehicle is beside the base, though the scene is elsewhere."""
-    lab, campaign = tmp_path / "lab", tmp_path / "campaign"
+    lab = tmp_path / "lab"
+    campaign = tmp_path / "campaign"
     lab.mkdir()
     campaign.mkdir()
     model = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
@@ -189,7 +213,9 @@ def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path)
 
 def test_a_base_that_is_none_is_told_with_its_place(tmp_path: Path) -> None:
     path = written(tmp_path, "mine", title="mine", base="nothing")
-    with pytest.raises(InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"):
+    with pytest.raises(
+        InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"
+    ):
         loader.load(path)
 
 
@@ -203,8 +229,12 @@ def test_a_scene_is_not_its_own_base(tmp_path: Path) -> None:
 def test_a_slip_is_found_in_the_file_where_it_stands(tmp_path: Path) -> None:
     written(tmp_path, "below", base="afit_simsat", exposure={"time": "3 kg"})
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}})
-    with pytest.raises(InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"):
+    with pytest.raises(
+        InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"
+    ):
         loader.load(above)
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {}})
-    with pytest.raises(InputError, match=r"exposure.time: '3 kg' is not a time.*below.yaml, line 4\)"):
+    with pytest.raises(
+        InputError, match=r"exposure.time: '3 kg' is not a time.*below.yaml, line 4\)"
+    ):
         loader.load(above)

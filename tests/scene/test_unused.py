@@ -17,9 +17,8 @@ from skysim.tracking.factory import solve_frame
 SMALL = {"exposure.frames": "1", "camera.width_px": "400", "camera.height_px": "300"}
 IMU = "{gyro: {bias_deg_h: 0}, accelerometer: {bias_ug: 0}}"
 CMGS = "{gimbal_rate_limit_deg_s: 5, steering: pseudo_inverse}"
-BOARDS = (
-    "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 1, leds: [0, 2, 4, 7, 8]}]}"
-)
+BOARD = "{azimuth_deg: 0, tilt_deg: 1, leds: [0, 2, 4, 7, 8]}"
+BOARDS = f"{{kind: patch_boards, cap_deg: 27, pitch: 8 mm, boards: [{BOARD}]}}"
 SPREAD = "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, spacing: 60 mm}"
 PANEL = (
     "{kind: lcd, pixels: [400, 300], pitch: 2 mm, points: {kind: celestial, cap_deg: 10, count: 20,"
@@ -38,7 +37,10 @@ class Case(NamedTuple):
     useful: dict[str, str]
 
 
-DOME, SKY, BENCH, CODED = "afit_simsat", "shefex2", "collimated_display", "coded_spiral"
+DOME = "afit_simsat"
+SKY = "shefex2"
+BENCH = "collimated_display"
+CODED = "coded_spiral"
 MANY = "{kind: fibonacci, count: 700, cap_deg: 34}"
 DENSE = {"light.layout.count": "4000"}  # for the small field of these tests
 TWO_LEVELS = {"light.layout.levels": "[1, 0.5]"}
@@ -51,20 +53,40 @@ WARMING = {
     "thermal.temperature": "{kind: linear, start_c: 21, rate_c_h: 30}",
 }
 STEADY = {"thermal.temperature": "{kind: steady, temperature_c: 25}"}
-MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
+MOON = {
+    "light.bodies": "{}",
+    "start_time": "2012-06-24T21:00:00",
+    "motion.start": "{ra_deg: 154.5, dec_deg: 5}",
+}
 ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97}"
-AIR = {"light.air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T21:00:00"}
+AIR = {
+    "light.air": "{}",
+    "site": "{latitude_deg: 53, longitude_deg: 9}",
+    "start_time": "2012-06-24T21:00:00",
+}
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
     Case(DOME, {}, "tracker.limit_mag", "4", {}),
     Case(SKY, {}, "tracker.assumed_camera_body", "[1 m, 0 m, 0 m]", {}),
     Case(SKY, {}, "tracker.options", "{a: 1}", {"tracker.name": "tetra3rs"}),
     Case(SKY, {}, "tracker.time_limit", "3 s", {"tracker.name": "tetra3rs"}),
-    Case(CODED, {"tracker.name": "guest"}, "tracker.decoder", "{gate_px: 40}", {"tracker.name": "own"}),
+    Case(
+        CODED,
+        {"tracker.name": "guest"},
+        "tracker.decoder",
+        "{gate_px: 40}",
+        {"tracker.name": "own"},
+    ),
     Case(CODED, DENSE, "tracker.identifier", "pyramid", {"tracker.decoder": "null"}),
     Case(SKY, {}, "tracker.brightness_sigma", "0.2", {}),
     Case(CODED, DENSE | TWO_LEVELS, "tracker.brightness_sigma", "0.2", {"tracker.decoder": "null"}),
-    Case(DOME, BY_LEVELS | {"tracker.name": "guest"}, "tracker.brightness_sigma", "0.2", {"tracker.name": "own"}),
+    Case(
+        DOME,
+        BY_LEVELS | {"tracker.name": "guest"},
+        "tracker.brightness_sigma",
+        "0.2",
+        {"tracker.name": "own"},
+    ),
     Case(
         DOME,
         BY_LEVELS | {"tracker.identifier": "saa"},
@@ -81,7 +103,9 @@ CASES = [
         {"light.led.code": "{kind: cyclic, bit_time: 20 ms}"},
     ),
     Case(SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}),
-    Case("simsat_bump", {"tracker.name": "tetra3rs"}, "tracker.gyro", "true", {"tracker.name": "own"}),
+    Case(
+        "simsat_bump", {"tracker.name": "tetra3rs"}, "tracker.gyro", "true", {"tracker.name": "own"}
+    ),
     Case(
         SKY,
         {"tracker.name": "tetra3rs"},
@@ -89,7 +113,13 @@ CASES = [
         "7",
         {"tracker.exposure_control": "{mean_dn: 150, longest: 50 ms}"},
     ),
-    Case(DOME, {"tracker.detector": "thesis"}, "tracker.min_area_px", "9", {"tracker.detector": "threshold"}),
+    Case(
+        DOME,
+        {"tracker.detector": "thesis"},
+        "tracker.min_area_px",
+        "9",
+        {"tracker.detector": "threshold"},
+    ),
     Case(
         DOME,
         {"tracker.survey": "{led_sigma: 0 m, lever_sigma: 0 m}"},
@@ -108,7 +138,9 @@ CASES = [
     ),
     Case(
         DOME,
-        FLAT | DIRECT | {"light.layout": PANEL, "light.led.aging": "{hours: 9000, life_hours: 30000}"},
+        FLAT
+        | DIRECT
+        | {"light.layout": PANEL, "light.led.aging": "{hours: 9000, life_hours: 30000}"},
         "light.led.aging.scatter",
         "0.2",
         {},
@@ -137,9 +169,27 @@ CASES = [
         {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
     ),
     Case(SKY, {}, "camera.baffle", "{angle_deg: [20, 90], pst: [1e-6, 1e-9]}", MOON),
-    Case(SKY, {"camera.detector.dark_e_s": "0"}, "camera.detector.dsnu", "0.5", {"camera.detector.dark_e_s": "20"}),
-    Case(SKY, {"camera.detector.hot_e_s": "0"}, "camera.detector.hot_pixels", "0.01", {"camera.detector.hot_e_s": "9"}),
-    Case(SKY, {"camera.detector.hot_pixels": "0"}, "camera.detector.hot_e_s", "9", {"camera.detector.hot_pixels": "1"}),
+    Case(
+        SKY,
+        {"camera.detector.dark_e_s": "0"},
+        "camera.detector.dsnu",
+        "0.5",
+        {"camera.detector.dark_e_s": "20"},
+    ),
+    Case(
+        SKY,
+        {"camera.detector.hot_e_s": "0"},
+        "camera.detector.hot_pixels",
+        "0.01",
+        {"camera.detector.hot_e_s": "9"},
+    ),
+    Case(
+        SKY,
+        {"camera.detector.hot_pixels": "0"},
+        "camera.detector.hot_e_s",
+        "9",
+        {"camera.detector.hot_pixels": "1"},
+    ),
     Case(SKY, {}, "camera.detector.dark_doubling_c", "5", {"camera.detector.temperature_c": "30"}),
     Case(
         SKY,
@@ -159,7 +209,11 @@ CASES = [
         {"camera.detector.prnu": "0.01"},
     ),
     Case(
-        SKY, {"camera.detector.noise": "false"}, "camera.detector.blooming", "column", {"camera.detector.noise": "true"}
+        SKY,
+        {"camera.detector.noise": "false"},
+        "camera.detector.blooming",
+        "column",
+        {"camera.detector.noise": "true"},
     ),
     Case(DOME, {}, "camera.detector.anti_blooming", "0.5", {"camera.detector.blooming": "column"}),
     Case(DOME, {}, "site.latitude_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
@@ -183,7 +237,13 @@ CASES = [
     Case(SKY, AIR, "light.air.seeing_arcsec", "1", {**AIR, "camera.focal_length": "200 mm"}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
-    Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),
+    Case(
+        DOME,
+        {"vehicle.imu": IMU},
+        "vehicle.imu.gyro.bias_time",
+        "9 s",
+        {"vehicle.imu.gyro.bias_deg_h": "1"},
+    ),
     Case(
         DOME,
         {"vehicle.imu": IMU},
@@ -220,8 +280,12 @@ def test_a_key_without_effect_is_refused(case: Case) -> None:
 
 def test_every_rule_has_a_case() -> None:
     """But the one for a map, which needs a file (below)."""
-    covered = {rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)}
-    covered |= {rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys}  # set with its section
+    covered = {
+        rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)
+    }
+    covered |= {
+        rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys
+    }  # set with its section
     missing = [rule.keys for rule in unused.RULES if rule.reason not in covered]
     assert missing == []
 
@@ -243,11 +307,18 @@ def outcome(scene: str, settings: dict[str, str]) -> tuple[np.ndarray, np.ndarra
     return frame.image_dn, solved, flight.trajectory().lab_from_body[-1].as_quat()
 
 
-SAMPLE = ("tracker.limit_mag", "tracker.survey.surface_seed", "light.led.pwm_period", "camera.detector.dark_doubling_c")
+SAMPLE = (
+    "tracker.limit_mag",
+    "tracker.survey.surface_seed",
+    "light.led.pwm_period",
+    "camera.detector.dark_doubling_c",
+)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case.key in SAMPLE], ids=lambda case: case.key)
+@pytest.mark.parametrize(
+    "case", [case for case in CASES if case.key in SAMPLE], ids=lambda case: case.key
+)
 def test_a_refused_key_changes_neither_motion_nor_frame_nor_solution(case: Case) -> None:
     check_no_effect(case)
 
@@ -268,7 +339,8 @@ def check_no_effect(case: Case) -> None:
         settings |= {case.key: "{}"}
     if case.key == "light.layout.lit":
         settings |= {"light.layout": BOARDS}
-    plain, changed = outcome(case.scene, settings), outcome(case.scene, settings | {case.key: case.value})
+    plain = outcome(case.scene, settings)
+    changed = outcome(case.scene, settings | {case.key: case.value})
     for one, other in zip(plain, changed, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -281,7 +353,8 @@ def check_no_effect(case: Case) -> None:
 def test_where_it_is_allowed_it_changes_something(case: Case) -> None:
     """Else the test above could not fail."""
     settings = SMALL | {"exposure.first": "50 ms"} | case.settings | case.useful
-    plain, changed = outcome(case.scene, settings), outcome(case.scene, settings | {case.key: case.value})
+    plain = outcome(case.scene, settings)
+    changed = outcome(case.scene, settings | {case.key: case.value})
     assert any((one != other).any() for one, other in zip(plain, changed, strict=True))
 
 
@@ -292,14 +365,21 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_key_of_the_file_is_refused_with_its_line(tmp_path: Path) -> None:
-    path = written(tmp_path, "base: afit_simsat\nlight:\n  led:\n    drive: {kind: direct}\n    pwm_period: 2 ms\n")
-    with pytest.raises(InputError, match=r"light.led.pwm_period: has no effect.*mine.yaml, line 6\)"):
+    path = written(
+        tmp_path,
+        "base: afit_simsat\nlight:\n  led:\n    drive: {kind: direct}\n    pwm_period: 2 ms\n",
+    )
+    with pytest.raises(
+        InputError, match=r"light.led.pwm_period: has no effect.*mine.yaml, line 6\)"
+    ):
         loader.load(path)
 
 
 def test_a_key_of_a_base_or_a_preset_is_tolerated(tmp_path: Path) -> None:
     """The base has pwm_period and clock, the preset lu205c dark_doubling_c without a temperature."""
-    loaded = loader.load(written(tmp_path, "base: afit_simsat\nlight: {led: {drive: {kind: direct}}}\n"))
+    loaded = loader.load(
+        written(tmp_path, "base: afit_simsat\nlight: {led: {drive: {kind: direct}}}\n")
+    )
     assert loaded.light.led.pwm_period_s == 1e-3  # type: ignore[union-attr]
     assert loaded.light.led.clock.offset_ppm == 2000  # type: ignore[union-attr]
     assert loaded.camera.detector.dark_doubling_c != 7
@@ -326,7 +406,9 @@ def test_with_a_map_the_survey_has_no_effect(tmp_path: Path) -> None:
     """But for a solver that uses the surveyed surface."""
     (tmp_path / "leds.ecsv").write_text("")
     own = written(tmp_path, "base: afit_simsat_ideal\ntracker: {map: leds.ecsv}\n")
-    with pytest.raises(InputError, match=r"light.surface.error: has no effect: tracker.map replaces the survey"):
+    with pytest.raises(
+        InputError, match=r"light.surface.error: has no effect: tracker.map replaces the survey"
+    ):
         loader.load(own, {"light.surface.error": "1 mm"})
     assert loader.load(own, {"light.surface.error": "1 mm", "tracker.solver": "thesis"})
 

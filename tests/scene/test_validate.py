@@ -48,7 +48,9 @@ def faults(kind: str, tree: Any) -> list[str]:
 @pytest.mark.parametrize("kind", SHIPPED)
 def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
-    assert published == json_schema.json_schema(kind), f"skysim validate --schema {kind} > data/schema/{kind}.json"
+    assert published == json_schema.json_schema(kind), (
+        f"skysim validate --schema {kind} > data/schema/{kind}.json"
+    )
     jsonschema.Draft202012Validator.check_schema(published)
     for path in SHIPPED[kind]:
         tree = yaml.load(path.read_text(), Plain)
@@ -84,17 +86,21 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
     newer.write_text("schema: 3\nbase: shefex2\nfuture: 1\n")
     mine.write_text("schema: 1\nbase: newer.yaml\n")
     for path in (newer, mine):
-        with pytest.raises(InputError, match=r"^schema: version 3 is newer than skysim .*newer\.yaml, line 1\)$"):
+        with pytest.raises(
+            InputError, match=r"^schema: version 3 is newer than skysim .*newer\.yaml, line 1\)$"
+        ):
             load(path)
     study.write_text("title: T\nschema: 0\n")
     with pytest.raises(
-        InputError, match=r"^schema: version 0 is no longer supported; allowed: 1 \(.*study\.yaml, line 2\)$"
+        InputError,
+        match=r"^schema: version 0 is no longer supported; allowed: 1 \(.*study\.yaml, line 2\)$",
     ):
         loader.load(study)
 
 
 def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Path) -> None:
-    path, above = tmp_path / "mine.yaml", tmp_path / "above.yaml"
+    path = tmp_path / "mine.yaml"
+    above = tmp_path / "above.yaml"
     path.write_text("base: shefex2\n")
     above.write_text("schema: 1\nbase: mine.yaml\n")
     says = f"schema: missing; add the line schema: 1 ({path})"
@@ -116,7 +122,8 @@ def test_a_shipped_camera_is_checked_by_its_name() -> None:
 
 @pytest.mark.slow
 def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> None:
-    broken, xml = tmp_path / "broken.ecsv", tmp_path / "a.xml"
+    broken = tmp_path / "broken.ecsv"
+    xml = tmp_path / "a.xml"
     broken.write_text("# %ECSV 1.0\nnothing\n")
     for path, what in (
         (SCENES / "shefex2.yaml", "a scene of 45735 lights and 40 frames"),
@@ -157,10 +164,13 @@ def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_a_wrong_key_of_a_trial_is_told_with_those_that_are_allowed(tmp_path: Path) -> None:
-    path, text = tmp_path / "mine.yaml", (SCENES / "studies/false_stars.yaml").read_text()
+    path = tmp_path / "mine.yaml"
+    text = (SCENES / "studies/false_stars.yaml").read_text()
     path.write_text(text.replace("trial.false_lights", "trial.false_light"))
     says = r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
-    assert re.fullmatch(rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path).fault)
+    assert re.fullmatch(
+        rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path).fault
+    )
 
 
 def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:
@@ -172,7 +182,9 @@ def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_command_refuses_with_2_and_prints_a_schema() -> None:
-    done = CliRunner().invoke(main.app, ["validate", str(SCENES / "shefex2.yaml"), "nothing.yaml", "--json"])
+    done = CliRunner().invoke(
+        main.app, ["validate", str(SCENES / "shefex2.yaml"), "nothing.yaml", "--json"]
+    )
     assert done.exit_code == 2
     assert [bool(one["fault"]) for one in json.loads(done.stdout)] == [False, True]
     assert (

@@ -39,7 +39,8 @@ def level(lab: Lab, altitude_deg: float) -> Rotation:
     assert atmosphere is not None
     north, _, up = atmosphere.air.at(lab.scene.start_time).axes
     h = np.radians(altitude_deg)
-    z, y = -np.cos(h) * north + np.sin(h) * up, -np.sin(h) * north - np.cos(h) * up
+    z = -np.cos(h) * north + np.sin(h) * up
+    y = -np.sin(h) * north - np.cos(h) * up
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z]))
 
 
@@ -57,7 +58,9 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
     lab = lab_of()
     through = truth_at(lab, 30.0).sources
-    airless = tuple(light for light in lab.camera.lights if not isinstance(light, Atmosphere | Skyline))
+    airless = tuple(
+        light for light in lab.camera.lights if not isinstance(light, Atmosphere | Skyline)
+    )
     without = render_toward(lab.with_camera(lights=airless), level(lab, 30.0))[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
     assert len(both) > 30
@@ -105,9 +108,12 @@ def test_stars_twinkle_by_frame_and_star() -> None:
         _, a, b = np.intersect1d(seen.id, still.id, return_indices=True)
         ratios.append(seen.electrons[a] / still.electrons[b])
     ratio = np.concatenate(ratios)
-    camera, exposure_s = lab.scene.camera, lab.scene.exposure.time_s
+    camera = lab.scene.camera
+    exposure_s = lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = scintillation.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[0]
+    variance = scintillation.variance(
+        mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9
+    )[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 
@@ -115,7 +121,8 @@ def test_stars_twinkle_by_frame_and_star() -> None:
 @pytest.mark.slow
 def test_seeing_widens_images_by_its_variance() -> None:
     """20" at the zenith before a lens of 200 mm; at 30 degrees of altitude 2^0.6 times that."""
-    keys, areas = {"camera.focal_length": "200 mm", "camera.f_number": "4"}, []
+    keys = {"camera.focal_length": "200 mm", "camera.f_number": "4"}
+    areas = []
     for seeing in ({}, {"light.air.seeing_arcsec": "20"}):
         truth = truth_at(lab_of(**keys, **seeing), 30.0).sources
         assert len(truth.id)
@@ -128,11 +135,16 @@ def test_air_needs_a_site() -> None:
     with pytest.raises(InputError, match=r"light\.air: requires site\.longitude_deg"):
         load("shefex2", {"light.air": "{}"})
     with pytest.raises(InputError, match="conflicts with a background of kind sky"):
-        load("shefex2", AIR | {"light.air.glow": "{}", "background": "[{kind: sky, mag_arcsec2: 21}]"})
+        load(
+            "shefex2",
+            AIR | {"light.air.glow": "{}", "background": "[{kind: sky, mag_arcsec2: 21}]"},
+        )
     with pytest.raises(InputError, match="outside 1972 to 2100"):
         load("shefex2", AIR | {"light.air.glow": "{}", "start_time": "1960-01-01T00:00:00"})
     with pytest.raises(InputError, match="outside the circle"):
-        load("shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"})
+        load(
+            "shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"}
+        )
 
 
 def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float, float]:
@@ -150,8 +162,11 @@ def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float,
 @pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
 def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
-    told, later = {"tracker.refraction": "true"}, {"exposure.first": "600 s"}
-    without = errors_arcsec(build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
+    told = {"tracker.refraction": "true"}
+    later = {"exposure.first": "600 s"}
+    without = errors_arcsec(
+        build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg
+    )
     undone = errors_arcsec(lab_of(**told), altitude_deg)
     assert undone[0] < without[0] + 1.0
     assert undone[1] == pytest.approx(without[1], abs=0.02)

@@ -62,7 +62,9 @@ def bumped() -> Bumped:
 
 
 @pytest.mark.slow
-def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The first frame is solved once more before, and that report is none of the flight's."""
     solved: list[Frame] = []
     solve = factory.solve_frame
@@ -72,7 +74,11 @@ def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(monkeypatch
         return solve(tracker, frame, **known)
 
     monkeypatch.setattr(factory, "solve_frame", watched)
-    shots = shots_of(changed(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]"))
+    shots = shots_of(
+        changed(
+            exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]"
+        )
+    )
     assert [frame.index for frame in solved] == [0, 0, 1]
     assert solved[0] is solved[1] is shots[0].frame
     assert len(shots) == 2
@@ -110,11 +116,13 @@ def test_every_frame_is_solved_and_used(bumped: Bumped) -> None:
 @pytest.mark.slow
 def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Bumped) -> None:
     """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
-    telemetry, path = bumped.telemetry, bumped.flight.trajectory()
+    telemetry = bumped.telemetry
+    path = bumped.flight.trajectory()
     excess = np.maximum(np.abs(np.degrees(path.rate_body_rad_s[:, 2])) - 10, 0)
     missed_deg = np.trapezoid(excess, path.t_s)
     lost = imu_error_deg(telemetry)
-    before, after = lost[telemetry.t_s < 1.5], lost[telemetry.t_s > AFTER_S]
+    before = lost[telemetry.t_s < 1.5]
+    after = lost[telemetry.t_s > AFTER_S]
     assert missed_deg > 0.3
     assert np.abs(before).max() < 0.01
     # Its own errors and the Earth's turning, 15 deg/h, are some hundredths of a degree in 6 s.
@@ -146,7 +154,9 @@ def test_the_filter_of_an_hour_s_flight_claims_what_its_laboratory_errs_by() -> 
     scene, _ = resolve_point(spec, {"exposure.frames": 150, "exposure.rate_hz": 5})
     telemetry = simulate_motion(scene).telemetry()
     assert telemetry.sigma_bias_rad_s is not None
-    bias_error = np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s) / telemetry.sigma_bias_rad_s
+    bias_error = (
+        np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s) / telemetry.sigma_bias_rad_s
+    )
     turning = telemetry.t_s > 10
     assert in_sigma(telemetry)[turning].max() < 4
     assert bias_error[turning].max() < 3
@@ -237,7 +247,9 @@ def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
 def test_the_loop_with_latency_survives_the_accident() -> None:
     flight = open_flight(changed(**EARLY | EXACT_MAP, filter__latency="0.2 s"))
     shots = list(flight.shots())
-    assert [shot.update_status for shot in shots] == ["used"] * 7 + [""]  # the last comes after the motion's end
+    assert [shot.update_status for shot in shots] == ["used"] * 7 + [
+        ""
+    ]  # the last comes after the motion's end
     telemetry = flight.telemetry()
     assert in_sigma(telemetry)[1:].max() < 4
     assert off_deg(telemetry)[telemetry.t_s > 7].max() < 0.05
@@ -245,7 +257,9 @@ def test_the_loop_with_latency_survives_the_accident() -> None:
 
 def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
     """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
-    flight = open_flight(changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}'))
+    flight = open_flight(
+        changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
+    )
     shots = list(flight.shots())
     assert "used" not in [shot.update_status for shot in shots]
     assert [shot.update_status for shot in shots] == [shot.report.attitude.status for shot in shots]
@@ -256,7 +270,9 @@ def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
 
 def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
     """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
-    flight = open_flight(changed("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4"))
+    flight = open_flight(
+        changed("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
+    )
     assert [shot.update_status for shot in flight.shots()] == ["used"] * 4
     telemetry = flight.telemetry()
     assert in_sigma(telemetry)[1:].max() < 4
@@ -276,5 +292,7 @@ def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
         assert getattr(one, name).tobytes() == getattr(same, name).tobytes()
         assert getattr(one, name).tobytes() != getattr(other, name).tobytes()
     for name in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
-        quaternions = [getattr(telemetry, name).as_quat().tobytes() for telemetry in (one, same, other)]
+        quaternions = [
+            getattr(telemetry, name).as_quat().tobytes() for telemetry in (one, same, other)
+        ]
         assert quaternions[0] == quaternions[1] != quaternions[2]

@@ -16,7 +16,12 @@ from scipy.spatial.transform import Rotation
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
-from skysim.dynamics.controllers.interface import ControllerInput, ControllerSetup, check_torque, torque_of_reply
+from skysim.dynamics.controllers.interface import (
+    ControllerInput,
+    ControllerSetup,
+    check_torque,
+    torque_of_reply,
+)
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import runner, setups, store
@@ -73,7 +78,14 @@ for line in sys.stdin:
 SHORT = {
     "motion.control": {"law": "pd", "actuators": "wheels", "bandwidth_rad_s": 2.5, "damping": 0.7},
     "motion.maneuver": [
-        {"kind": "slew", "roll_deg": 10, "pitch_deg": -6, "yaw_deg": 15, "rate_deg_s": 4, "acceleration_deg_s2": 3}
+        {
+            "kind": "slew",
+            "roll_deg": 10,
+            "pitch_deg": -6,
+            "yaw_deg": 15,
+            "rate_deg_s": 4,
+            "acceleration_deg_s2": 3,
+        }
     ],
     "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "1.5 s"},
 }
@@ -86,7 +98,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about = tmp_path / "mypd-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mypd\nVersion: 1.0\n")
-    names = "".join(f"{name} = mypd:{name.replace('mine', 'pd')}\n" for name in ("mine", "weak", "crashing"))
+    names = "".join(
+        f"{name} = mypd:{name.replace('mine', 'pd')}\n" for name in ("mine", "weak", "crashing")
+    )
     (about / "entry_points.txt").write_text(f"[skysim.controllers]\n{names}")
     monkeypatch.syspath_prepend(str(tmp_path))
     return tmp_path
@@ -108,14 +122,20 @@ def command(folder: Path, text: str) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On wheels that turn, with drag and disturbances: by a function, an entry point and a program, to 1e-12."""
     from mypd import pd  # type: ignore[import-not-found]
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), *sys.path]))
     built_in = flown()
     law = {"motion.control.law": "mine"}
-    routes = {"function": flown(controller=pd), "entry point": flown(changes=law), "name": flown(controller="mine")}
+    routes = {
+        "function": flown(controller=pd),
+        "entry point": flown(changes=law),
+        "name": flown(controller="mine"),
+    }
     (installed / "mypd-1.0.dist-info/entry_points.txt").write_text("")
     routes["program"] = flown(changes=law, programs=command(installed, PROGRAM))
     assert np.abs(built_in.torque_nm).max() > 0.2
@@ -123,12 +143,18 @@ def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(installed: Path, monke
     for route, mine in routes.items():
         off = (built_in.lab_from_body.inv() * mine.lab_from_body).magnitude()
         assert off.max() < 1e-12, route
-        np.testing.assert_allclose(mine.torque_nm, built_in.torque_nm, rtol=0, atol=1e-11, err_msg=route)
-        np.testing.assert_allclose(mine.rate_body_rad_s, built_in.rate_body_rad_s, rtol=0, atol=1e-12, err_msg=route)
+        np.testing.assert_allclose(
+            mine.torque_nm, built_in.torque_nm, rtol=0, atol=1e-11, err_msg=route
+        )
+        np.testing.assert_allclose(
+            mine.rate_body_rad_s, built_in.rate_body_rad_s, rtol=0, atol=1e-12, err_msg=route
+        )
     np.testing.assert_array_equal(routes["entry point"].torque_nm, routes["name"].torque_nm)
 
 
-def recorder(seen: list[ControllerInput], told: list[ControllerSetup], torque: Any = (0.0, 0.0, 0.0)) -> Callable:
+def recorder(
+    seen: list[ControllerInput], told: list[ControllerSetup], torque: Any = (0.0, 0.0, 0.0)
+) -> Callable:
     def factory(setup: ControllerSetup) -> Callable[[ControllerInput], Any]:
         told.append(setup)
 
@@ -148,9 +174,16 @@ def test_it_gets_what_the_page_says() -> None:
     scene = skysim.load_scene("simsat_slew", SHORT)
     telemetry = flown(controller=recorder(seen, told, (0.0, 0.0, 5.0)))
     (setup,) = told
-    assert (setup.period_s, setup.actuators, setup.feedback, setup.seed) == (0.01, "wheels", "truth", scene.seed)
+    assert (setup.period_s, setup.actuators, setup.feedback, setup.seed) == (
+        0.01,
+        "wheels",
+        "truth",
+        scene.seed,
+    )
     assert (setup.bandwidth_rad_s, setup.damping, setup.rate_limit_rad_s) == (2.5, 0.7, None)
-    np.testing.assert_allclose(setup.inertia_kg_m2, build_lab(scene).vehicle.inertia_kg_m2, rtol=0, atol=0)
+    np.testing.assert_allclose(
+        setup.inertia_kg_m2, build_lab(scene).vehicle.inertia_kg_m2, rtol=0, atol=0
+    )
     assert [now.tick for now in seen] == list(range(len(telemetry.t_s)))
     np.testing.assert_allclose([now.t_s for now in seen], telemetry.t_s, rtol=0, atol=1e-12)
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
@@ -160,10 +193,16 @@ def test_it_gets_what_the_page_says() -> None:
     reference = plan(scene.motion)
     for now in seen[::50]:
         attitude, rate, acceleration = reference.state_at(now.t_s)
-        np.testing.assert_allclose(now.lab_from_ref.as_quat(scalar_first=True), attitude, rtol=0, atol=1e-15)
-        np.testing.assert_array_equal([now.rate_ref_rad_s, now.acceleration_ref_rad_s2], [rate, acceleration])
+        np.testing.assert_allclose(
+            now.lab_from_ref.as_quat(scalar_first=True), attitude, rtol=0, atol=1e-15
+        )
+        np.testing.assert_array_equal(
+            [now.rate_ref_rad_s, now.acceleration_ref_rad_s2], [rate, acceleration]
+        )
     np.testing.assert_array_equal(seen[0].achieved_nm, np.zeros(3))
-    assert seen[1].achieved_nm[2] == pytest.approx(0.6, rel=1e-9)  # the wheels' limit, not the 5 N m asked for
+    assert seen[1].achieved_nm[2] == pytest.approx(
+        0.6, rel=1e-9
+    )  # the wheels' limit, not the 5 N m asked for
 
 
 @pytest.mark.slow
@@ -188,7 +227,9 @@ def test_it_measures_what_the_scene_s_feedback_gives(feedback: str) -> None:
 
 
 def test_set_up_and_input_come_through_json_as_they_were() -> None:
-    setup = ControllerSetup(0.01, np.eye(3) * 1.1, 0.3, None, "ideal", "truth", 3.0, 0.8, 0.6, 5, {"a": 1.5})
+    setup = ControllerSetup(
+        0.01, np.eye(3) * 1.1, 0.3, None, "ideal", "truth", 3.0, 0.8, 0.6, 5, {"a": 1.5}
+    )
     again = ControllerSetup.of_tree(json.loads(json.dumps(setup.as_tree())))
     assert again.as_tree() == setup.as_tree()
     vectors = np.random.default_rng(1).normal(size=(7, 4))
@@ -228,12 +269,15 @@ def test_a_large_torque_is_limited_by_the_actuators() -> None:
 def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
     from mypd import crashing, weak
 
-    with pytest.raises(InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"):
+    with pytest.raises(
+        InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"
+    ):
         flown(controller=crashing)
     with pytest.raises(InputError, match=r"^motion.control.law: weak: KeyError: 'why'$"):
         flown(controller=weak)
     with pytest.raises(
-        InputError, match=r"^motion.control.law: lambda: TypeError: it returned int for the set-up; allo"
+        InputError,
+        match=r"^motion.control.law: lambda: TypeError: it returned int for the set-up; allo",
     ):
         flown(controller=lambda setup: 5)
     with pytest.raises(InputError, match=r"controller: int; allowed: a name, or"):
@@ -242,14 +286,18 @@ def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
 
 @pytest.mark.slow
 def test_an_entry_point_that_fails_is_named_with_its_time(installed: Path) -> None:
-    with pytest.raises(InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"):
+    with pytest.raises(
+        InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"
+    ):
         flown(controller="crashing")
     with pytest.raises(InputError, match=r"^motion.control.law: weak: ValueError: too weak: 3$"):
         flown(controller="weak", changes={"motion.control": {"law": "weak", "options": {"why": 3}}})
 
 
 READY = (
-    "import json, os, sys, time\nsys.stdin.readline(); print('{\"ready\": true}', flush=True)\nsys.stdin.readline()\n"
+    "import json, os, sys, time\n"
+    "sys.stdin.readline(); print('{\"ready\": true}', flush=True)\n"
+    "sys.stdin.readline()\n"
 )
 
 
@@ -275,7 +323,10 @@ def test_a_program_that_fails_is_named_and_ended(text: str, told: str, tmp_path:
     note = f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n"
     control = {"motion.control": {"law": "mine", "time_limit": "0.5 s"}}
     with pytest.raises(InputError, match=told) as raised:
-        flown(changes=control, programs=command(tmp_path, READY.replace("sys.stdin", note + "sys.stdin", 1) + text))
+        flown(
+            changes=control,
+            programs=command(tmp_path, READY.replace("sys.stdin", note + "sys.stdin", 1) + text),
+        )
     assert str(raised.value).startswith("motion.control.law: mine: ")
     assert "\n" not in str(raised.value)
     with pytest.raises(ProcessLookupError):
@@ -286,10 +337,13 @@ def test_a_program_that_fails_is_named_and_ended(text: str, told: str, tmp_path:
 def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
     """Where the motion cannot begin it is not started: a tilt beyond the stop is found before."""
     text = (
-        f"import os\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n" + READY.rpartition("sys.stdin")[0]
+        f"import os\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n"
+        + READY.rpartition("sys.stdin")[0]
     )
     text += "for line in sys.stdin:\n    n = json.loads(line)['tick']\n"
-    programs = command(tmp_path, text + "    print(json.dumps({'tick': n, 'torque_nm': [0, 0, 0]}), flush=True)\n")
+    programs = command(
+        tmp_path, text + "    print(json.dumps({'tick': n, 'torque_nm': [0, 0, 0]}), flush=True)\n"
+    )
 
     def scene(maneuver: list[dict[str, Any]]) -> skysim.Scene:
         changes = {"motion.control": {"law": "mine"}, "motion.maneuver": maneuver}
@@ -309,14 +363,18 @@ def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
     """Or `skysim run`, which checks its plan, would start it twice."""
     started = tmp_path / "started"
     programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
-    lab = build_lab(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), UserParts(programs))
+    lab = build_lab(
+        skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}),
+        UserParts(programs),
+    )
     check(lab)
     assert not started.exists()
 
 
 def test_an_unknown_law_is_told_before_the_motion() -> None:
     with pytest.raises(
-        InputError, match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed, or a program"
+        InputError,
+        match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed, or a program",
     ):
         build_lab(loader.load("simsat_slew", {"motion.control": "lqr"}))
 
@@ -327,7 +385,9 @@ def test_a_program_takes_no_name_that_is_taken(name: str, installed: Path) -> No
         process.program_commands([f"{name}=x"])
 
 
-@pytest.mark.parametrize("reply", [5, None, [], {"tick": 7}, {"torque_nm": [0, 0, 0]}, {"tick": 0, "torque_nm": {}}])
+@pytest.mark.parametrize(
+    "reply", [5, None, [], {"tick": 7}, {"torque_nm": [0, 0, 0]}, {"tick": 0, "torque_nm": {}}]
+)
 def test_a_reply_of_another_form_is_refused_in_one_line(reply: object) -> None:
     with pytest.raises(ValueError, match=r"tick 0|torque_nm") as raised:
         torque_of_reply(reply, 0, 1.0)
@@ -352,7 +412,10 @@ responses: [identified]
 def test_a_study_s_factor_is_a_controller(installed: Path, tmp_path: Path) -> None:
     path = tmp_path / "which.yaml"
     path.write_text(STUDY.replace("mine", "other"))
-    with pytest.raises(InputError, match=r"factors\.law: 'other': motion\.control\.law: unknown law 'other'; allowed:"):
+    with pytest.raises(
+        InputError,
+        match=r"factors\.law: 'other': motion\.control\.law: unknown law 'other'; allowed:",
+    ):
         study_loader.load(path, programs={})
     path.write_text(STUDY)
     plan_ = study_loader.load(path, programs={})
@@ -367,5 +430,7 @@ def test_a_study_s_factor_is_a_controller(installed: Path, tmp_path: Path) -> No
 def test_a_trial_with_another_release_of_a_controller_is_another(installed: Path) -> None:
     scene = loader.load("simsat_slew", {"motion.control": "mine"})
     before = setups.scene_hash(scene)
-    (installed / "mypd-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: mypd\nVersion: 1.1\n")
+    (installed / "mypd-1.0.dist-info/METADATA").write_text(
+        "Metadata-Version: 2.1\nName: mypd\nVersion: 1.1\n"
+    )
     assert setups.scene_hash(scene) != before

@@ -105,7 +105,9 @@ def test_what_is_due_only_after_the_motion_is_not_rendered_for_it(rendered: list
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, FILTERED, {"tracker__exposure_control": "{mean_dn: 150}"}])
 @pytest.mark.parametrize("solves", [False, True])
-def test_a_shot_is_the_frame_that_is_rendered_alone(changes: Mapping[str, str], solves: bool) -> None:
+def test_a_shot_is_the_frame_that_is_rendered_alone(
+    changes: Mapping[str, str], solves: bool
+) -> None:
     """Bit for bit: from a piece of the motion when due, from the whole motion, and from another flight."""
     scene = scene_of("shefex2", 3, **changes)
     flight = open_flight(scene)
@@ -124,7 +126,9 @@ def test_a_shot_is_the_frame_that_is_rendered_alone(changes: Mapping[str, str], 
 def test_a_flight_that_forgets_has_the_same_shots(name: str) -> None:
     """To the last bit: with the filter in the loop, and without."""
     scene = scene_of(name, 6)
-    shots, forgetful = (list(open_flight(scene, keeps_history=keeps).shots()) for keeps in (True, False))
+    shots, forgetful = (
+        list(open_flight(scene, keeps_history=keeps).shots()) for keeps in (True, False)
+    )
     assert images(shots) == images(forgetful)
     for shot, other in zip(shots, forgetful, strict=True):
         assert (shot.camera.name, shot.frame.t_mid_s) == (other.camera.name, other.frame.t_mid_s)
@@ -140,13 +144,17 @@ def test_a_flight_that_forgets_has_the_same_shots(name: str) -> None:
 def test_a_flight_that_forgets_moves_alike() -> None:
     """Nothing of the motion depends on how much is kept; what is older is gone."""
     scene = scene_of("simsat_slew", 3)
-    long, short = open_flight(scene), open_flight(scene, keeps_history=False)
+    long = open_flight(scene)
+    short = open_flight(scene, keeps_history=False)
     while not long.is_over:
         long.step()
         short.step()
-    kept, all_of_it = short.motion.simulation, long.motion.simulation
+    kept = short.motion.simulation
+    all_of_it = long.motion.simulation
     assert len(kept.states) < len(all_of_it.states) / 4
-    for one, other in zip(kept.knots(kept.first_step), all_of_it.knots(kept.first_step), strict=True):
+    for one, other in zip(
+        kept.knots(kept.first_step), all_of_it.knots(kept.first_step), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
 
 
@@ -248,7 +256,9 @@ def test_steps_are_control_periods_and_end_with_the_motion() -> None:
         times_s.append(flight.now_s)
     np.testing.assert_allclose(np.diff(times_s[:-1]), 0.01, rtol=0, atol=1e-12)
     assert times_s[-1] == pytest.approx(flight.duration_s, abs=1e-3)
-    with pytest.raises(InputError, match=r"step: the motion has ended at .* s; allowed: more frames, or endless"):
+    with pytest.raises(
+        InputError, match=r"step: the motion has ended at .* s; allowed: more frames, or endless"
+    ):
         flight.step()
 
 
@@ -256,14 +266,16 @@ def test_steps_are_control_periods_and_end_with_the_motion() -> None:
 def test_steps_are_the_same_flight_as_a_loop_over_shots() -> None:
     """And where there is a filter, each step returns the exposures that updated it."""
     scene = scene_of("shefex2", 3, **FILTERED)
-    stepped, looped = open_flight(scene), open_flight(scene)
+    stepped = open_flight(scene)
+    looped = open_flight(scene)
     updates = []
     while not stepped.is_over:
         updates += stepped.step()
     shots = list(looped.shots())
     assert images(updates) == images(shots)
     assert [shot.update_status for shot in updates] == ["used"] * 3
-    one, other = stepped.telemetry(), looped.telemetry()
+    one = stepped.telemetry()
+    other = looped.telemetry()
     for name in ("t_s", "rate_body_rad_s", "sigma_attitude_rad", "assumed_bias_rad_s"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
@@ -277,16 +289,23 @@ def test_a_torque_turns_the_vehicle_as_eulers_equation_says() -> None:
         flight.step([0.0, 0.0, 0.3])
     state = flight.state
     assert state.t_s == pytest.approx(1.0, abs=1e-9)
-    np.testing.assert_allclose(state.rate_body_rad_s, [0, 0, 0.3 / inertia[2, 2]], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(state.lab_from_body.as_rotvec(), [0, 0, 0.15 / inertia[2, 2]], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        state.rate_body_rad_s, [0, 0, 0.3 / inertia[2, 2]], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        state.lab_from_body.as_rotvec(), [0, 0, 0.15 / inertia[2, 2]], rtol=0, atol=1e-9
+    )
     np.testing.assert_array_equal(flight.telemetry().torque_nm, np.tile([0.0, 0.0, 0.3], (100, 1)))
-    momentum, given = open_flight(scene), np.zeros(3)
+    momentum = open_flight(scene)
+    given = np.zeros(3)
     for _ in range(100):
         # A torque is constant in body axes during a period, in which the vehicle turns by less than a thousandth.
         given += momentum.state.lab_from_body.apply(PUSH_NM) * 0.01
         momentum.step(PUSH_NM)
     state = momentum.state
-    np.testing.assert_allclose(state.lab_from_body.apply(inertia @ state.rate_body_rad_s), given, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        state.lab_from_body.apply(inertia @ state.rate_body_rad_s), given, rtol=2e-3, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("actuators", ["ideal", "wheels"])
@@ -304,9 +323,13 @@ def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(actuat
     inertia = flight.lab.vehicle.inertia_kg_m2[2, 2]
     assert pushed.rate_body_rad_s[2] == pytest.approx(0.2 * 0.5 / inertia, rel=5e-3)
     wheel_nms = -0.2 * 0.5 if actuators == "wheels" else 0.0
-    assert 0.010125 * (pushed.wheel_rad_s[2] + pushed.rate_body_rad_s[2]) == pytest.approx(wheel_nms, abs=2e-4)
+    assert 0.010125 * (pushed.wheel_rad_s[2] + pushed.rate_body_rad_s[2]) == pytest.approx(
+        wheel_nms, abs=2e-4
+    )
     flight.simulate_motion()
-    assert abs(flight.state.rate_body_rad_s[2]) < 0.1 * pushed.rate_body_rad_s[2]  # the controller is back
+    assert (
+        abs(flight.state.rate_body_rad_s[2]) < 0.1 * pushed.rate_body_rad_s[2]
+    )  # the controller is back
 
 
 def test_a_torque_that_cannot_be_given_is_refused() -> None:
@@ -320,7 +343,10 @@ def test_a_torque_that_cannot_be_given_is_refused() -> None:
             flight.step(torque)  # type: ignore[arg-type]
     assert flight.now_s == 0
     prescribed = open_flight(scene_of("afit_simsat", 1, motion__control="prescribed"))
-    with pytest.raises(InputError, match=r"step: a prescribed motion takes no torque; allowed: another motion\.contr"):
+    with pytest.raises(
+        InputError,
+        match=r"step: a prescribed motion takes no torque; allowed: another motion\.contr",
+    ):
         prescribed.step(np.zeros(3))
     prescribed.step()
     assert prescribed.now_s == pytest.approx(0.01)
@@ -332,7 +358,9 @@ def test_a_torque_that_cannot_be_given_is_refused() -> None:
 def test_the_telemetry_of_a_flight_in_progress_has_the_ticks_so_far() -> None:
     scene = scene_of("simsat_bump", 2, exposure__first="0.2 s")
     flight = open_flight(scene)
-    with pytest.raises(InputError, match=r"telemetry: the motion has not begun; allowed: after a step"):
+    with pytest.raises(
+        InputError, match=r"telemetry: the motion has not begun; allowed: after a step"
+    ):
         flight.telemetry()
     for _ in range(17):
         flight.step()
@@ -340,17 +368,27 @@ def test_the_telemetry_of_a_flight_in_progress_has_the_ticks_so_far() -> None:
     np.testing.assert_allclose(part.t_s, 0.01 * np.arange(17), rtol=0, atol=1e-12)
     whole = flight.simulate_motion().telemetry()
     assert len(whole.t_s) > 50
-    for name in ("t_s", "rate_body_rad_s", "torque_nm", "momentum_nms", "sigma_attitude_rad", "bias_rad_s"):
+    for name in (
+        "t_s",
+        "rate_body_rad_s",
+        "torque_nm",
+        "momentum_nms",
+        "sigma_attitude_rad",
+        "bias_rad_s",
+    ):
         np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:17])
     for name in ("lab_from_body", "lab_from_ref", "lab_from_imu", "lab_from_filter"):
-        np.testing.assert_array_equal(getattr(part, name).as_quat(), getattr(whole, name).as_quat()[:17])
+        np.testing.assert_array_equal(
+            getattr(part, name).as_quat(), getattr(whole, name).as_quat()[:17]
+        )
 
 
 def test_the_state_is_that_of_the_trajectory_now() -> None:
     flight = open_flight(scene_of("simsat_slew", 1, exposure__first="0.5 s"))
     for _ in range(20):
         flight.step()
-    state, motion = flight.state, flight.trajectory()
+    state = flight.state
+    motion = flight.trajectory()
     assert state.t_s == flight.now_s == motion.t_s[-1] == pytest.approx(0.2, abs=1e-12)
     assert (state.lab_from_body * motion.lab_from_body[-1].inv()).magnitude() < 1e-15
     np.testing.assert_array_equal(state.rate_body_rad_s, motion.rate_body_rad_s[-1])
@@ -367,7 +405,8 @@ def test_imu_samples_since_a_time_are_the_last_of_all() -> None:
         flight.step()
     so_far = flight.imu_samples()
     flight.simulate_motion()
-    samples, late = flight.imu_samples(), flight.imu_samples(0.5)
+    samples = flight.imu_samples()
+    late = flight.imu_samples(0.5)
     np.testing.assert_array_equal(so_far.angle_rad, samples.angle_rad[: len(so_far.t_s)])
     count = len(late.t_s)
     assert count < len(samples.t_s) / 2
@@ -380,11 +419,15 @@ def test_imu_samples_since_a_time_are_the_last_of_all() -> None:
 
 def test_a_flight_without_history_has_no_telemetry_and_no_frames_of_the_past() -> None:
     flight = open_flight(loader.load("afit_simsat", SLEW), keeps_history=False)
-    with pytest.raises(InputError, match=r"telemetry: this flight keeps no history; allowed: keeps_history=True"):
+    with pytest.raises(
+        InputError, match=r"telemetry: this flight keeps no history; allowed: keeps_history=True"
+    ):
         flight.telemetry()
     while flight.now_s < 0.5:
         flight.step()
-    with pytest.raises(InputError, match=r"shots: the flight has forgotten frame 0; allowed: keeps_history=True"):
+    with pytest.raises(
+        InputError, match=r"shots: the flight has forgotten frame 0; allowed: keeps_history=True"
+    ):
         next(flight.shots())
 
 
@@ -418,16 +461,24 @@ def observed_at(flight: Flight, t_s: float) -> Shot:
 @pytest.mark.slow
 def test_an_observation_is_the_exposure_that_ends_now() -> None:
     """Without noise it is the scheduled one that ends at the same time, in a slew."""
-    scene = loader.load("afit_simsat", SLEW | {"camera.detector.noise": "false", "camera.shutter": "{kind: global}"})
+    scene = loader.load(
+        "afit_simsat", SLEW | {"camera.detector.noise": "false", "camera.shutter": "{kind: global}"}
+    )
     flight = open_flight(scene)
     for index in (0, 3):
         shot = observed_at(flight, 0.11 + 0.1 * index)
         frame, truth = flight.render(index)
-        assert shot.truth.t_s == pytest.approx(truth.t_s, abs=1e-9) == pytest.approx(0.105 + 0.1 * index, abs=1e-9)
+        assert (
+            shot.truth.t_s
+            == pytest.approx(truth.t_s, abs=1e-9)
+            == pytest.approx(0.105 + 0.1 * index, abs=1e-9)
+        )
         assert (shot.truth.cam_from_lab * truth.cam_from_lab.inv()).magnitude() < 1e-9
         np.testing.assert_array_equal(shot.truth.sources.id, truth.sources.id)
         np.testing.assert_allclose(shot.truth.sources.electrons, truth.sources.electrons, rtol=1e-6)
-        np.testing.assert_allclose(shot.frame.image_dn, frame.image_dn, rtol=0, atol=1e-3 * frame.image_dn.max())
+        np.testing.assert_allclose(
+            shot.frame.image_dn, frame.image_dn, rtol=0, atol=1e-3 * frame.image_dn.max()
+        )
     assert np.degrees(np.linalg.norm(flight.state.rate_body_rad_s)) > 2
 
 
@@ -435,7 +486,9 @@ def test_observations_have_the_noise_of_a_scheduled_frame_and_each_its_own() -> 
     """The differences of any two frames of a camera at rest have the same variance, those of disjoint pairs no
     correlation.
     """
-    scene = scene_of("shefex2", 2, **{key.replace(".", "__"): value for key, value in AT_REST.items()})
+    scene = scene_of(
+        "shefex2", 2, **{key.replace(".", "__"): value for key, value in AT_REST.items()}
+    )
     flight = simulate_motion(scene)
     scheduled = [flight.render(index)[0] for index in (0, 1)]
     observed = [flight.observe(solves=False).frame for _ in range(4)]
@@ -472,23 +525,33 @@ def test_an_observation_at_the_start_is_exposed_while_the_vehicle_comes_at_its_f
 def test_observations_leave_the_flight_as_it_is() -> None:
     """In a loop over shots, with a filter: frames, updates and motion are those of a flight without them."""
     scene = scene_of("two_heads", 4, **HEADS)
-    flight, alone = open_flight(scene), open_flight(scene)
-    shots, seen = [], []
+    flight = open_flight(scene)
+    alone = open_flight(scene)
+    shots = []
+    seen = []
     for shot in flight.shots():
         shots.append(shot)
         seen.append(flight.observe(camera=1 if shot.camera is flight.lab.camera else 0))
     expected = list(alone.shots())
     assert images(shots) == images(expected)
-    assert [shot.update_status for shot in shots] == [shot.update_status for shot in expected] == ["used"] * 8
+    assert (
+        [shot.update_status for shot in shots]
+        == [shot.update_status for shot in expected]
+        == ["used"] * 8
+    )
     assert {shot.update_status for shot in seen} == {""}
     assert [shot.camera.name for shot in seen] == ["side", "main"] * 4
     assert all(shot.report is not None and shot.report.attitude.solved for shot in seen)
-    np.testing.assert_array_equal(flight.telemetry().sigma_attitude_rad, alone.telemetry().sigma_attitude_rad)
+    np.testing.assert_array_equal(
+        flight.telemetry().sigma_attitude_rad, alone.telemetry().sigma_attitude_rad
+    )
 
 
 def test_an_observation_gets_the_gyro_s_rate_of_its_own_exposure() -> None:
     imu = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, quantum_arcsec: 0}}"
-    flight = open_flight(scene_of("shefex2", 1, vehicle__imu=imu, tracker__gyro="true", exposure__first="0.5 s"))
+    flight = open_flight(
+        scene_of("shefex2", 1, vehicle__imu=imu, tracker__gyro="true", exposure__first="0.5 s")
+    )
     shot = observed_at(flight, 0.3)
     assert isinstance(shot.rate, RateEstimate)
     np.testing.assert_allclose(shot.rate.rate_rad_s, shot.truth.rate_cam_rad_s, rtol=0, atol=1e-6)
@@ -498,10 +561,13 @@ def test_an_observation_gets_the_gyro_s_rate_of_its_own_exposure() -> None:
 def test_a_control_loop_of_twenty_lines_brings_the_vehicle_to_its_target() -> None:
     """Attitudes from observations ten times a second, rates between them, a torque in every period."""
     changes = BALANCED | {"vehicle.imu": "{gyro: {turn_on_bias_deg_h: 0}}", "exposure.first": "8 s"}
-    scene = scene_of("afit_simsat_ideal", 1, **{key.replace(".", "__"): value for key, value in changes.items()})
+    scene = scene_of(
+        "afit_simsat_ideal", 1, **{key.replace(".", "__"): value for key, value in changes.items()}
+    )
     target = Rotation.from_euler("ZYX", [8.0, -3.0, 4.0], degrees=True)
     flight = open_flight(scene)
-    inertia, mount = flight.lab.vehicle.inertia_kg_m2, flight.lab.camera.mount
+    inertia = flight.lab.vehicle.inertia_kg_m2
+    mount = flight.lab.camera.mount
     ticks = 0
     while not flight.is_over:
         samples = flight.imu_samples(flight.now_s - 0.005)

@@ -32,7 +32,9 @@ def test_a_head_is_turned_and_placed_as_the_scene_says() -> None:
     _, main = render_at_rest(lab.camera, lab.start)
     _, side = render_at_rest(head, lab.start)
     boresight = side.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(boresight, main.cam_from_lab.inv().apply([1.0, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(
+        boresight, main.cam_from_lab.inv().apply([1.0, 0.0, 0.0]), atol=1e-12
+    )
     # The real camera is turned about its boresight by one degree from the assumed mount.
     assumed = head.mount.cam_from_body * side.lab_from_body.inv()
     error = (side.cam_from_lab * assumed.inv()).as_rotvec(degrees=True)
@@ -52,13 +54,20 @@ def test_a_head_is_another_chip_with_other_noise() -> None:
     bright = truth.sources.peak_e > 2000
     x, y = np.rint(truth.sources.xy_px[bright]).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < frame.image_dn.shape[1]) & (y < frame.image_dn.shape[0])
-    brightest = frame.image_dn[y[inside], x[inside]].astype(float), other.image_dn[y[inside], x[inside]].astype(float)
+    brightest = (
+        frame.image_dn[y[inside], x[inside]].astype(float),
+        other.image_dn[y[inside], x[inside]].astype(float),
+    )
     assert np.corrcoef(*brightest)[0, 1] > 0.9
     assert np.mean(frame.image_dn == other.image_dn) < 0.5
 
 
 def test_keys_of_a_head_are_put_over_those_of_the_main_camera() -> None:
-    lens = {"camera": {"f_number": 2.8}, "exposure": {"time": "80 ms"}, "tracker": {"limit_mag": 5.0}}
+    lens = {
+        "camera": {"f_number": 2.8},
+        "exposure": {"time": "80 ms"},
+        "tracker": {"limit_mag": 5.0},
+    }
     lab = two_heads(heads=[SIDE | lens])
     main, side = (camera.scene for camera in lab.cameras)
     assert (side.camera.f_number, side.exposure.time_s, side.tracker.limit_mag) == (2.8, 0.08, 5.0)
@@ -78,9 +87,15 @@ def test_frames_of_the_main_camera_do_not_change_with_a_head() -> None:
     [
         ([SIDE, SIDE], "heads.1.name: side is the name of another camera"),
         ([SIDE | {"name": "main"}], "heads.0.name: main is the name of another camera"),
-        ([SIDE | {"tracker": {"identifier": "cedar"}}], "heads.0.tracker.identifier: unknown identifier 'cedar'"),
+        (
+            [SIDE | {"tracker": {"identifier": "cedar"}}],
+            "heads.0.tracker.identifier: unknown identifier 'cedar'",
+        ),
         ([SIDE | {"tracker": {"gyro": True, "map": "x"}}], "heads.0.tracker.map"),
-        ([SIDE | {"camera": {"preset": "none_such"}}], "heads.0.camera.preset: unknown preset 'none_such'"),
+        (
+            [SIDE | {"camera": {"preset": "none_such"}}],
+            "heads.0.camera.preset: unknown preset 'none_such'",
+        ),
         ([SIDE | {"camera": {"f_number": -1}}], "heads.0.camera.f_number"),
         ([SIDE | {"position": ["0 m"]}], "heads.0.position"),
         ([SIDE | {"focal_length": "20 mm"}], "heads.0.focal_length"),
@@ -112,7 +127,8 @@ def test_an_option_without_effect_is_refused_in_a_head_too(tmp_path: Path) -> No
 def test_the_check_expects_the_roll_of_two_heads_from_the_other_s_boresight() -> None:
     """At a right angle the roll about one boresight is an angle across the other: 1 / roll^2 + 2 / cross^2."""
     facts = check(two_heads()).as_dict()["facts"]
-    main, side = facts["expected_error"]["frames"], facts["heads"]["heads"][0]
+    main = facts["expected_error"]["frames"]
+    side = facts["heads"]["heads"][0]
     expected = (main["roll_arcsec"] ** -2 + 2 * side["cross_arcsec"] ** -2) ** -0.5
     np.testing.assert_allclose(facts["heads"]["together"]["roll_arcsec"], expected, rtol=1e-9)
     assert facts["heads"]["together"]["roll_arcsec"] < main["roll_arcsec"] / 3
@@ -120,7 +136,10 @@ def test_the_check_expects_the_roll_of_two_heads_from_the_other_s_boresight() ->
 
 def test_under_a_dome_a_head_that_looks_below_the_rim_sees_nothing() -> None:
     top = SIDE | {"position": ["0.1 m", "0 m", "0.45 m"]}
-    heads = [top | {"name": "up", "rotation_deg": [0, 8, 0]}, top | {"name": "down", "rotation_deg": [0, 150, 0]}]
+    heads = [
+        top | {"name": "up", "rotation_deg": [0, 8, 0]},
+        top | {"name": "down", "rotation_deg": [0, 150, 0]},
+    ]
     scene = load_scene("afit_simsat", {"exposure.frames": 1, "heads": heads, "tracker.survey": {}})
     reports = {shot.camera.name: shot.report for shot in open_flight(scene).shots()}
     solved = {name: report.attitude.solved for name, report in reports.items()}
@@ -136,7 +155,9 @@ def test_the_filter_uses_the_frames_of_all_heads() -> None:
     every = list(open_flight(scene).shots())
     for name in ("main", "side"):
         own = [shot for shot in every if shot.camera.name == name]
-        assert {shot.frame.index: shot.update_status for shot in own} == dict.fromkeys(range(6), "used")
+        assert {shot.frame.index: shot.update_status for shot in own} == dict.fromkeys(
+            range(6), "used"
+        )
     flight = open_flight(scene, keeps_history=False)
     alone = list(flight.shots(cameras=[0]))
     assert [schedule.index for schedule in flight.schedules] == [6, 6]
@@ -172,9 +193,12 @@ def test_the_filter_finds_how_far_the_mounts_have_turned() -> None:
     flight = simulate_motion(load_scene("two_heads", {"exposure.frames": 200}))
     mountings = flight.telemetry().mountings
     for name, mounting in mountings.items():
-        error, sigma = mounting.estimate_rad[-1] - mounting.true_rad[-1], mounting.sigma_rad[-1]
+        error = mounting.estimate_rad[-1] - mounting.true_rad[-1]
+        sigma = mounting.sigma_rad[-1]
         assert np.abs(error / sigma).max() < 4, name
     side = mountings["side"]
-    boresight = flight.lab.cameras[1].mount.cam_from_body.apply(side.estimate_rad[-1] - side.true_rad[-1])[:2]
+    boresight = flight.lab.cameras[1].mount.cam_from_body.apply(
+        side.estimate_rad[-1] - side.true_rad[-1]
+    )[:2]
     assert np.linalg.norm(side.true_rad[-1]) > 20 * ARCSEC_RAD
     assert np.linalg.norm(boresight) < 3 * ARCSEC_RAD

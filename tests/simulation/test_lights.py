@@ -62,11 +62,16 @@ class Lighthouse(Light):
 
 
 def build_lighthouse(config: LighthouseConfig, plan: Plan) -> Lighthouse:
-    one, zero = np.ones(1), np.zeros(1)
+    one = np.ones(1)
+    zero = np.zeros(1)
     strength = np.atleast_1d(led_strength_e_s_sr(config.intensity_cd, "white", plan.band))
-    place, down = np.array([[*config.place_m, 1.0]]), np.array([[0.0, 0.0, -1.0]])
-    ids, clock = np.array([LAMP_ID]), np.zeros(1, np.int64)
-    return Lighthouse(config, Sources(ids, place, down, zero, strength, one, zero, one, clock, np.full(1, np.nan)))
+    place = np.array([[*config.place_m, 1.0]])
+    down = np.array([[0.0, 0.0, -1.0]])
+    ids = np.array([LAMP_ID])
+    clock = np.zeros(1, np.int64)
+    return Lighthouse(
+        config, Sources(ids, place, down, zero, strength, one, zero, one, clock, np.full(1, np.nan))
+    )
 
 
 # A second one, which hides.
@@ -86,13 +91,20 @@ class Curtain(Obstacle):
     beyond_m: float
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("the curtain", hides=Occluder("the curtain", lambda place: place[:, 0] > self.beyond_m))
+        return Lit(
+            "the curtain", hides=Occluder("the curtain", lambda place: place[:, 0] > self.beyond_m)
+        )
 
 
 # The tests.
 
 LAMP = "{kind: lighthouse, place: [0 m, 0 m, 1 m], intensity: 2 mcd, period: 2 s, lit: 1 s}"
-LEVEL = {"exposure.frames": "4", "exposure.rate_hz": "1", "motion.control": "none", "motion.maneuver": "[]"}
+LEVEL = {
+    "exposure.frames": "4",
+    "exposure.rate_hz": "1",
+    "motion.control": "none",
+    "motion.maneuver": "[]",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -112,8 +124,10 @@ def lab_with(lamp: str, **keys: str) -> Lab:
 
 def test_a_lighthouse_is_in_the_frames_in_which_it_is_lit() -> None:
     """In the truth where the lens has it, with the light of its intensity; the other frames are those without it."""
-    lab, dark = lab_with(LAMP), build_lab(loader.load("afit_simsat", LEVEL))
-    period_s, start_s = 1.0, lab.scene.exposure.first_s
+    lab = lab_with(LAMP)
+    dark = build_lab(loader.load("afit_simsat", LEVEL))
+    period_s = 1.0
+    start_s = lab.scene.exposure.first_s
     assert start_s == period_s
     for index, is_lit in enumerate((False, True, False, True)):
         frame, truth = render_at_rest(lab.camera, lab.start, index)
@@ -126,7 +140,12 @@ def test_a_lighthouse_is_in_the_frames_in_which_it_is_lit() -> None:
             expected_px = lab.camera.optics.project(truth.cam_from_lab.apply(offset_m[None]))
             np.testing.assert_allclose(truth.sources.xy_px[row], expected_px, atol=1e-6)
             strength = led_strength_e_s_sr(2e-3, "white", lab.camera.band)
-            light_e = strength * lab.camera.optics.collecting_m2 / np.sum(offset_m**2) * lab.scene.exposure.time_s
+            light_e = (
+                strength
+                * lab.camera.optics.collecting_m2
+                / np.sum(offset_m**2)
+                * lab.scene.exposure.time_s
+            )
             assert truth.sources.electrons[row] == pytest.approx(light_e, rel=1e-3)
 
 
@@ -141,11 +160,12 @@ def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_no
 def test_a_curtain_hides_what_is_listed_before_it_and_the_forecast_names_it() -> None:
     """Lamp and LEDs beyond it are gone from the frame and listed as hidden; those before it are as without it."""
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
-    lab, free = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}"), lab_with(lamp)
+    lab = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}")
+    free = lab_with(lamp)
     (_, truth), (_, open_truth) = (render_at_rest(one.camera, one.start, 1) for one in (lab, free))
-    x_m = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, 0].tolist(), strict=True)) | {
-        LAMP_ID: 0.03
-    }
+    x_m = dict(
+        zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, 0].tolist(), strict=True)
+    ) | {LAMP_ID: 0.03}
     seen = [id for id in open_truth.sources.id.tolist() if x_m[id] <= 0.02]
     assert truth.sources.id.tolist() == seen
     assert LAMP_ID in truth.hidden
@@ -163,10 +183,16 @@ def test_a_lighthouse_is_a_section_of_the_scene() -> None:
     assert isinstance(config, LighthouseConfig)
     assert (config.place_m, config.intensity_cd, config.lit_s) == ((0.0, 0.0, 1.0), 0.002, 1.0)
     written = scene.model_dump(mode="json", by_alias=True)["lights"][0]
-    assert (written["kind"], written["place"], written["lit"]) == ("lighthouse", [0.0, 0.0, 1.0], 1.0)
+    assert (written["kind"], written["place"], written["lit"]) == (
+        "lighthouse",
+        [0.0, 0.0, 1.0],
+        1.0,
+    )
     with pytest.raises(InputError, match=r"lights\.0\.lit: .*greater than 0"):
         loader.load("afit_simsat", {"lights": f"[{LAMP.replace('lit: 1 s', 'lit: 0 s')}]"})
-    with pytest.raises(InputError, match=r"lights\.0\.kind: .*unknown light 'buoy'; allowed: .*lighthouse"):
+    with pytest.raises(
+        InputError, match=r"lights\.0\.kind: .*unknown light 'buoy'; allowed: .*lighthouse"
+    ):
         loader.load("afit_simsat", {"lights": "[{kind: buoy}]"})
 
 
@@ -226,7 +252,12 @@ def test_the_forecast_sees_the_stars_through_the_air_as_the_frames_do() -> None:
 def test_a_head_that_looks_at_the_earth_is_told_by_its_own_key() -> None:
     """The main camera looks away from the Earth, the head opposite to it, through the payload's skin."""
     head = '[{name: back, position: ["0 m", "0 m", "0 m"], rotation_deg: [0, 180, 0]}]'
-    keys = {"exposure.frames": "2", "orbit": BEHIND.replace("180", "0"), "heads": head, "light.occlusion": "false"}
+    keys = {
+        "exposure.frames": "2",
+        "orbit": BEHIND.replace("180", "0"),
+        "heads": head,
+        "light.occlusion": "false",
+    }
     findings = check(build_lab(loader.load("shefex2", keys))).findings
     told = [line for line in findings if "behind the Earth" in line]
     assert len(told) == 1

@@ -24,8 +24,11 @@ ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 0, ar
 def in_orbit(**keys: str) -> Lab:
     """Two frames, half a revolution apart, of a camera that looks along the orbit's pole or as the keys say."""
     overrides = {
-        **{"orbit": ORBIT, "exposure.frames": "2", "exposure.rate_hz": str(1 / HALF_S)},
-        **{"motion.start": "{ra_deg: 90, dec_deg: 0, roll_deg: 0}", "camera.detector.noise": "false"},
+        "orbit": ORBIT,
+        "exposure.frames": "2",
+        "exposure.rate_hz": str(1 / HALF_S),
+        "motion.start": "{ra_deg: 90, dec_deg: 0, roll_deg: 0}",
+        "camera.detector.noise": "false",
         **{key.replace("__", "."): value for key, value in keys.items()},
     }
     return build_lab(loader.load("shefex2", overrides))
@@ -34,7 +37,8 @@ def in_orbit(**keys: str) -> Lab:
 def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
     """Against `stars.apparent` with the velocity of mid-exposure, projected by the lens: half a revolution is 10"."""
     lab = in_orbit(light__limit_mag="4")
-    scene, star_camera = lab.scene, lab.camera
+    scene = lab.scene
+    star_camera = lab.camera
     known = catalog.read_for("light.catalog", scene.light.catalog)
     for index in range(2):
         _, truth = render_at_rest(star_camera, lab.start, index)
@@ -44,17 +48,23 @@ def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
         chosen = np.argsort(known.hip)[rows]
         exact = stars.apparent(known, time, velocity_m_s)[chosen]
         xy_px = star_camera.optics.project(truth.cam_from_lab.apply(exact))
-        off_arcsec = np.linalg.norm(xy_px - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+        off_arcsec = (
+            np.linalg.norm(xy_px - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+        )
         # Parallax, proper motion and deflection of half a revolution are below 0.001".
         assert off_arcsec.max() < 0.005
-        still = star_camera.optics.project(truth.cam_from_lab.apply(stars.apparent(known, time)[chosen]))
+        still = star_camera.optics.project(
+            truth.cam_from_lab.apply(stars.apparent(known, time)[chosen])
+        )
         moved = np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
         assert moved.mean() == pytest.approx(7617 / 299_792_458 * 206265, rel=0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("knows", "low", "high"), [("true", 0.0, 1.0), ("false", 4.5, 6.0)])
-def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(knows: str, low: float, high: float) -> None:
+def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(
+    knows: str, low: float, high: float
+) -> None:
     """Without noise, at the start and half a revolution later. The error without it is 5.2"."""
     lab = in_orbit(tracker__orbit_velocity=knows)
     tracker = build_tracker(lab.camera)
@@ -85,18 +95,26 @@ def test_a_satellite_ahead_on_the_same_orbit_is_seen(tmp_path: Path) -> None:
         "2 00002  97.0000 100.0000 0001000   0.0000 000.5000 15.20000000    1",
     )
     path.write_text("\n".join(lines), encoding="utf-8")
-    keys = {"orbit": f"{{kind: tle, file: {path}, number: 1}}", "light__satellites": f"{{file: {path}}}"}
+    keys = {
+        "orbit": f"{{kind: tle, file: {path}, number: 1}}",
+        "light__satellites": f"{{file: {path}}}",
+    }
     keys |= {"start_time": "2012-06-22T00:00:00", "exposure__frames": "1", "exposure__rate_hz": "1"}
     lab = in_orbit(**keys)
     velocity = state_at(lab.camera.orbit, 0.0).velocity_m_s
-    ra, dec = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360, np.degrees(np.arcsin(velocity[2] / 7.6e3))
+    ra = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360
+    dec = np.degrees(np.arcsin(velocity[2] / 7.6e3))
     lab = in_orbit(**keys, motion__start=f"{{ra_deg: {ra}, dec_deg: {dec}, roll_deg: 0}}")
     _, truth = render_at_rest(lab.camera, lab.start, 0)
     assert [satellite.id for satellite in truth.satellites] == [ID_BASE + 2]
     assert truth.satellites[0].range_km == pytest.approx(60, abs=1.5)
-    assert truth.satellites[0].rate_deg_s == pytest.approx(0.063, rel=0.1)  # it turns with the orbit
+    assert truth.satellites[0].rate_deg_s == pytest.approx(
+        0.063, rel=0.1
+    )  # it turns with the orbit
 
 
 def test_an_orbit_needs_the_sky() -> None:
-    with pytest.raises(InputError, match=r"orbit: light of kind dome is in a laboratory; allowed: stars"):
+    with pytest.raises(
+        InputError, match=r"orbit: light of kind dome is in a laboratory; allowed: stars"
+    ):
         loader.load("afit_simsat", {"orbit": ORBIT})

@@ -33,12 +33,15 @@ AT_REST = {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames":
 
 
 STATION = (
-    "{kind: total_station, position: [1 m, 0 m, -0.5 m], angle_sigma_arcsec: 2, distance_sigma: 0.2 mm, distance_ppm: 2"
+    "{kind: total_station, position: [1 m, 0 m, -0.5 m], angle_sigma_arcsec: 2, "
+    "distance_sigma: 0.2 mm, distance_ppm: 2"
 )
 
 
 def lab_of(name: str, **changes: str) -> Lab:
-    return build_lab(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
+    return build_lab(
+        loader.load(name, {key.replace("__", "."): value for key, value in changes.items()})
+    )
 
 
 def fact(result: plan.Check, name: str) -> Fact:
@@ -77,7 +80,8 @@ def test_frames_are_checked_where_the_vehicle_will_be() -> None:
 
 
 def test_the_reach_is_even_up_to_the_greatest_tilt_and_over_the_whole_sky() -> None:
-    dome, sky = lab_of("afit_simsat"), lab_of("shefex2")
+    dome = lab_of("afit_simsat")
+    sky = lab_of("shefex2")
     frames = attitudes.of_frames(dome)
     reach = attitudes.within_reach(dome.scene, dome.camera.mount, frames)
     tilt_deg = multibody.tilt_deg(reach.lab_from_body)
@@ -100,7 +104,10 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"}, "motion.start: tilt of 40.0 deg"),
+        (
+            {"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"},
+            "motion.start: tilt of 40.0 deg",
+        ),
         ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
     ],
 )
@@ -116,7 +123,9 @@ def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], 
 def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
     """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
     field = fact(afit, "field of view").values
-    assert field["field_deg"][0] == pytest.approx(2 * math.degrees(math.atan(800 * 4e-6 / 36.53e-3)), rel=1e-3)
+    assert field["field_deg"][0] == pytest.approx(
+        2 * math.degrees(math.atan(800 * 4e-6 / 36.53e-3)), rel=1e-3
+    )
     assert field["arcsec_px"] == pytest.approx(4e-6 / 36.53e-3 / ARCSEC_RAD, rel=1e-3)
 
 
@@ -136,11 +145,17 @@ def test_the_least_lights_are_where_it_says() -> None:
     lab = lab_of("afit_simsat")
     context, samples = samples_of(lab)
     text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
-    roll, pitch, yaw = (float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw"))  # type: ignore[index]
+    roll, pitch, yaw = (
+        float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw")
+    )  # type: ignore[index]
     there = attitudes.Attitudes(
-        Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True), np.zeros((1, 3)), np.full(1, np.nan)
+        Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True),
+        np.zeros((1, 3)),
+        np.full(1, np.nan),
     )
-    assert len(sampling.sampled(there, context).used[0]) == pytest.approx(samples.reach.counts().min(), abs=1)
+    assert len(sampling.sampled(there, context).used[0]) == pytest.approx(
+        samples.reach.counts().min(), abs=1
+    )
 
 
 @pytest.mark.slow
@@ -165,7 +180,10 @@ def test_smear_is_the_rate_times_the_exposure() -> None:
     dome = lab_of("afit_simsat")
     values = fact(check(dome), "smear").values
     far = np.linalg.norm(dome.camera.sources.place[:, :3], axis=1).mean() / 0.838
-    assert values["largest_px"] < far * dome.scene.camera.focal_px * math.radians(values["rate_deg_s"]) * 0.01
+    assert (
+        values["largest_px"]
+        < far * dome.scene.camera.focal_px * math.radians(values["rate_deg_s"]) * 0.01
+    )
 
 
 def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
@@ -201,7 +219,10 @@ def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
     assert values["cap_deg"] == pytest.approx(20, abs=1e-6)
     assert values["limit_deg"] == 50
     assert values["margin_deg"] < -5
-    assert "LEDs to 20° from the zenith, shell and wires to cap_deg, 50°" in fact(planned, "LED cap").lines[0]
+    assert (
+        "LEDs to 20° from the zenith, shell and wires to cap_deg, 50°"
+        in fact(planned, "LED cap").lines[0]
+    )
     assert not any("LEDs end at" in one for one in planned.findings)
 
 
@@ -218,13 +239,17 @@ def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it
     cap = fact(planned, "LED cap")
     assert cap.values["stop_deg"] == 30
     beyond_deg = 30 - cap.values["tilt_deg"]
-    assert cap.values["stop_margin_deg"] == pytest.approx(cap.values["margin_deg"] - beyond_deg, abs=1e-3)
+    assert cap.values["stop_margin_deg"] == pytest.approx(
+        cap.values["margin_deg"] - beyond_deg, abs=1e-3
+    )
     assert cap.lines[1].startswith("at the tilt stop, 30°, the field's edge reaches 33.")
     assert not [line for line in planned.findings if "cap_deg" in line]
     (warned,) = [line for line in check(lab, 30.0).findings if "cap_deg" in line]
     assert "at a tilt of 30.0 deg" in warned
     free = check(lab_of("afit_simsat", motion__control="none", motion__maneuver="[]"))
-    assert all("tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines)
+    assert all(
+        "tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines
+    )
 
 
 @pytest.mark.slow
@@ -236,7 +261,13 @@ def test_what_the_tracker_believes_is_said() -> None:
         "tracker__assumed_camera_body": "[0 mm, 0 mm, 385 mm]",
     }
     lines = " ".join(fact(check(lab_of("afit_simsat_ideal", **changes)), "tracker knows").lines)
-    for words in ("LEDs to 0.3 mm", "rotated by 36″", "length wrong by +0.2 %", "another distortion", "lever wrong by"):
+    for words in (
+        "LEDs to 0.3 mm",
+        "rotated by 36″",
+        "length wrong by +0.2 %",
+        "another distortion",
+        "lever wrong by",
+    ):
         assert words in lines
     told = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
     assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in told
@@ -250,24 +281,33 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
     assert next(iter(roll)) == "survey rotation"
     assert roll["survey rotation"] == pytest.approx(360, rel=0.1)
     assert list(roll.values()) == sorted(roll.values(), reverse=True)
-    assert values["roll_arcsec"] == pytest.approx(math.sqrt(math.fsum(value**2 for value in roll.values())), rel=1e-6)
+    assert values["roll_arcsec"] == pytest.approx(
+        math.sqrt(math.fsum(value**2 for value in roll.values())), rel=1e-6
+    )
     assert next(iter(values["cross_causes_arcsec"])) in ("lever survey", "survey rotation")
 
 
 @pytest.mark.slow
 def test_what_cross_and_sigma_are_of_is_said() -> None:
     """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
-    over_surveys = "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
-    surveyed, exact = check(lab_of("afit_simsat")), check(lab_of("afit_simsat_ideal"))
+    over_surveys = (
+        "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
+    )
+    surveyed = check(lab_of("afit_simsat"))
+    exact = check(lab_of("afit_simsat_ideal"))
     assert over_surveys in fact(surveyed, "expected error").lines
     assert over_surveys not in fact(exact, "expected error").lines
-    assert [one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")]
+    assert [
+        one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")
+    ]
 
 
 @pytest.mark.slow
 def test_a_solver_s_own_error_is_a_cause() -> None:
     """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
-    values = fact(check(lab_of("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]
+    values = fact(
+        check(lab_of("afit_simsat_ideal", tracker__solver="infinity")), "expected error"
+    ).values["frames"]
     assert next(iter(values["cross_causes_arcsec"])) == "solver"
     assert 0.02 < values["cross_arcsec"] / 3600 < 1
 
@@ -279,44 +319,118 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
 @pytest.mark.parametrize(
     ("scene", "changes", "key", "words"),
     [
-        ("afit_simsat", {"light__led__intensity": "60 mcd"}, "light.led.intensity", "of the lights are saturated"),
-        ("shefex2", {"exposure__time": "99 ms", "camera__detector__full_well_e": "300"}, "exposure.time", "saturated"),
+        (
+            "afit_simsat",
+            {"light__led__intensity": "60 mcd"},
+            "light.led.intensity",
+            "of the lights are saturated",
+        ),
+        (
+            "shefex2",
+            {"exposure__time": "99 ms", "camera__detector__full_well_e": "300"},
+            "exposure.time",
+            "saturated",
+        ),
         (
             "afit_simsat",
             {"light__layout__cap_deg": "25"},
             "light.layout.cap_deg",
             "its edge has no LED",
         ),
-        ("afit_simsat", {"light__layout__cap_deg": "24"}, "light.layout.cap_deg", "the tilt itself is not covered"),
-        ("afit_simsat", {"light__layout__spacing": "7 in"}, "light.layout.spacing", "fewer than 4 lights"),
+        (
+            "afit_simsat",
+            {"light__layout__cap_deg": "24"},
+            "light.layout.cap_deg",
+            "the tilt itself is not covered",
+        ),
+        (
+            "afit_simsat",
+            {"light__layout__spacing": "7 in"},
+            "light.layout.spacing",
+            "fewer than 4 lights",
+        ),
         ("shefex2", {"tracker__limit_mag": "1.5"}, "tracker.limit_mag", "fewer than 4 lights"),
-        ("afit_simsat", {"tracker__min_area_px": "900"}, "tracker.min_area_px", "px above the threshold, it wants 900"),
-        ("shefex2", {"exposure__time": "1 ms"}, "exposure.time", "the others are below the threshold"),
-        ("afit_simsat", {"camera__focus": "24 in"}, "camera.focus", "out of focus"),
-        ("shefex2", {"camera__focus": "3 m"}, "camera.focus", "change it to infinity"),
-        ("shefex2", {"motion__rate_deg_s": "[3, 4, 0]"}, "exposure.time", "images move by up to 9 px"),
+        (
+            "afit_simsat",
+            {"tracker__min_area_px": "900"},
+            "tracker.min_area_px",
+            "px above the threshold, it wants 900",
+        ),
         (
             "shefex2",
-            {"camera__f_number": "0.8", "exposure__time": "100 ms", "motion__rate_deg_s": "[0, 0, 0]"},
+            {"exposure__time": "1 ms"},
+            "exposure.time",
+            "the others are below the threshold",
+        ),
+        ("afit_simsat", {"camera__focus": "24 in"}, "camera.focus", "out of focus"),
+        ("shefex2", {"camera__focus": "3 m"}, "camera.focus", "change it to infinity"),
+        (
+            "shefex2",
+            {"motion__rate_deg_s": "[3, 4, 0]"},
+            "exposure.time",
+            "images move by up to 9 px",
+        ),
+        (
+            "shefex2",
+            {
+                "camera__f_number": "0.8",
+                "exposure__time": "100 ms",
+                "motion__rate_deg_s": "[0, 0, 0]",
+            },
             "light.catalog",
             "the sky ends at V 8.0",
         ),
-        ("shefex2", {"camera__vignetting": TWO_STOPS}, "camera.vignetting.cutoff_deg", "the lens is dark beyond 4 deg"),
+        (
+            "shefex2",
+            {"camera__vignetting": TWO_STOPS},
+            "camera.vignetting.cutoff_deg",
+            "the lens is dark beyond 4 deg",
+        ),
         ("shefex2", {"light__limit_mag": "4"}, "light.limit_mag", "of the directions in reach"),
         ("shefex2", {"light__limit_mag": "5.9"}, "light.limit_mag", "the sky ends at V 5.9"),
-        ("shefex2", {"camera__preset": "imx174"}, "tracker.limit_mag", "knows them to V 5.8 only, 9 % of them"),
-        ("shefex2", {"camera__detector__prnu": "0.1"}, "tracker.centroid_sigma_px", "1.3 times too small (NEES 5.4"),
+        (
+            "shefex2",
+            {"camera__preset": "imx174"},
+            "tracker.limit_mag",
+            "knows them to V 5.8 only, 9 % of them",
+        ),
+        (
+            "shefex2",
+            {"camera__detector__prnu": "0.1"},
+            "tracker.centroid_sigma_px",
+            "1.3 times too small (NEES 5.4",
+        ),
         ("shefex2", {"tracker__limit_mag": "3"}, "tracker.limit_mag", "of the directions in reach"),
-        ("afit_simsat", {"tracker__brightest": "3"}, "tracker.brightest", "the tracker uses 3 lights"),
-        ("shefex2", {"tracker__threshold_sigma": "500"}, "tracker.threshold_sigma", "below the threshold of 500 sigma"),
-        ("shefex2", {"camera__f_number": "16"}, "camera.f_number", "the others are below the threshold"),
+        (
+            "afit_simsat",
+            {"tracker__brightest": "3"},
+            "tracker.brightest",
+            "the tracker uses 3 lights",
+        ),
+        (
+            "shefex2",
+            {"tracker__threshold_sigma": "500"},
+            "tracker.threshold_sigma",
+            "below the threshold of 500 sigma",
+        ),
+        (
+            "shefex2",
+            {"camera__f_number": "16"},
+            "camera.f_number",
+            "the others are below the threshold",
+        ),
         (
             "afit_simsat",
             {"light__led__intensity": "1 ucd"},
             "light.led.intensity",
             "the others are below the threshold",
         ),
-        ("shefex2", {"tracker__assumed_focal_length": "27 mm"}, "tracker.assumed_focal_length", "matching radius"),
+        (
+            "shefex2",
+            {"tracker__assumed_focal_length": "27 mm"},
+            "tracker.assumed_focal_length",
+            "matching radius",
+        ),
         (
             "shefex2",
             {"tracker__assumed_distortion": "[1, 0, 0, 0, 0]"},
@@ -331,7 +445,10 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
         ),
         (
             "afit_simsat",
-            {"tracker__survey__instrument": STATION + ", zero_sigma: 20 mm}", "camera__focal_length": "20 mm"},
+            {
+                "tracker__survey__instrument": STATION + ", zero_sigma: 20 mm}",
+                "camera__focal_length": "20 mm",
+            },
             "tracker.survey.instrument",
             "matching radius",
         ),
@@ -355,11 +472,21 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
         ),
     ],
 )
-def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str], key: str, words: str) -> None:
+def test_a_mistake_is_warned_of_with_its_key(
+    scene: str, changes: dict[str, str], key: str, words: str
+) -> None:
     """And with what to change it to; the plan as it ships gives no such warning."""
     tilted = {"motion__maneuver": TILTED} if key.endswith("cap_deg") else {}
-    lines = [line for line in check(lab_of(scene, **tilted, **changes)).findings if line.startswith(f"{key}: ")]
-    assert [line for line in lines if words in line and re.search("; (change it to|leave it out|turn)", line)]
+    lines = [
+        line
+        for line in check(lab_of(scene, **tilted, **changes)).findings
+        if line.startswith(f"{key}: ")
+    ]
+    assert [
+        line
+        for line in lines
+        if words in line and re.search("; (change it to|leave it out|turn)", line)
+    ]
     assert not [line for line in check(lab_of(scene)).findings if words in line]
 
 
@@ -372,7 +499,11 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
     ],
 )
 def test_following_the_advice_silences_the_warning(changes: dict[str, str], key: str) -> None:
-    (line,) = [one for one in check(build_lab(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
+    (line,) = [
+        one
+        for one in check(build_lab(loader.load("afit_simsat", changes))).findings
+        if one.startswith(key)
+    ]
     value = line.rpartition("change it to ")[2].partition(", or ")[0]
     again = check(build_lab(loader.load("afit_simsat", changes | {key: value}))).findings
     assert not [one for one in again if one.startswith(key)]
@@ -406,7 +537,9 @@ def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys:
 def test_a_bright_background_is_the_only_warning_that_it_causes() -> None:
     """The lights in it are saturated too, and their pixels above no threshold."""
     (line,) = check(lab_of("shefex2", background="[{kind: uniform, e_s: 5.0e6}]")).findings
-    assert line.startswith("background: 200001 electrons in a pixel without a light, of 39956 at saturation; lower it")
+    assert line.startswith(
+        "background: 200001 electrons in a pixel without a light, of 39956 at saturation; lower it"
+    )
 
 
 def test_smear_is_not_also_reported_as_faint_lights() -> None:
@@ -418,7 +551,12 @@ def test_smear_is_not_also_reported_as_faint_lights() -> None:
 def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     """The tracker takes as many from a frame; the fact says so, and no warning blames the area or the exposure."""
     tape = "{kind: string, pitch: 4 mm, spacing: 14 mm, cap_deg: 32}"
-    dense = lab_of("afit_simsat_ideal", light__surface=SPHERE, light__layout=tape, light__led__disk_diameter="1 mm")
+    dense = lab_of(
+        "afit_simsat_ideal",
+        light__surface=SPHERE,
+        light__layout=tape,
+        light__led__disk_diameter="1 mm",
+    )
     result = check(dense)
     assert "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]
     assert not [line for line in result.findings if "detects" in line]
@@ -433,18 +571,20 @@ def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
 @pytest.mark.slow
 def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     result = check(lab_of("shefex2"))
-    rate_deg_s, width_px = (
-        fact(result, "smear").values["width_rate_deg_s"],
-        fact(result, "image size").values["width_px"],
-    )
+    rate_deg_s = fact(result, "smear").values["width_rate_deg_s"]
+    width_px = fact(result, "image size").values["width_px"]
     camera = loader.load("shefex2").camera
     assert math.radians(rate_deg_s) * 0.04 * camera.focal_px == pytest.approx(width_px, rel=0.02)
     assert "as long as the image is wide at" in fact(result, "smear").lines[0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)])
-def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_length: str, solved: int) -> None:
+@pytest.mark.parametrize(
+    ("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)]
+)
+def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(
+    focal_length: str, solved: int
+) -> None:
     lab = lab_of("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
     found = [shot.report.attitude.solved for shot in Flight(lab).shots()]
     assert found.count(True) == solved
@@ -461,11 +601,17 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_lengt
 )
 def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
     """On rendered frames at the attitudes in reach: none, some three of four, all."""
-    changes = {"light__surface": SPHERE, "light__layout": layout, "camera__focus": "0.82 m", "camera__f_number": "11"}
+    changes = {
+        "light__surface": SPHERE,
+        "light__layout": layout,
+        "camera__focus": "0.82 m",
+        "camera__f_number": "11",
+    }
     lab = lab_of("afit_simsat", **changes, motion__maneuver=TILTED)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
-    tracker, told = build_tracker(lab.camera), []
+    tracker = build_tracker(lab.camera)
+    told = []
     for n, lab_from_body in enumerate(reach):
         frame, _ = render_at_rest(lab.in_run(n).camera, lab_from_body)
         told.append(solve_frame(tracker, frame).attitude.status)
@@ -477,20 +623,31 @@ def test_fields_whose_leds_have_names_are_not_alike() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
     told = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
-    without = check(lab_of("coded_spiral", **told, light__led__code="null", tracker__decoder="null"))
+    without = check(
+        lab_of("coded_spiral", **told, light__led__code="null", tracker__decoder="null")
+    )
     assert any("look like another one" in line for line in without.findings)
-    assert not any("look like another one" in line for line in check(lab_of("coded_spiral", **told)).findings)
+    assert not any(
+        "look like another one" in line for line in check(lab_of("coded_spiral", **told)).findings
+    )
 
 
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     lab = lab_of("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
     limit = depth.detection_limit_mag(*samples_of(lab))
-    tracker, rng, found, faint = build_tracker(lab.camera), np.random.default_rng(3), [], []
+    tracker = build_tracker(lab.camera)
+    rng = np.random.default_rng(3)
+    found = []
+    faint = []
     for n in range(6):
         frame, truth = render_at_rest(lab.in_run(n).camera, Rotation.random(rng=rng))
-        magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
-        near = cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
+        magnitude = dict(
+            zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+        )
+        near = (
+            cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
+        )
         v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
         found += near[np.abs(v_mag - limit + 0.5) < 0.25].tolist()
         faint += near[np.abs(v_mag - limit - 0.5) < 0.25].tolist()
@@ -502,7 +659,9 @@ def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> N
     """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
     lab = lab_of("shefex2", exposure__frames="1")
     limit = fact(check(lab), "faintest star").values["snr_5_v_mag"]
-    magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
+    magnitude = dict(
+        zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+    )
     _, truth = Flight(lab).simulate_motion().render(0)
     v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
     near = np.abs(truth.sources.snr - 5) < 0.7
@@ -515,17 +674,27 @@ def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
     nees = [
-        claims.claimed(*samples_of(lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))))
+        claims.claimed(
+            *samples_of(
+                lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))
+            )
+        )
         for px in (0.007, floor_px)
     ]
     assert nees == [pytest.approx(5.4, abs=0.3), pytest.approx(3, abs=0.15)]
 
 
-MOON = {"start_time": "2012-06-24T21:00:00", "motion__rate_deg_s": "[0, 0, 0]", "light__bodies": "{}"}
+MOON = {
+    "start_time": "2012-06-24T21:00:00",
+    "motion__rate_deg_s": "[0, 0, 0]",
+    "light__bodies": "{}",
+}
 
 
 def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]:
-    scene = lab_of("shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes)
+    scene = lab_of(
+        "shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes
+    )
     return [line for line in check(scene).findings if line.startswith("light.bodies")]
 
 
@@ -533,9 +702,14 @@ def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]
 def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
     """The Moon at RA 154.9, Dec +4.8 of V -8.8; Mars of V 0.8 is 20 degrees from it."""
     (inside,) = warned_of_bodies(154.9, 2.0)
-    assert re.match(r"light.bodies: Moon \(V -8.8, 1900″ wide\) is in the field, 2.8° from the boresight at", inside)
+    assert re.match(
+        r"light.bodies: Moon \(V -8.8, 1900″ wide\) is in the field, 2.8° from the boresight at",
+        inside,
+    )
     (near,) = warned_of_bodies(154.9, -15.0)
-    assert re.match(r"light.bodies: Moon .* is 19.8° from the boresight .* background of kind stray", near)
+    assert re.match(
+        r"light.bodies: Moon .* is 19.8° from the boresight .* background of kind stray", near
+    )
     mars = next(line for line in warned_of_bodies(174.9, 2.0) if "Mars" in line)
     assert "is in the field" in mars
     assert warned_of_bodies(340.0, -5.0) == []
@@ -543,7 +717,9 @@ def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ra_deg", "dec_deg", "name"), [(174.9, 2.0, "Mars"), (154.9, 4.8, "Moon")])
+@pytest.mark.parametrize(
+    ("ra_deg", "dec_deg", "name"), [(174.9, 2.0, "Mars"), (154.9, 4.8, "Moon")]
+)
 def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
     """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}"
@@ -551,13 +727,17 @@ def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, nam
     line = next(line for line in check(lab).findings if name in line)
     fill = float(re.search(r"([\d.]+) times saturation", line)[1])
     _, truth = simulate_motion(lab.scene).render(0)
-    row = list(truth.sources.id).index(next(body.id for body in truth.bodies if body.name == name.lower()))
+    row = list(truth.sources.id).index(
+        next(body.id for body in truth.bodies if body.name == name.lower())
+    )
     full_e = detection.full_scale_e(lab.scene.camera.detector)
     assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"])
+@pytest.mark.parametrize(
+    "name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"]
+)
 def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
     assert check(lab_of(name)).findings == []
 
@@ -566,7 +746,11 @@ def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
 def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
     """AFIT's tests of two and of five LEDs, as they were made, and of nine in a square, which looks alike turned."""
     warned = {name for name in loader.list_scenes() if check(build_lab(loader.load(name))).findings}
-    assert {name.removesuffix("_ideal") for name in warned} == {"afit_test1", "afit_test2", "afit_test3"}
+    assert {name.removesuffix("_ideal") for name in warned} == {
+        "afit_test1",
+        "afit_test2",
+        "afit_test3",
+    }
 
 
 @pytest.mark.slow
@@ -591,6 +775,8 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     rows = [f"{t},0,0,{yaw}" for t, yaw in zip(t_s, yaw_deg, strict=True)]
     file.write_text("\n".join(["t_s,roll_deg,pitch_deg,yaw_deg", *rows]))
     changes = {"motion__start": "profile", "motion__maneuver": f"[{{kind: profile, file: {file}}}]"}
-    with pytest.raises(InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"):
+    with pytest.raises(
+        InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"
+    ):
         check(lab_of("simsat_slew", **changes))
     check(lab_of("simsat_slew", motion__control="prescribed", filter="null", **changes))

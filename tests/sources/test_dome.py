@@ -20,8 +20,19 @@ from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 INCH_M = 0.0254
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
-SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "45 in", "offset": ["1 in", "-2 in", "0.5 in"]}
-BOARDS = {"kind": "patch_boards", "cap_deg": 27, "spacing": "2.6 in", "pitch": "8 mm", "lit": [3, 6]}
+SPHERE = {
+    "kind": "sphere",
+    "apex": "48 in",
+    "radius": "45 in",
+    "offset": ["1 in", "-2 in", "0.5 in"],
+}
+BOARDS = {
+    "kind": "patch_boards",
+    "cap_deg": 27,
+    "spacing": "2.6 in",
+    "pitch": "8 mm",
+    "lit": [3, 6],
+}
 LED = {"intensity": "16 mcd", "disk_diameter": "2 mm", "pwm_period": "1 ms"}
 BAND = Band.from_efficiency("cmos")
 
@@ -30,7 +41,9 @@ def surface(part: dict[str, Any]) -> Any:
     return dome_surface.build_surface(light.SurfaceConfig.model_validate(part))
 
 
-def lit_dome(surface: dict[str, Any] = MEASURED, led: dict[str, Any] = LED, **boards: Any) -> Sources:
+def lit_dome(
+    surface: dict[str, Any] = MEASURED, led: dict[str, Any] = LED, **boards: Any
+) -> Sources:
     light = {"kind": "dome", "surface": surface, "layout": BOARDS | boards, "led": led}
     return dome.sources(DomeConfig.model_validate(light), BAND)
 
@@ -48,8 +61,12 @@ def upward_rays(count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("part", [MEASURED, SPHERE])
 @pytest.mark.parametrize("origin_in", [(0, 0, 0), (2, -1, 15)])
-def test_rays_meet_the_surface_on_its_equation_and_on_themselves(part: dict, origin_in: tuple) -> None:
-    made, rays, origin = surface(part), upward_rays(200, 1), INCH_M * np.array(origin_in, float)
+def test_rays_meet_the_surface_on_its_equation_and_on_themselves(
+    part: dict, origin_in: tuple
+) -> None:
+    made = surface(part)
+    rays = upward_rays(200, 1)
+    origin = INCH_M * np.array(origin_in, float)
     met = made.meet(origin, rays)
     quadric = np.sum(((met - made.center_m) / made.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(quadric, 1, rtol=0, atol=1e-13)  # rounding of a root
@@ -61,7 +78,9 @@ def test_rays_meet_the_surface_on_its_equation_and_on_themselves(part: dict, ori
 def test_measured_dome_has_the_reference_s_figures() -> None:
     # Reference A4: radius from the bearing 48 in at the apex, 48.29 in at most, near 29 degrees.
     angle_deg = np.arange(0, 40, 0.02)
-    rays = np.column_stack([np.sin(np.radians(angle_deg)), 0 * angle_deg, np.cos(np.radians(angle_deg))])
+    rays = np.column_stack(
+        [np.sin(np.radians(angle_deg)), 0 * angle_deg, np.cos(np.radians(angle_deg))]
+    )
     radius_in = np.linalg.norm(surface(MEASURED).meet(np.zeros(3), rays), axis=1) / INCH_M
     assert radius_in[0] == pytest.approx(48.0, abs=1e-12)
     assert radius_in.max() == pytest.approx(48.29, abs=0.01)
@@ -72,7 +91,9 @@ def test_measured_dome_at_the_rim_height_has_the_reference_s_radius() -> None:
     # Reference A4: rim at z = 36.66 in, 48.011 in from the bearing.
     made = surface(MEASURED)
     z = 36.66 * INCH_M
-    half_width = made.semi_axes_m[0] * np.sqrt(1 - ((z - made.center_m[2]) / made.semi_axes_m[2]) ** 2)
+    half_width = made.semi_axes_m[0] * np.sqrt(
+        1 - ((z - made.center_m[2]) / made.semi_axes_m[2]) ** 2
+    )
     met = made.meet(np.zeros(3), np.array([[half_width, 0, z]]))
     assert np.linalg.norm(met) / INCH_M == pytest.approx(48.011, abs=0.01)
 
@@ -87,7 +108,8 @@ def test_a_sphere_about_the_bearing_is_equally_far_everywhere() -> None:
 @pytest.mark.parametrize("part", [MEASURED, SPHERE, {"kind": "flat", "apex": "48 in"}])
 def test_the_apex_is_where_it_is_declared(part: dict) -> None:
     """Straight above the dome's own axis; the offset moves it along."""
-    made, offset = surface(part), light.SurfaceConfig.model_validate(part).offset_m
+    made = surface(part)
+    offset = light.SurfaceConfig.model_validate(part).offset_m
     above = np.array([offset[0], offset[1], 0.0])
     top = made.meet(above, np.array([[0.0, 0.0, 1.0]]))[0]
     np.testing.assert_allclose(top, [*offset[:2], 48 * INCH_M + offset[2]], rtol=0, atol=1e-14)
@@ -96,12 +118,15 @@ def test_the_apex_is_where_it_is_declared(part: dict) -> None:
 @pytest.mark.parametrize("part", [MEASURED, SPHERE])
 def test_normals_are_perpendicular_and_point_inside(part: dict) -> None:
     """Against chords between neighboring points of the surface, found by rays alone."""
-    made, rays = surface(part), upward_rays(60, 3)
+    made = surface(part)
+    rays = upward_rays(60, 3)
     here = made.meet(np.zeros(3), rays)
     normal = made.inward(here)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=0, atol=1e-15)
     for axis in np.eye(3):
-        chord = made.meet(np.zeros(3), rays + 1e-5 * axis) - made.meet(np.zeros(3), rays - 1e-5 * axis)
+        chord = made.meet(np.zeros(3), rays + 1e-5 * axis) - made.meet(
+            np.zeros(3), rays - 1e-5 * axis
+        )
         # A symmetric chord is off the tangent by the third power of its length only.
         assert np.abs(np.einsum("nj,nj->n", chord, normal)).max() < 1e-13
     assert np.all(np.einsum("nj,nj->n", normal, made.center_m - here) > 0)
@@ -142,7 +167,8 @@ def board_of(leds: Sources) -> np.ndarray:
 
 def test_neighbors_on_a_board_are_a_pitch_apart(afit: Sources) -> None:
     """Holes r and c rows and columns apart are hypot(r, c) pitches apart, for every pair on every board."""
-    board, hole = board_of(afit), afit.id % 9
+    board = board_of(afit)
+    hole = afit.id % 9
     first, second = np.nonzero(np.triu(board[:, None] == board[None, :], 1))
     steps = np.hypot(hole[first] % 3 - hole[second] % 3, hole[first] // 3 - hole[second] // 3)
     apart_m = np.linalg.norm(afit.place[first, :3] - afit.place[second, :3], axis=1)
@@ -151,7 +177,8 @@ def test_neighbors_on_a_board_are_a_pitch_apart(afit: Sources) -> None:
 
 
 def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sources) -> None:
-    made, holes = surface(MEASURED), afit.id % 9
+    made = surface(MEASURED)
+    holes = afit.id % 9
     middle = afit.take(holes == 4)
     assert len(middle) > 50
     quadric = np.sum(((middle.place[:, :3] - made.center_m) / made.semi_axes_m) ** 2, axis=1)
@@ -276,7 +303,8 @@ def test_nine_per_cent_ranks_as_normal_order_statistics() -> None:
 
 def likelihood(boards: np.ndarray) -> float:
     """How probable Table 2 is among boards, by the standard deviation of its nine values: log density, Normal."""
-    spread, seen = np.log(boards.std(axis=1)), np.log(np.std(TABLE_2) / np.mean(TABLE_2))
+    spread = np.log(boards.std(axis=1))
+    seen = np.log(np.std(TABLE_2) / np.mean(TABLE_2))
     return float(-((seen - spread.mean()) ** 2) / (2 * spread.var()))
 
 
@@ -292,7 +320,12 @@ def test_table_2_is_a_board_of_nine_per_cent_and_not_of_three_or_thirty() -> Non
 
 
 def test_strength_is_in_the_chip_s_own_electrons() -> None:
-    light = {"kind": "dome", "surface": MEASURED, "layout": BOARDS, "led": LED | {"spectrum": "640 nm"}}
+    light = {
+        "kind": "dome",
+        "surface": MEASURED,
+        "layout": BOARDS,
+        "led": LED | {"spectrum": "640 nm"},
+    }
     red = dome.sources(DomeConfig.model_validate(light), Band.from_efficiency(0.5)).strength
     # By hand: 16 mcd of V(640 nm) = .175 in photons of 3.1038e-19 J, half of them electrons.
     np.testing.assert_allclose(red, 0.016 / (683 * 0.175) / 3.1038e-19 * 0.5, rtol=1e-4, atol=0)

@@ -45,12 +45,17 @@ def unit(vectors: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("on", [SPHERE, OVAL], ids=["sphere", "ellipsoid"])
-def test_an_angle_displaces_a_hole_by_its_arc_over_the_cosine_of_incidence(on: dict[str, Any]) -> None:
+def test_an_angle_displaces_a_hole_by_its_arc_over_the_cosine_of_incidence(
+    on: dict[str, Any],
+) -> None:
     """Along the surface: D sigma out of the plane of incidence, D sigma / cos(incidence) in it; on the surface."""
-    design, real = places(on=on), places(on=on, pointing_sigma_arcsec=60)
+    design = places(on=on)
+    real = places(on=on, pointing_sigma_arcsec=60)
     shell = surface.build_surface(config(on=on).surface)
-    normal, sight = -shell.inward(design), design - LASER_M
-    distance_m, line = np.linalg.norm(sight, axis=1), unit(sight)
+    normal = -shell.inward(design)
+    sight = design - LASER_M
+    distance_m = np.linalg.norm(sight, axis=1)
+    line = unit(sight)
     out = unit(np.cross(normal, line))
     moved = (real - design) / (distance_m * 60 * ARCSEC_RAD)[:, None]
     across = np.sum(moved * out, axis=1)
@@ -66,7 +71,8 @@ def test_an_angle_displaces_a_hole_by_its_arc_over_the_cosine_of_incidence(on: d
 def test_a_shell_s_error_is_along_the_laser_s_line_where_the_laser_sees_nothing_of_it() -> None:
     """v R outward by the normal: v R / cos(incidence) along the line. Without a laser it is seen from its place."""
     design = places()
-    marked, built = places(0.004, pointing_sigma_arcsec=1e-9), places(0.004)
+    marked = places(0.004, pointing_sigma_arcsec=1e-9)
+    built = places(0.004)
     np.testing.assert_allclose(unit(marked - LASER_M), unit(design - LASER_M), rtol=0, atol=1e-12)
     outward_m = np.linalg.norm(built, axis=1) - APEX_M
     cosine = np.sum(unit(design) * unit(design - LASER_M), axis=1)
@@ -78,7 +84,8 @@ def test_a_shell_s_error_is_along_the_laser_s_line_where_the_laser_sees_nothing_
 
 def test_a_mount_s_orientation_rotates_all_holes_about_the_laser() -> None:
     """One rotation fits all directions from the laser; its size is that of three errors of 0.1 deg."""
-    design, real = unit(places() - LASER_M), unit(places(orientation_sigma_arcsec=360) - LASER_M)
+    design = unit(places() - LASER_M)
+    real = unit(places(orientation_sigma_arcsec=360) - LASER_M)
     by_axis = np.array([np.cross(axis, design).ravel() for axis in np.eye(3)])
     rotation, _, _, _ = np.linalg.lstsq(by_axis.T, (real - design).ravel())
     np.testing.assert_allclose(real, design + np.cross(rotation, design), rtol=0, atol=3e-5)
@@ -95,7 +102,8 @@ def test_a_drill_errs_in_the_surface() -> None:
 
 
 def test_a_laser_leaves_light_and_numbers_of_the_fibers_unchanged() -> None:
-    design, real = holes(), holes(0.004, pointing_sigma_arcsec=60, drill_sigma="0.1 mm")
+    design = holes()
+    real = holes(0.004, pointing_sigma_arcsec=60, drill_sigma="0.1 mm")
     for name in ("id", "strength", "normal", "radius_m", "start_s"):
         np.testing.assert_array_equal(getattr(real, name), getattr(design, name))
 
@@ -103,7 +111,10 @@ def test_a_laser_leaves_light_and_numbers_of_the_fibers_unchanged() -> None:
 @pytest.mark.parametrize(
     ("aiming", "says"),
     [
-        ('{laser: ["0 m", "0 m", "2 m"], pointing_sigma_arcsec: 5}', r"aiming\.laser: .* is outside of the dome"),
+        (
+            '{laser: ["0 m", "0 m", "2 m"], pointing_sigma_arcsec: 5}',
+            r"aiming\.laser: .* is outside of the dome",
+        ),
         ('{laser: ["0 m", "0 m", "0 m"], drill_sigma: "1 mm"}', "the laser's place has no effect"),
         ('{laser: ["0 m", "0 m", "0 m"], pointing_sigma_arcsec: 90000}', "passes below the rim"),
     ],

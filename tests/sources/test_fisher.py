@@ -8,14 +8,18 @@ from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 
 FISHER = interpreted("skysim.sources.dome.placement.fisher")
-CAMERA_M, TAN_HALF = np.array([0.03, -0.02, 0.3]), np.array([0.2, 0.1])
+CAMERA_M = np.array([0.03, -0.02, 0.3])
+TAN_HALF = np.array([0.2, 0.1])
 
 
 def dome(rng: np.random.Generator, count: int) -> np.ndarray:
     """Sites of 1.0 to 1.4 m about the bearing, down to 78 degrees from the zenith."""
-    z, azimuth = rng.uniform(0.2, 1, count), rng.uniform(0, 2 * np.pi, count)
+    z = rng.uniform(0.2, 1, count)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
     across = np.sqrt(1 - z**2)
-    return rng.uniform(1, 1.4, (count, 1)) * np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    return rng.uniform(1, 1.4, (count, 1)) * np.column_stack(
+        [across * np.cos(azimuth), across * np.sin(azimuth), z]
+    )
 
 
 def attitudes(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -30,7 +34,8 @@ def seen(R: np.ndarray, sites_m: np.ndarray) -> np.ndarray:
 
 def test_each_site_is_seen_by_the_attitudes_that_have_it_in_their_field() -> None:
     rng = np.random.default_rng(1)
-    sites_m, R = dome(rng, 100), attitudes(rng, 300)
+    sites_m = dome(rng, 100)
+    R = attitudes(rng, 300)
     start, attitude, information = FISHER.visible_from(sites_m, R, CAMERA_M, TAN_HALF)
     assert len(start) == 101
     assert start[0] == 0
@@ -50,7 +55,10 @@ def test_a_point_behind_the_camera_is_in_no_field() -> None:
 
 def test_an_led_s_information_is_that_of_its_tangents_slopes() -> None:
     """J'J by differences of small rotations in body axes; the sum's variance is the trace of the inverse."""
-    b, out, total, information = np.array([[0.2, -0.1, 1.2], [-0.1, 0.05, 1.1]]), np.empty(7), np.zeros(7), 0.0
+    b = np.array([[0.2, -0.1, 1.2], [-0.1, 0.05, 1.1]])
+    out = np.empty(7)
+    total = np.zeros(7)
+    information = 0.0
 
     def tangents(rotvec: np.ndarray, point: np.ndarray) -> np.ndarray:
         x, y, z = Rotation.from_rotvec(rotvec).apply(point) - CAMERA_M
@@ -58,11 +66,16 @@ def test_an_led_s_information_is_that_of_its_tangents_slopes() -> None:
 
     for point in b:
         FISHER.led_information(point, CAMERA_M, out)
-        slopes = np.array([(tangents(1e-6 * e, point) - tangents(-1e-6 * e, point)) / 2e-6 for e in np.eye(3)])
+        slopes = np.array(
+            [(tangents(1e-6 * e, point) - tangents(-1e-6 * e, point)) / 2e-6 for e in np.eye(3)]
+        )
         wanted = slopes @ slopes.T
         np.testing.assert_allclose(out[:3], np.diag(wanted), rtol=1e-8)
         np.testing.assert_allclose(out[3:6], wanted[[0, 0, 1], [1, 2, 2]], rtol=0, atol=1e-8)
         assert out[6] == 1
-        total, information = total + out, information + wanted
+        total = total + out
+        information = information + wanted
     prior = FISHER.PRIOR_INFORMATION * np.eye(3)
-    assert FISHER.variance(total[:6]) == pytest.approx(np.trace(np.linalg.inv(information + prior)), rel=1e-9)
+    assert FISHER.variance(total[:6]) == pytest.approx(
+        np.trace(np.linalg.inv(information + prior)), rel=1e-9
+    )

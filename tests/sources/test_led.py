@@ -13,20 +13,37 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.display_glow import black_glow
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
-from skysim.scene.sections.leds import AgingConfig, CosineLobeConfig, LedConfig, LobeTableConfig, WarmUpConfig
+from skysim.scene.sections.leds import (
+    AgingConfig,
+    CosineLobeConfig,
+    LedConfig,
+    LobeTableConfig,
+    WarmUpConfig,
+)
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.simulation.timing import exposure_window
 from skysim.sources.dome import sources
-from skysim.sources.dome.led import FALLOFF, LOBES, Emitter, aging_factors, irradiance_e_s_m2, warm_up_factor
+from skysim.sources.dome.led import (
+    FALLOFF,
+    LOBES,
+    Emitter,
+    aging_factors,
+    irradiance_e_s_m2,
+    warm_up_factor,
+)
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 ONE = np.ones(1)
 LAMBERT = Emitter()
 
 
-def irradiance(cos_out: float = 1.0, cos_in: float = 1.0, distance_m: float = 1.0, emitter: Emitter = LAMBERT) -> float:
-    return float(irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[0])
+def irradiance(
+    cos_out: float = 1.0, cos_in: float = 1.0, distance_m: float = 1.0, emitter: Emitter = LAMBERT
+) -> float:
+    return float(
+        irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[0]
+    )
 
 
 def cosine(exponent: float) -> Emitter:
@@ -44,7 +61,9 @@ def test_on_its_normal_at_a_meter_the_irradiance_is_the_strength() -> None:
 
 @pytest.mark.parametrize("distance_m", [0.1, 0.8382, 1.0, 3.0])
 def test_twice_as_far_is_a_quarter_as_bright(distance_m: float) -> None:
-    assert irradiance(distance_m=2 * distance_m) == pytest.approx(irradiance(distance_m=distance_m) / 4, rel=1e-14)
+    assert irradiance(distance_m=2 * distance_m) == pytest.approx(
+        irradiance(distance_m=distance_m) / 4, rel=1e-14
+    )
 
 
 def test_lambert_s_emitter_and_the_aperture_each_cost_a_cosine() -> None:
@@ -60,12 +79,17 @@ def test_reference_cosine_falloff_of_the_led_at_5_10_and_30_degrees() -> None:
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.5, 20.0])
 def test_the_lobe_is_the_cosine_to_its_exponent(exponent: float) -> None:
-    assert irradiance(cos_out=0.8, emitter=cosine(exponent)) == pytest.approx(5e12 * 0.8**exponent, rel=1e-13)
+    assert irradiance(cos_out=0.8, emitter=cosine(exponent)) == pytest.approx(
+        5e12 * 0.8**exponent, rel=1e-13
+    )
 
 
 def test_a_measured_lobe_goes_through_its_points_and_between_them() -> None:
     emitter = measured([0, 30, 60, 75], [1.0, 0.9, 0.5, 0.2])
-    made = [irradiance(np.cos(np.radians(angle)), emitter=emitter) / 5e12 for angle in (0, 30, 60, 45, 74.99)]
+    made = [
+        irradiance(np.cos(np.radians(angle)), emitter=emitter) / 5e12
+        for angle in (0, 30, 60, 45, 74.99)
+    ]
     np.testing.assert_allclose(made, [1, 0.9, 0.5, 0.7, 0.2002], rtol=0, atol=1e-9)
     assert irradiance(np.cos(np.radians(75.1)), emitter=emitter) == 0.0
 
@@ -90,9 +114,15 @@ def test_a_measured_lobe_that_falls_falls_in_between(seed: int) -> None:
     assert made.max() <= intensity[0]
 
 
-@pytest.mark.parametrize(("cos_out", "cos_in"), [(-0.1, 1.0), (0.0, 1.0), (1.0, -0.1), (1.0, 0.0), (-0.5, -0.5)])
-@pytest.mark.parametrize("emitter", [cosine(0.0), cosine(1.0), cosine(2.5), measured([0, 180], [1.0, 1.0])])
-def test_nothing_goes_backwards_or_comes_from_behind(cos_out: float, cos_in: float, emitter: Emitter) -> None:
+@pytest.mark.parametrize(
+    ("cos_out", "cos_in"), [(-0.1, 1.0), (0.0, 1.0), (1.0, -0.1), (1.0, 0.0), (-0.5, -0.5)]
+)
+@pytest.mark.parametrize(
+    "emitter", [cosine(0.0), cosine(1.0), cosine(2.5), measured([0, 180], [1.0, 1.0])]
+)
+def test_nothing_goes_backwards_or_comes_from_behind(
+    cos_out: float, cos_in: float, emitter: Emitter
+) -> None:
     assert irradiance(cos_out, cos_in, emitter=emitter) == 0.0
 
 
@@ -105,20 +135,29 @@ def test_a_lambertian_disk_sends_pi_times_its_strength_into_the_half_space() -> 
 
 
 def test_a_scene_s_led_names_its_laws() -> None:
-    part = {"intensity": "16 mcd", "disk_diameter": "2 mm", "lobe": {"kind": "cosine", "exponent": 3}}
+    part = {
+        "intensity": "16 mcd",
+        "disk_diameter": "2 mm",
+        "lobe": {"kind": "cosine", "exponent": 3},
+    }
     assert Emitter.from_config(LedConfig.model_validate(part)) == cosine(3.0)
     del part["lobe"]
     assert Emitter.from_config(LedConfig.model_validate(part)) == LAMBERT
 
 
 def test_every_lobe_of_a_scene_is_known_here() -> None:
-    kinds = [part.model_fields["kind"].annotation.__args__[0] for part in (CosineLobeConfig, LobeTableConfig)]
+    kinds = [
+        part.model_fields["kind"].annotation.__args__[0]
+        for part in (CosineLobeConfig, LobeTableConfig)
+    ]
     assert sorted(LOBES) == sorted(kinds)
 
 
 def test_the_falloff_that_a_scene_names_is_the_one_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(FALLOFF, "cubic", lambda distance_m: distance_m**-3.0)
-    assert irradiance(distance_m=2.0, emitter=Emitter("cubic")) == pytest.approx(5e12 / 8, rel=1e-14)
+    assert irradiance(distance_m=2.0, emitter=Emitter("cubic")) == pytest.approx(
+        5e12 / 8, rel=1e-14
+    )
 
 
 def test_every_falloff_falls() -> None:
@@ -132,7 +171,9 @@ def test_reference_electrons_of_a_bright_led() -> None:
     strength = led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30))
     at_camera = irradiance_e_s_m2(strength, LAMBERT, ONE, ONE, 33 * 0.0254 * ONE)
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2
-    assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(3.1e7, rel=0.02)  # two digits
+    assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(
+        3.1e7, rel=0.02
+    )  # two digits
 
 
 def test_every_falloff_law_can_be_named_in_a_scene() -> None:
@@ -158,7 +199,9 @@ def test_the_procedure_of_tm_21_finds_the_life_that_a_scene_states() -> None:
 @pytest.mark.parametrize("scatter", [0.2, {"tolerance": 0.3}])
 def test_leds_age_at_rates_of_their_own(scatter: object) -> None:
     config = aging(12_000.0, scatter)
-    rates = -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000))) / 12_000
+    rates = (
+        -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000))) / 12_000
+    )
     nominal = math.log(1 / 0.7) / 36_000
     if isinstance(scatter, float):
         assert np.log(rates / nominal).std() == pytest.approx(scatter, rel=0.02)
@@ -197,7 +240,10 @@ def test_panels_age_as_one() -> None:
     ]
     new, old = (camera.sources.strength for camera in cameras)
     np.testing.assert_allclose(old / new, math.sqrt(0.7), rtol=1e-12)
-    glows = [black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band) for one in cameras]
+    glows = [
+        black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band)
+        for one in cameras
+    ]
     assert glows[0] is not None
     assert glows[0].max() > 0
     np.testing.assert_allclose(glows[1], math.sqrt(0.7) * glows[0], rtol=1e-12)
@@ -207,7 +253,9 @@ def test_warm_up_is_the_cooling_law_of_newton() -> None:
     """The light follows d g / d t = (steady - g) / time from 1."""
     config = WarmUpConfig.model_validate({"steady": 0.88, "time": "7 min"})
     times = np.array([10.0, 60.0, 420.0, 3000.0])
-    solved = solve_ivp(lambda _, g: (0.88 - g) / 420, (0, 3000), [1.0], t_eval=times, rtol=1e-10, atol=1e-12).y[0]
+    solved = solve_ivp(
+        lambda _, g: (0.88 - g) / 420, (0, 3000), [1.0], t_eval=times, rtol=1e-10, atol=1e-12
+    ).y[0]
     np.testing.assert_allclose([warm_up_factor(config, t_s) for t_s in times], solved, rtol=1e-8)
 
 
@@ -228,7 +276,9 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[s
         dark_dn, cold_dn, warm_dn = (still(scene, told, index) for told in (dark, keys, warm))
         t_s = exposure_window(loader.load(scene, keys), index).middle_s(len(dark_dn))
         left = 0.8 + 0.2 * math.exp(-t_s / 2)
-        np.testing.assert_allclose(warm_dn - dark_dn, left * (cold_dn - dark_dn), rtol=0, atol=1e-9 * cold_dn.max())
+        np.testing.assert_allclose(
+            warm_dn - dark_dn, left * (cold_dn - dark_dn), rtol=0, atol=1e-9 * cold_dn.max()
+        )
 
 
 def still(scene: str, keys: dict[str, str], index: int) -> Floats:

@@ -13,7 +13,9 @@ from skysim.sources.dome.placement.neighborhoods import unique_levels
 SCENE = "coded_spiral"
 
 
-def surroundings(place: np.ndarray, level: np.ndarray, led: int, nearest: int) -> tuple[tuple[int, ...], ...]:
+def surroundings(
+    place: np.ndarray, level: np.ndarray, led: int, nearest: int
+) -> tuple[tuple[int, ...], ...]:
     """All turns of the levels of the nearest LEDs, by their angles in the picture of a camera that looks at one."""
     others = np.argsort(np.linalg.norm(place - place[led], axis=1))[1 : nearest + 1]
     up = place[led]
@@ -35,7 +37,10 @@ def test_no_two_neighborhoods_are_alike_however_they_are_turned() -> None:
 @pytest.mark.parametrize(
     ("layout", "reason"),
     [
-        ("{kind: fibonacci, count: 400, cap_deg: 34, unique_neighbors: 6}", "all LEDs are equally bright"),
+        (
+            "{kind: fibonacci, count: 400, cap_deg: 34, unique_neighbors: 6}",
+            "all LEDs are equally bright",
+        ),
         (
             "{kind: fibonacci, count: 400, cap_deg: 34, levels: [1, 0.5], unique_neighbors: 17}",
             "less than or equal to 16",
@@ -53,7 +58,9 @@ def test_layouts_that_cannot_have_them_are_refused(layout: str, reason: str) -> 
 
 def test_too_few_levels_or_leds_are_refused() -> None:
     rng = np.random.default_rng(2)
-    with pytest.raises(InputError, match=r"3 with 2 levels leave some of 60 LEDs alike; allowed: more levels"):
+    with pytest.raises(
+        InputError, match=r"3 with 2 levels leave some of 60 LEDs alike; allowed: more levels"
+    ):
         unique_levels(2, 3, cap(60, 0.6), rng)
     with pytest.raises(InputError, match=r"unique_neighbors: 6 of 6 LEDs; allowed: fewer"):
         unique_levels(3, 6, cap(6, 0.6), rng)

@@ -25,7 +25,9 @@ from skysim.sources.photometry import Band, star_flux_e_s_m2
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
 LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
 BAND = Band.from_efficiency("cmos")
-COUNT, TILT_DEG, CAP_DEG = 120, 8.0, 13.0
+COUNT = 120
+TILT_DEG = 8.0
+CAP_DEG = 13.0
 WANTED = {
     "kind": "optimized",
     "cap_deg": CAP_DEG,
@@ -69,7 +71,9 @@ def test_places_are_searched_once_for_each_dome_and_camera() -> None:
     assert spreads.optimized_places.cache_info().misses == 1
     np.testing.assert_array_equal(again.place, first.place)
     full = first.strength.max()
-    np.testing.assert_allclose(np.where(first.strength < 0.9 * full, 0.25, 1), again.strength / full, rtol=0.1)
+    np.testing.assert_allclose(
+        np.where(first.strength < 0.9 * full, 0.25, 1), again.strength / full, rtol=0.1
+    )
     spreads.optimized_places.cache_clear()
     np.testing.assert_array_equal(lit(few).strength, first.strength)
     assert not np.array_equal(lit(few | {"hardware_seed": 1}).place, first.place)
@@ -82,7 +86,9 @@ def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) ->
     tilt = np.arccos(1 - rng.random(count) * (1 - np.cos(np.radians(tilt_deg))))
     turns = rng.uniform(0, 7, (2, count))
     out = []
-    for R_body_from_lab in Rotation.from_euler("ZYZ", np.column_stack([turns[0], tilt, turns[1]])).as_matrix():
+    for R_body_from_lab in Rotation.from_euler(
+        "ZYZ", np.column_stack([turns[0], tilt, turns[1]])
+    ).as_matrix():
         b = place_m @ R_body_from_lab.T
         x = (b[:, :2] / (b[:, 2:] - 0.381)) / np.tan(np.radians([5, 3.75]))
         b = b[np.all(np.abs(x) <= 1, axis=1)]
@@ -113,7 +119,9 @@ def sparse_is_not_worse(seed: int, **more: int) -> None:
     unseen = optimize.sample_attitudes(config, 100_000, np.random.default_rng(77))
 
     def worst(leds: Sources) -> float:
-        each = fisher.variances(fisher.total_information(leds.place[:, :3], unseen, *optimize.camera_geometry(config)))
+        each = fisher.variances(
+            fisher.total_information(leds.place[:, :3], unseen, *optimize.camera_geometry(config))
+        )
         return float(np.sort(each)[-1000:].mean())
 
     mine = worst(lit(wanted))
@@ -131,7 +139,13 @@ def test_where_few_leds_are_seen_its_worst_attitudes_are_no_worse() -> None:
 def test_with_any_seed_it_is_not_worse(seed: int) -> None:
     """As shipped: sparse, and dense, where it is clearly better, at 5,000 attitudes that it was not made for."""
     sparse_is_not_worse(seed, rounds=100)
-    shipped = {"count": 400, "tilt_deg": 20.0, "cap_deg": 25.0, "hardware_seed": seed, "rounds": 100}
+    shipped = {
+        "count": 400,
+        "tilt_deg": 20.0,
+        "cap_deg": 25.0,
+        "hardware_seed": seed,
+        "rounds": 100,
+    }
     mine = variances(lit(WANTED | shipped).place[:, :3], 20.0, 5000)
     for kind in ("fibonacci", "poisson_disk"):
         other = variances(spread(kind, 400, 25.0).place[:, :3], 20.0, 5000)
@@ -142,7 +156,10 @@ def test_with_any_seed_it_is_not_worse(seed: int) -> None:
 def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
     place_m = best.place[:, :3]
     assert len(best) == COUNT
-    assert np.degrees(np.arccos(place_m[:, 2] / np.linalg.norm(place_m, axis=1))).max() <= CAP_DEG + 1e-9
+    assert (
+        np.degrees(np.arccos(place_m[:, 2] / np.linalg.norm(place_m, axis=1))).max()
+        <= CAP_DEG + 1e-9
+    )
     assert cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= 0.012
     center_in = np.array([0, 0, 48 - 28.60])
     level = np.sum(((place_m / 0.0254 - center_in) / [38.88, 38.88, 28.60]) ** 2, axis=1)
@@ -162,7 +179,8 @@ def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_its_information_is_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
-    part, place_m = layouts.OptimizedConfig.model_validate(WANTED), best.place[:, :3]
+    part = layouts.OptimizedConfig.model_validate(WANTED)
+    place_m = best.place[:, :3]
     judged = [np.eye(3)[None], np.array(part.camera_m), optimize.tan_half(part)]
     seen = fisher.Visibility(*fisher.visible_from(place_m, *judged))
     total = fisher.total_information(place_m, *judged)[0]
@@ -171,8 +189,12 @@ def test_its_information_is_the_estimator_s(best: Sources) -> None:
     rays = q / np.linalg.norm(q, axis=1, keepdims=True)
     lever = Lever(np.array(part.camera_m), Rotation.identity())
     leds = LedMap(np.arange(len(q)), q + part.camera_m, np.zeros(3), np.ones(3))
-    _, covariance = rotation_only(rays, np.ones(len(q)), leds.position_m, leds, lever, Rotation.identity())
-    assert fisher.variance(total) == pytest.approx(np.trace(covariance), rel=1e-3)  # the prior's part
+    _, covariance = rotation_only(
+        rays, np.ones(len(q)), leds.position_m, leds, lever, Rotation.identity()
+    )
+    assert fisher.variance(total) == pytest.approx(
+        np.trace(covariance), rel=1e-3
+    )  # the prior's part
 
 
 def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
@@ -184,7 +206,9 @@ def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
 @pytest.mark.slow
 def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror_is_not() -> None:
     """Seven LEDs, and the same rigidly turned by 30 deg: share 1, LED on LED; two left out: 5 of 7."""
-    pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60]))
+    pattern = on_sphere(
+        np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60])
+    )
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
     seen = (
         0.3,
@@ -195,18 +219,24 @@ def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror
     whole = field_ambiguity(np.concatenate([pattern, turned]), *seen)
     assert whole.fraction[0] == 1
     np.testing.assert_array_equal(whole.other[[0, 7]], [7, 0])
-    assert field_ambiguity(np.concatenate([pattern, turned[:5]]), *seen).fraction[0] == pytest.approx(5 / 7, abs=1e-12)
+    assert field_ambiguity(np.concatenate([pattern, turned[:5]]), *seen).fraction[
+        0
+    ] == pytest.approx(5 / 7, abs=1e-12)
     mirrored = turned.copy() @ np.diag([1.0, -1.0, 1.0])
     assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).fraction[0] < 0.5
 
 
 @pytest.mark.slow
 def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
-    pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5]), np.array([0, 20, 250, 110, 305, 170]))
+    pattern = on_sphere(
+        np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5]), np.array([0, 20, 250, 110, 305, 170])
+    )
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
     turned[4] += [0.0, 2e-3, 0.0]
     for coincidence_m, coincide in ((1e-4, 5), (3e-3, 6)):
-        found = field_ambiguity(np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), coincidence_m)
+        found = field_ambiguity(
+            np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), coincidence_m
+        )
         assert found.fraction[0] == pytest.approx(coincide / 6, abs=1e-12)
 
 
@@ -215,7 +245,9 @@ def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(bes
     """A Fibonacci spiral is itself again a step along: benchmarks/dome_identify.py refuses 89 frames of a hundred."""
     config = layouts.OptimizedConfig.model_validate(WANTED)
     assert optimize.layout_ambiguity(config, best.place[:, :3]).fraction.max() <= 0.5
-    afit = layouts.OptimizedConfig.model_validate(WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400})
+    afit = layouts.OptimizedConfig.model_validate(
+        WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400}
+    )
     spiral = optimize.layout_ambiguity(afit, spread("fibonacci", 1400, 40.0).place[:, :3])
     assert np.mean(spiral.fraction > 0.8) > 0.85
     darts = optimize.layout_ambiguity(afit, spread("poisson_disk", 1400, 40.0).place[:, :3])
@@ -257,17 +289,22 @@ def test_an_led_is_as_bright_as_the_chip_finds_its_star() -> None:
 
 def test_doubles_within_a_disk_are_one_led_of_their_light() -> None:
     """No light is lost, and no two are nearer than a disk, though merged ones stand between their stars' places."""
-    wide, fine = (
-        lit(SKY),
-        dome.sources(
-            DomeConfig.model_validate(
-                {"kind": "dome", "surface": MEASURED, "layout": SKY, "led": LED | {"disk_diameter": "1 um"}}
-            ),
-            BAND,
+    wide = lit(SKY)
+    fine = dome.sources(
+        DomeConfig.model_validate(
+            {
+                "kind": "dome",
+                "surface": MEASURED,
+                "layout": SKY,
+                "led": LED | {"disk_diameter": "1 um"},
+            }
         ),
+        BAND,
     )
     assert len(wide) < len(fine)
-    assert cKDTree(wide.place[:, :3]).query(wide.place[:, :3], k=2)[0][:, 1].min() > 2e-3 * (1 - 1e-6)
+    assert cKDTree(wide.place[:, :3]).query(wide.place[:, :3], k=2)[0][:, 1].min() > 2e-3 * (
+        1 - 1e-6
+    )
     lights = [np.sum(10 ** (-0.4 * leds.magnitude)) for leds in (wide, fine)]
     assert lights[0] == pytest.approx(lights[1], rel=1e-12)
 
@@ -280,8 +317,12 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
     sites_m, layout_m = (spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50))
     for fraction in (1.0, 0.5):
         placed = optimize.contract(layout_m, sites_m, fraction)
-        wanted, found = (place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed))
-        np.testing.assert_allclose(1 - found[:, 2], fraction * (1 - wanted[:, 2]), rtol=0, atol=3e-3)
+        wanted, found = (
+            place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed)
+        )
+        np.testing.assert_allclose(
+            1 - found[:, 2], fraction * (1 - wanted[:, 2]), rtol=0, atol=3e-3
+        )
         across = wanted[:, 0] * found[:, 1] - wanted[:, 1] * found[:, 0]
         np.testing.assert_allclose(across, 0, rtol=0, atol=3e-3)
         assert cKDTree(sites_m).query(placed)[0].max() == 0
@@ -296,15 +337,26 @@ def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
 def test_field_and_lever_are_the_scene_s_own_if_left_out() -> None:
     """2 atan(w / 2 f) of the chip's sides, f the image distance; of a layout on a panel or of fibers too."""
     layout = "{kind: optimized, count: 20, cap_deg: 20, tilt_deg: 8, spacing: 20 mm%s}"
-    own = {"vehicle.camera": "[0 m, 0 m, 0.3 m]", "camera.focal_length": "20 mm", "camera.focus": "1 m"}
+    own = {
+        "vehicle.camera": "[0 m, 0 m, 0.3 m]",
+        "camera.focal_length": "20 mm",
+        "camera.focus": "1 m",
+    }
     for text in (layout % "", "{kind: fibers, points: %s}" % (layout % "")):
-        found = loader.load("afit_simsat", own | {"light.layout": text, "light.led.drive": "{kind: direct}"})
+        found = loader.load(
+            "afit_simsat", own | {"light.layout": text, "light.led.drive": "{kind: direct}"}
+        )
         points = getattr(found.light.layout, "points", found.light.layout)
         assert points.camera_m == (0, 0, 0.3)
-        distance_m, sides_m = 1 / (1 / 0.02 - 1 / 1), np.array([1600, 1200]) * found.camera.pixel_m
-        assert points.field_deg == pytest.approx(np.degrees(2 * np.arctan(sides_m / 2 / distance_m)), rel=1e-12)
+        distance_m = 1 / (1 / 0.02 - 1 / 1)
+        sides_m = np.array([1600, 1200]) * found.camera.pixel_m
+        assert points.field_deg == pytest.approx(
+            np.degrees(2 * np.arctan(sides_m / 2 / distance_m)), rel=1e-12
+        )
     given = ", field_deg: [10, 7.5], camera: [0 m, 0 m, 15 in]"
     points = loader.load("afit_simsat", own | {"light.layout": layout % given}).light.layout
     assert (points.field_deg, points.camera_m) == ((10, 7.5), (0, 0, pytest.approx(0.381)))
-    with pytest.raises(InputError, match=r"light\.layout\.camera: missing; allowed: that, or vehicle\.camera"):
+    with pytest.raises(
+        InputError, match=r"light\.layout\.camera: missing; allowed: that, or vehicle\.camera"
+    ):
         loader.load("afit_simsat", {"light.layout": layout % ""})

@@ -43,7 +43,10 @@ from skysim.sources.photometry import (
 
 ALL = Band.from_efficiency(1.0)
 CURVES = ["cmos", "interline", "thick_ccd"]
-A0, K3, M1 = (0.0, 0.004), (0.99, 1.03), (1.485, 2.005)  # B-V and V-I of the sequence's own A0V, K3V, M1V
+# B-V and V-I of the sequence's own A0V, K3V, M1V
+A0 = (0.0, 0.004)
+K3 = (0.99, 1.03)
+M1 = (1.485, 2.005)
 
 # The response of Gaia's G to photons every 40 nm, rounded: Riello et al. 2021, A&A 649, A3, by PyPI speclite 1.0.0.
 GAIA_G_NM = np.arange(320, 1081, 40)
@@ -70,7 +73,15 @@ GAIA_G = [
     0.0,
 ]
 # G-V of dwarfs by E. Mamajek's table, version 2024.05.15 (see data/bands/stellar_sequence.csv), by their V-I.
-G_V = {-0.165: 0.013, 0.004: 0.015, 0.339: -0.06, 0.713: -0.155, 0.853: -0.21, 1.03: -0.31, 2.005: -0.81}
+G_V = {
+    -0.165: 0.013,
+    0.004: 0.015,
+    0.339: -0.06,
+    0.713: -0.155,
+    0.853: -0.21,
+    1.03: -0.31,
+    2.005: -0.81,
+}
 
 
 def test_a_g2_star_sends_the_reference_s_photons() -> None:
@@ -103,7 +114,9 @@ def test_black_body_colors_are_planck_s() -> None:
     """Two wavelengths' ratio by Planck's law with its constants written out; Wien's peak where it belongs."""
     red, blue = black_body_v0(np.array([800e-9, 450e-9]), np.array(5000.0))
     x_red, x_blue = (1.438776877e-2 / (nm * 1e-9 * 5000) for nm in (800, 450))
-    assert red / blue == pytest.approx((450 / 800) ** 4 * np.expm1(x_blue) / np.expm1(x_red), rel=1e-8)
+    assert red / blue == pytest.approx(
+        (450 / 800) ** 4 * np.expm1(x_blue) / np.expm1(x_red), rel=1e-8
+    )
     grid = np.arange(300e-9, 1200e-9, 0.1e-9)
     peak_m = grid[np.argmax(black_body_v0(grid, np.array(5000.0)) / grid)]  # of energy
     assert peak_m == pytest.approx(2.897771955e-3 / 5000, abs=0.1e-9)
@@ -112,21 +125,28 @@ def test_black_body_colors_are_planck_s() -> None:
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
     flux = star_flux_e_s_m2(np.array([[-1.0, 4.0], [1.5, 6.5]]), 0.3, 0.4, ALL)
     assert flux.shape == (2, 2)
-    np.testing.assert_allclose(flux[:, 0] / flux[:, 1], 100.0, rtol=1e-12, atol=0)  # Pogson's definition
+    np.testing.assert_allclose(
+        flux[:, 0] / flux[:, 1], 100.0, rtol=1e-12, atol=0
+    )  # Pogson's definition
 
 
 def test_liebe_s_rate_is_that_of_a_third_of_the_photons() -> None:
     # Reference §2: 19,100 e-/s/mm² at V = 0 is efficiency times transmission of 0.34, three figures.
-    assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency(0.34)) * 1e-6 == pytest.approx(19_100, rel=2e-3)
+    assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency(0.34)) * 1e-6 == pytest.approx(
+        19_100, rel=2e-3
+    )
 
 
 def test_an_interline_chip_takes_the_reference_s_rate() -> None:
     # Reference §2: 15,000 e-/s/mm². The curve's height was chosen for it; three figures.
-    assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency("interline")) * 1e-6 == pytest.approx(15_000, rel=5e-3)
+    assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency("interline")) * 1e-6 == pytest.approx(
+        15_000, rel=5e-3
+    )
 
 
 @pytest.mark.parametrize(
-    ("curve", "a0", "k3", "m"), [("interline", 0.01, -0.08, -0.28), ("thick_ccd", 0.19, -0.21, -0.55)]
+    ("curve", "a0", "k3", "m"),
+    [("interline", 0.01, -0.08, -0.28), ("thick_ccd", 0.19, -0.21, -0.55)],
 )
 def test_red_stars_look_brighter_to_silicon(curve: str, a0: float, k3: float, m: float) -> None:
     """Reference §2, instrumental offset against G2.
@@ -142,7 +162,8 @@ def test_red_stars_look_brighter_to_silicon(curve: str, a0: float, k3: float, m:
 
 def test_a_thick_chip_is_redder_than_cmos_and_that_than_interline() -> None:
     offsets = [
-        float(synthetic_mag(0.0, *M1, Band.from_efficiency(name))) for name in ("thick_ccd", "cmos", "interline")
+        float(synthetic_mag(0.0, *M1, Band.from_efficiency(name)))
+        for name in ("thick_ccd", "cmos", "interline")
     ]
     assert offsets == sorted(offsets)
 
@@ -160,7 +181,9 @@ def test_measured_stars_from_b5_to_k0_are_black_bodies_in_a_broad_band(v_i: floa
 
 
 @pytest.mark.parametrize(("v_i", "short_mag"), [(1.03, 0.05), (2.005, 0.25)])
-def test_measured_cool_stars_are_brighter_than_black_bodies_by_what_the_docs_say(v_i: float, short_mag: float) -> None:
+def test_measured_cool_stars_are_brighter_than_black_bodies_by_what_the_docs_say(
+    v_i: float, short_mag: float
+) -> None:
     assert gaia_offset(v_i) - (G_V[v_i] - G_V[0.713]) == pytest.approx(short_mag, abs=0.02)
 
 
@@ -179,7 +202,9 @@ def test_known_stars_have_about_their_temperatures() -> None:
     row = {int(hip): n for n, hip in enumerate(stars.hip)}
     kelvin = temperature_k(stars.b_v, stars.v_i)
     known = {32349: 9940, 37279: 6530, 71683: 5790, 21421: 3900, 27989: 3600}
-    np.testing.assert_allclose([kelvin[row[hip]] for hip in known], [*known.values()], rtol=0.04, atol=0)
+    np.testing.assert_allclose(
+        [kelvin[row[hip]] for hip in known], [*known.values()], rtol=0.04, atol=0
+    )
     assert kelvin[row[69673]] == pytest.approx(4290, rel=0.06)
 
 
@@ -236,7 +261,9 @@ def test_a_sky_of_a_star_a_square_arcsecond() -> None:
 def test_one_watt_of_555_nm_is_683_lumens() -> None:
     # By hand: 683 cd are 1 W/sr of photons of 3.57918e-19 J each.
     assert led_strength_e_s_sr(683.0, 555e-9, ALL) == pytest.approx(1 / 3.57918e-19, rel=1e-5)
-    assert led_strength_e_s_sr(683.0, 555e-9, Band.from_efficiency(0.25)) == pytest.approx(0.25 / 3.57918e-19, rel=1e-5)
+    assert led_strength_e_s_sr(683.0, 555e-9, Band.from_efficiency(0.25)) == pytest.approx(
+        0.25 / 3.57918e-19, rel=1e-5
+    )
 
 
 def test_the_eye_s_curve_is_the_cie_s() -> None:
@@ -258,7 +285,9 @@ def test_an_led_fills_the_lens_as_the_reference_says() -> None:
     Our white light has 304 lm/W (1.5 % less power) in photons of 563 nm on average (1.6 % more of them a watt),
     so that with a flat QE the two differ by less than half a per cent.
     """
-    electrons_ms = led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)) * pupil_sr() * 0.85 * 1e-3
+    electrons_ms = (
+        led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)) * pupil_sr() * 0.85 * 1e-3
+    )
     assert electrons_ms == pytest.approx(3.1e7, rel=0.02)
     green = 0.6 / 300 / 3.57918e-19 * pupil_sr() * 0.85 * 0.30 * 1e-3
     assert electrons_ms == pytest.approx(green, rel=0.005)
@@ -283,7 +312,8 @@ def read_columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("wavelength_m", [340e-9, 900e-9])
 def test_light_that_nobody_sees_has_no_candelas(wavelength_m: float) -> None:
     with pytest.raises(
-        InputError, match=r"^light\.led\.spectrum: .* candelas; allowed: 360 to 830 nm, or radiant_intensity$"
+        InputError,
+        match=r"^light\.led\.spectrum: .* candelas; allowed: 360 to 830 nm, or radiant_intensity$",
     ):
         led_strength_e_s_sr(0.1, wavelength_m, ALL)
 
@@ -293,15 +323,17 @@ def test_a_watt_is_a_watt_by_whichever_name() -> None:
     for spectrum in ("white", 555e-9, 630e-9):
         watts = 0.2 / lumens_per_watt(spectrum)
         by_eye = led_strength_e_s_sr(0.2, spectrum, Band.from_efficiency("cmos"))
-        assert radiant_strength_e_s_sr(watts, spectrum, Band.from_efficiency("cmos")) == pytest.approx(
-            by_eye, rel=1e-12
-        )
+        assert radiant_strength_e_s_sr(
+            watts, spectrum, Band.from_efficiency("cmos")
+        ) == pytest.approx(by_eye, rel=1e-12)
     assert lumens_per_watt(555e-9) == pytest.approx(683, rel=1e-5)
 
 
 def test_an_infrared_lamp_gives_one_electron_a_photon_of_a_perfect_chip() -> None:
     photon_j = 6.62607015e-34 * 299792458 / 850e-9
-    assert radiant_strength_e_s_sr(3e-3, 850e-9, Band.from_efficiency(1.0)) == pytest.approx(3e-3 / photon_j, rel=1e-9)
+    assert radiant_strength_e_s_sr(3e-3, 850e-9, Band.from_efficiency(1.0)) == pytest.approx(
+        3e-3 / photon_j, rel=1e-9
+    )
 
 
 def test_ec655_collects_the_reference_s_electrons() -> None:
@@ -323,21 +355,28 @@ def test_ec655_has_the_reference_s_signal_to_noise(
     It prints no background. With none we get 56.2, 27.1, 19.7, 11.9 (2-8 % more); any background of 23 to 29 e-
     a pixel gives all eight numbers as printed, so it had one of about 25.
     """
-    signal = np.array([6008, 2392, 1655, 952]) * 0.99929  # within 5 x 5 px: erf(5 / (2 sqrt(2) .7))^2
+    signal = (
+        np.array([6008, 2392, 1655, 952]) * 0.99929
+    )  # within 5 x 5 px: erf(5 / (2 sqrt(2) .7))^2
     off = np.abs(snr(signal, 25, 25.0, read_noise_e) - printed)
     assert np.all(off <= rounding)
 
 
 def test_snr_is_that_of_drawn_pixels() -> None:
     """Mean over standard deviation of 20,000 sums of 25 pixels, each Poisson light plus Gaussian read noise."""
-    rng, n = np.random.default_rng(3), 20_000
+    rng = np.random.default_rng(3)
+    n = 20_000
     total = rng.poisson(1500 + 25 * 30, n) + rng.normal(0, 12 * 5, n) - 25 * 30
     # The relative error of a standard deviation of n draws is 1 / sqrt(2 n): four of them.
-    assert total.mean() / total.std() == pytest.approx(float(snr(1500, 25, 30, 12)), rel=4 / np.sqrt(2 * n))
+    assert total.mean() / total.std() == pytest.approx(
+        float(snr(1500, 25, 30, 12)), rel=4 / np.sqrt(2 * n)
+    )
 
 
 def test_a_number_is_flat_and_its_integral_exact() -> None:
-    assert Band.from_efficiency(0.4).integral(np.ones_like) == pytest.approx(0.4 * 600e-9, rel=1e-12)
+    assert Band.from_efficiency(0.4).integral(np.ones_like) == pytest.approx(
+        0.4 * 600e-9, rel=1e-12
+    )
     np.testing.assert_array_equal(
         Band.from_efficiency(0.4).response_at([399e-9, 400e-9, 1000e-9, 1001e-9]), [0, 0.4, 0.4, 0]
     )
@@ -346,16 +385,21 @@ def test_a_number_is_flat_and_its_integral_exact() -> None:
 
 @pytest.mark.parametrize("curve", CURVES)
 def test_curves_are_efficiencies_of_silicon_and_say_where_they_come_from(curve: str) -> None:
-    band, text = Band.from_efficiency(curve), curve_file(curve).read_text()
+    band = Band.from_efficiency(curve)
+    text = curve_file(curve).read_text()
     assert text.startswith("#")
     assert "assumed" in text.split("wavelength_nm")[0]
     assert np.all((band.response >= 0) & (band.response <= 0.96))
-    assert 380e-9 <= band.wavelength_m[0] < band.wavelength_m[-1] <= 1110e-9  # glass to silicon's edge
+    assert (
+        380e-9 <= band.wavelength_m[0] < band.wavelength_m[-1] <= 1110e-9
+    )  # glass to silicon's edge
     assert Band.from_efficiency(curve) is band
 
 
 def test_a_wrong_name_is_answered_with_the_right_ones() -> None:
-    with pytest.raises(ValueError, match=r"^unknown curve 'emccd'; allowed: cmos, interline, thick_ccd$"):
+    with pytest.raises(
+        ValueError, match=r"^unknown curve 'emccd'; allowed: cmos, interline, thick_ccd$"
+    ):
         Band.from_efficiency("emccd")
     with pytest.raises(ValueError, match=r"^unknown curve 'gone\.csv'; allowed: cmos"):
         curve_file("gone.csv")
@@ -399,13 +443,15 @@ def lens(tmp_path: Path) -> Path:
 
 def camera_with(transmission: Path | float) -> CameraConfig:
     return loader.load(
-        "shefex2", {"camera.transmission": str(transmission), "camera.detector.quantum_efficiency": "cmos"}
+        "shefex2",
+        {"camera.transmission": str(transmission), "camera.detector.quantum_efficiency": "cmos"},
     ).camera
 
 
 def test_the_response_is_the_efficiency_times_the_transmission(lens: Path) -> None:
     """Stars, glow, white and colored LEDs, against adaptive quadrature of the two curves."""
-    band, chip = Band.from_camera(camera_with(lens)), Band.from_efficiency("cmos")
+    band = Band.from_camera(camera_with(lens))
+    chip = Band.from_efficiency("cmos")
 
     def response(nm: float) -> float:
         return float(chip.response_at(nm * 1e-9)) * float(
@@ -414,35 +460,63 @@ def test_the_response_is_the_efficiency_times_the_transmission(lens: Path) -> No
 
     def electrons(photons: Callable[[float], float]) -> float:
         knots = [420, 425, 450, 470, *range(475, 901, 25)]
-        return sum(quad(lambda nm: photons(nm) * response(nm) * 1e-9, *ends)[0] for ends in itertools.pairwise(knots))
+        return sum(
+            quad(lambda nm: photons(nm) * response(nm) * 1e-9, *ends)[0]
+            for ends in itertools.pairwise(knots)
+        )
 
     for color in (A0, SUN, M1):
         kelvin = temperature_k(*color)
-        wanted = electrons(lambda nm, kelvin=kelvin: float(black_body_v0(np.array([nm * 1e-9]), kelvin)[0]))
+        wanted = electrons(
+            lambda nm, kelvin=kelvin: float(black_body_v0(np.array([nm * 1e-9]), kelvin)[0])
+        )
         assert star_flux_e_s_m2(0.0, *color, band) == pytest.approx(wanted, rel=2e-5)
     sun = float(star_flux_e_s_m2(20.0, *SUN, band))
-    assert float(sky_radiance_e_s_m2_sr(20.0, band)) * math.radians(1 / 3600) ** 2 == pytest.approx(sun, rel=1e-12)
-    assert radiant_strength_e_s_sr(1.0, 470e-9, band) == pytest.approx(470e-9 / HC_J_M * response(470), rel=1e-12)
+    assert float(sky_radiance_e_s_m2_sr(20.0, band)) * math.radians(1 / 3600) ** 2 == pytest.approx(
+        sun, rel=1e-12
+    )
+    assert radiant_strength_e_s_sr(1.0, 470e-9, band) == pytest.approx(
+        470e-9 / HC_J_M * response(470), rel=1e-12
+    )
     sigma = 20 / math.sqrt(8 * math.log(2))
 
     def line(nm: float) -> float:
-        return math.exp(-0.5 * ((nm - 460) / sigma) ** 2) / (math.sqrt(2 * math.pi) * sigma) * nm / HC_J_M
+        return (
+            math.exp(-0.5 * ((nm - 460) / sigma) ** 2)
+            / (math.sqrt(2 * math.pi) * sigma)
+            * nm
+            / HC_J_M
+        )
 
-    assert radiant_strength_e_s_sr(1.0, 460e-9, band, 20e-9) == pytest.approx(electrons(line), rel=2e-4)
+    assert radiant_strength_e_s_sr(1.0, 460e-9, band, 20e-9) == pytest.approx(
+        electrons(line), rel=2e-4
+    )
     assert Band.from_camera(camera_with(lens)) is band
 
 
-ORION = {"background": "[{kind: sky, mag_arcsec2: 19}]", "motion.start": "{ra_deg: 84, dec_deg: -1.2}"}
+ORION = {
+    "background": "[{kind: sky, mag_arcsec2: 19}]",
+    "motion.start": "{ra_deg: 84, dec_deg: -1.2}",
+}
 
 
-@pytest.mark.parametrize(("scene", "keys"), [("shefex2", ORION), ("afit_simsat", {"camera.pixel": "32 um"})])
-def test_a_gray_curve_gives_the_frame_of_its_number(scene: str, keys: dict[str, str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scene", "keys"), [("shefex2", ORION), ("afit_simsat", {"camera.pixel": "32 um"})]
+)
+def test_a_gray_curve_gives_the_frame_of_its_number(
+    scene: str, keys: dict[str, str], tmp_path: Path
+) -> None:
     """Every light, the sky's glow included, passes the lens once."""
     path = tmp_path / "gray.csv"
     path.write_text("wavelength_nm,transmission\n300,0.6\n1200,0.6\n")
-    keys = {"camera.width_px": "200", "camera.height_px": "150", "camera.detector.noise": "false"} | keys
+    keys = {
+        "camera.width_px": "200",
+        "camera.height_px": "150",
+        "camera.detector.noise": "false",
+    } | keys
     number, curve = (
-        still_frame(loader.load(scene, keys | {"camera.transmission": given})) for given in ("0.6", str(path))
+        still_frame(loader.load(scene, keys | {"camera.transmission": given}))
+        for given in ("0.6", str(path))
     )
     assert np.ptp(number) > 10
     np.testing.assert_allclose(curve, number, rtol=1e-9, atol=1e-9)
@@ -456,11 +530,15 @@ def still_frame(scene: Scene) -> Floats:
 def test_a_lens_that_lets_nothing_to_the_chip_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "infrared.csv"
     path.write_text("wavelength_nm,transmission\n1300,0.6\n1400,0.6\n")
-    with pytest.raises(InputError, match=r"^camera\.transmission: lets nothing through .*; allowed: an overlap$"):
+    with pytest.raises(
+        InputError, match=r"^camera\.transmission: lets nothing through .*; allowed: an overlap$"
+    ):
         Band.from_camera(camera_with(path))
 
 
-@pytest.mark.parametrize(("value", "message"), [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")])
+@pytest.mark.parametrize(
+    ("value", "message"), [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")]
+)
 def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
     with pytest.raises(InputError, match=f"^camera.transmission: .*{message}"):
         loader.load("shefex2", {"camera.transmission": value})
@@ -468,11 +546,14 @@ def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
 
 def test_a_measured_spectrum(tmp_path: Path) -> None:
     """A table of a Gaussian is a colored LED, in any unit of power; that of the white LED is the white LED."""
-    band, path = Band.from_efficiency("cmos"), tmp_path / "led.csv"
+    band = Band.from_efficiency("cmos")
+    path = tmp_path / "led.csv"
     rows = [f"{nm},{7.3 * math.exp(-0.5 * ((nm - 520) / 15) ** 2)!r}" for nm in range(430, 611)]
     path.write_text("\n".join(["wavelength_nm,power", *rows]))
     gaussian = 520e-9, band, 15e-9 * math.sqrt(8 * math.log(2))
-    assert led_strength_e_s_sr(0.3, str(path), band) == pytest.approx(led_strength_e_s_sr(0.3, *gaussian), rel=1e-4)
+    assert led_strength_e_s_sr(0.3, str(path), band) == pytest.approx(
+        led_strength_e_s_sr(0.3, *gaussian), rel=1e-4
+    )
     watts = radiant_strength_e_s_sr(0.3, str(path), band)
     assert watts == pytest.approx(radiant_strength_e_s_sr(0.3, *gaussian), rel=1e-4)
     white = str(DATA / "led" / "white.csv")
@@ -489,7 +570,9 @@ def test_a_power_without_bound_is_no_spectrum(tmp_path: Path) -> None:
 def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
     path = tmp_path / "infrared.csv"
     path.write_text("wavelength_nm,power\n900,0\n940,1\n980,0\n")
-    with pytest.raises(InputError, match=r"^light\.led\.spectrum: .*invisible.*; allowed: radiant_intensity$"):
+    with pytest.raises(
+        InputError, match=r"^light\.led\.spectrum: .*invisible.*; allowed: radiant_intensity$"
+    ):
         led_strength_e_s_sr(0.3, str(path), ALL)
     assert radiant_strength_e_s_sr(1.0, str(path), ALL) == pytest.approx(940e-9 / HC_J_M, rel=1e-3)
 
@@ -498,7 +581,10 @@ def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
     ("keys", "message"),
     [
         ({"spectrum": "gone.csv"}, "no file 'gone.csv'; allowed: white, a CSV file"),
-        ({"spectrum": "blue"}, "'blue' is not a wavelength; allowed: a wavelength such as \"630 nm\", or white"),
+        (
+            {"spectrum": "blue"},
+            "'blue' is not a wavelength; allowed: a wavelength such as \"630 nm\", or white",
+        ),
         ({"fwhm": "20 nm"}, "fwhm: white is a whole spectrum; allowed: a wavelength as spectrum"),
     ],
 )
@@ -510,9 +596,15 @@ def test_a_spectrum_is_white_a_file_or_a_wavelength(keys: dict[str, str], messag
 @pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(470, 25), (525, 35), (630, 18), (590, 3)])
 def test_colored_led(peak_nm: float, fwhm_nm: float) -> None:
     """Its Gaussian spectrum with QE and the eye's response, against adaptive quadrature."""
-    band, sigma = Band.from_efficiency("cmos"), fwhm_nm / 2.3548200450309493
+    band = Band.from_efficiency("cmos")
+    sigma = fwhm_nm / 2.3548200450309493
     eye = Band(
-        *np.loadtxt(DATA / "bands" / "photopic.csv", delimiter=",", comments="#", skiprows=skipped("photopic")).T
+        *np.loadtxt(
+            DATA / "bands" / "photopic.csv",
+            delimiter=",",
+            comments="#",
+            skiprows=skipped("photopic"),
+        ).T
     )
     eye = Band(eye.wavelength_m * 1e-9, eye.response)
 
@@ -521,7 +613,9 @@ def test_colored_led(peak_nm: float, fwhm_nm: float) -> None:
             return math.exp(-0.5 * ((nm - peak_nm) / sigma) ** 2) * weight(nm * 1e-9)
 
         ends = np.arange(peak_nm - 7 * sigma, peak_nm + 7 * sigma + 1, sigma / 2)
-        return sum(quad(shape, a, b)[0] for a, b in itertools.pairwise(ends)) / (math.sqrt(2 * math.pi) * sigma)
+        return sum(quad(shape, a, b)[0] for a, b in itertools.pairwise(ends)) / (
+            math.sqrt(2 * math.pi) * sigma
+        )
 
     electrons = integral(lambda m: float(band.response_at(m)) * m / HC_J_M)
     lumens = 683 * integral(lambda m: float(eye.response_at(m)))
@@ -539,7 +633,13 @@ def test_color_scatter() -> None:
     """LEDs of 630 nm within 2 nm, at equal candela: by the slope of QE times wavelength over V."""
     band = Band.from_efficiency("cmos")
     led = LedConfig.model_validate(
-        {"intensity": "10 mcd", "disk_diameter": "2 mm", "spectrum": "630 nm", "fwhm": "18 nm", "color_scatter": "2 nm"}
+        {
+            "intensity": "10 mcd",
+            "disk_diameter": "2 mm",
+            "spectrum": "630 nm",
+            "fwhm": "18 nm",
+            "color_scatter": "2 nm",
+        }
     )
     normal = np.random.default_rng(4).standard_normal(2000)
     factors = color_factors(led, band, normal)

@@ -10,12 +10,17 @@ from interpreted import interpreted
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
-OPTIMIZE, AMBIGUITY = (interpreted(f"skysim.sources.dome.placement.{name}") for name in ("optimize", "ambiguity"))
+OPTIMIZE, AMBIGUITY = (
+    interpreted(f"skysim.sources.dome.placement.{name}") for name in ("optimize", "ambiguity")
+)
 
 
 def test_a_site_has_room_beside_all_leds_but_the_one_that_moves() -> None:
-    rng, found = np.random.default_rng(1), 0
-    sites_m, chosen, spacing_m = rng.uniform(0, 1, (300, 3)), np.arange(0, 300, 20), 0.3
+    rng = np.random.default_rng(1)
+    found = 0
+    sites_m = rng.uniform(0, 1, (300, 3))
+    chosen = np.arange(0, 300, 20)
+    spacing_m = 0.3
     near = cdist(sites_m, sites_m[chosen]) < spacing_m
     for without in (0, 7):
         others = np.delete(near, without, axis=1).any(axis=1)
@@ -66,16 +71,27 @@ def test_most_of_a_field_that_another_shows_is_that_of_all_rotations() -> None:
     """Fields of two rings, at any angles: every neighbor of each field is laid on every one of the other."""
     rng = np.random.default_rng(5)
     counts = rng.integers(3, 6, (8, 2))
-    fields = [np.repeat([0.2, 0.3], count) * np.exp(2j * np.pi * rng.random(count.sum())) for count in counts]
-    every, first = np.concatenate(fields), np.cumsum([0, *map(len, fields)])
-    given = AMBIGUITY.Fields(np.arange(8), first, np.abs(every).round(9), np.angle(every), np.full(8, 0.02))
+    fields = [
+        np.repeat([0.2, 0.3], count) * np.exp(2j * np.pi * rng.random(count.sum()))
+        for count in counts
+    ]
+    every = np.concatenate(fields)
+    first = np.cumsum([0, *map(len, fields)])
+    given = AMBIGUITY.Fields(
+        np.arange(8), first, np.abs(every).round(9), np.angle(every), np.full(8, 0.02)
+    )
 
     def shown(i: int, j: int) -> float:
         """The most that two fields share at any turn, but for a field laid on itself without one."""
         turn = fields[j] / fields[i][:, None]
         unit = np.isclose(np.abs(turn), 1) & ~(np.eye(*turn.shape, dtype=bool) & (i == j))
-        far = np.abs(fields[i][:, None] * turn[unit][:, None, None] - fields[j])  # (turns, of i, of j)
-        return float((1 + (far.min(axis=2) < 0.02).sum(axis=1).max()) / (1 + max(len(fields[i]), len(fields[j]))))
+        far = np.abs(
+            fields[i][:, None] * turn[unit][:, None, None] - fields[j]
+        )  # (turns, of i, of j)
+        return float(
+            (1 + (far.min(axis=2) < 0.02).sum(axis=1).max())
+            / (1 + max(len(fields[i]), len(fields[j])))
+        )
 
     fraction, other = AMBIGUITY.most_similar(given, 0.0)
     wanted = np.array([[shown(*sorted((i, j))) for j in range(8)] for i in range(8)])
@@ -84,17 +100,24 @@ def test_most_of_a_field_that_another_shows_is_that_of_all_rotations() -> None:
     assert len(set(fraction)) > 3
 
 
-def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A stand-in for the overlap that falls with an LED's height, so that every move up is wanted."""
     sites_m = np.random.default_rng(6).uniform(0, 1, (400, 3))
     place_m = sites_m[OPTIMIZE.thin(sites_m, 0.2, 20)]
-    config, options = SimpleNamespace(count=20, spacing_m=0.2), OPTIMIZE.PlacementOptions(ambiguity_trials=300)
-    scorer = SimpleNamespace(config=config, options=options, tail_variance=lambda _: 0.5, under_two=lambda _: 0)
+    config = SimpleNamespace(count=20, spacing_m=0.2)
+    options = OPTIMIZE.PlacementOptions(ambiguity_trials=300)
+    scorer = SimpleNamespace(
+        config=config, options=options, tail_variance=lambda _: 0.5, under_two=lambda _: 0
+    )
     layouts = []
 
     def overlap(_: object, at_m: np.ndarray) -> object:
         layouts.append(at_m)
-        return AMBIGUITY.Ambiguity(np.arange(20), np.arange(20), options.max_overlap + (0.9 - at_m[:, 2]).clip(0))
+        return AMBIGUITY.Ambiguity(
+            np.arange(20), np.arange(20), options.max_overlap + (0.9 - at_m[:, 2]).clip(0)
+        )
 
     monkeypatch.setattr(OPTIMIZE, "layout_ambiguity", overlap)
     moved_m = OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, np.random.default_rng(7))
@@ -103,5 +126,7 @@ def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(mon
     # An overlap of the limit is none too many.
     layouts.clear()
     place_m[:, 2] = 0.95
-    np.testing.assert_array_equal(OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, None), place_m)
+    np.testing.assert_array_equal(
+        OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, None), place_m
+    )
     assert len(layouts) == 1

@@ -14,7 +14,9 @@ from skysim.sources.dome.led import lit_moments_s
 COUNT = 400_000
 
 
-def counted(begin: float, end: float, period: float, start: float, on: float) -> tuple[float, float, float]:
+def counted(
+    begin: float, end: float, period: float, start: float, on: float
+) -> tuple[float, float, float]:
     """The same by looking at 400,000 moments."""
     t = begin + (end - begin) * (np.arange(COUNT) + 0.5) / COUNT
     lit = t[(t - start) % period < on]
@@ -25,7 +27,8 @@ def counted(begin: float, end: float, period: float, start: float, on: float) ->
 def test_light_mean_and_spread_are_those_that_one_counts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     period = rng.uniform(0.2, 3.0)
-    begin, length = rng.uniform(-5, 5), period * 10 ** rng.uniform(-0.2, 1.3)
+    begin = rng.uniform(-5, 5)
+    length = period * 10 ** rng.uniform(-0.2, 1.3)
     pulses = (period, rng.uniform(-5, 5), period * rng.uniform(0.3, 0.95))
     ours = lit_moments_s(begin, begin + length, *pulses)
     step = length / COUNT
@@ -39,11 +42,15 @@ def test_light_mean_and_spread_are_those_that_one_counts(seed: int) -> None:
 
 def test_steady_light_has_the_moments_of_a_uniform_line() -> None:
     for on in (1.0, 2.0):
-        assert lit_moments_s(2.0, 5.0, 1.0, 0.3, on) == pytest.approx((3.0, 3.5, 3 / np.sqrt(12)), abs=1e-15)
+        assert lit_moments_s(2.0, 5.0, 1.0, 0.3, on) == pytest.approx(
+            (3.0, 3.5, 3 / np.sqrt(12)), abs=1e-15
+        )
 
 
 def test_a_pulse_within_is_its_own_moments_and_the_dark_has_none() -> None:
-    assert lit_moments_s(0.0, 10.0, 100.0, 4.0, 2.0) == pytest.approx((2.0, 5.0, 2 / np.sqrt(12)), abs=1e-14)
+    assert lit_moments_s(0.0, 10.0, 100.0, 4.0, 2.0) == pytest.approx(
+        (2.0, 5.0, 2 / np.sqrt(12)), abs=1e-14
+    )
     assert lit_moments_s(6.5, 99.0, 100.0, 4.0, 2.0)[0] == 0.0
 
 
@@ -90,7 +97,9 @@ def test_lit_time_is_that_of_brute_force_sampling(
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.floats(0, 1000), st.integers(1, 40), st.floats(0, 1e-3), st.floats(0.01, 1))
-def test_whole_periods_shine_for_exactly_their_duty(begin: float, periods: int, start: float, duty: float) -> None:
+def test_whole_periods_shine_for_exactly_their_duty(
+    begin: float, periods: int, start: float, duty: float
+) -> None:
     on = duty * 1e-3
     lit = float(lit_s(begin, begin + periods * 1e-3, 1e-3, start, on))
     assert lit == pytest.approx(periods * on, abs=1e-12)  # t of 1000 s is held to 1e-13 s
@@ -99,8 +108,12 @@ def test_whole_periods_shine_for_exactly_their_duty(begin: float, periods: int, 
 @pytest.mark.slow
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(span, span, span, st.floats(0.1, 2), st.floats(0, 1))
-def test_lit_time_of_two_intervals_adds(a: float, b: float, c: float, start: float, duty: float) -> None:
+def test_lit_time_of_two_intervals_adds(
+    a: float, b: float, c: float, start: float, duty: float
+) -> None:
     first, middle, last = sorted((a, b, c))
     whole = lit_s(first, last, 0.7, start, duty * 0.7)
-    parts = lit_s(first, middle, 0.7, start, duty * 0.7) + lit_s(middle, last, 0.7, start, duty * 0.7)
+    parts = lit_s(first, middle, 0.7, start, duty * 0.7) + lit_s(
+        middle, last, 0.7, start, duty * 0.7
+    )
     assert float(whole) == pytest.approx(float(parts), abs=1e-13)

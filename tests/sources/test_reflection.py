@@ -16,7 +16,9 @@ from skysim.sources.dome.shell.surface import Cylinder, Ellipsoid, Plane, Rim, S
 from skysim.sources.false_lights import MIRRORED, light_name
 
 LAMBERT = CosineLobeConfig()
-RADIUS_M, HEIGHT_M = 1.3, 0.3  # of a sphere, and of its center above the bearing
+# of a sphere, and of its center above the bearing
+RADIUS_M = 1.3
+HEIGHT_M = 0.3
 
 
 def leds(place_m: Floats, normal: Floats, on: float = 1.0) -> Sources:
@@ -25,7 +27,16 @@ def leds(place_m: Floats, normal: Floats, on: float = 1.0) -> Sources:
     place = np.column_stack([place_m, ones])
     clock = np.zeros(len(ones), np.int64)
     return Sources(
-        np.arange(len(ones)), place, normal, 1e-3 * ones, ones, ones, 0 * ones, on * ones, clock, np.nan * ones
+        np.arange(len(ones)),
+        place,
+        normal,
+        1e-3 * ones,
+        ones,
+        ones,
+        0 * ones,
+        on * ones,
+        clock,
+        np.nan * ones,
     )
 
 
@@ -58,9 +69,11 @@ def test_integrating_sphere(share: float) -> None:
 @pytest.mark.parametrize("rim_deg", [50.0, 90.0, 120.0])
 def test_cap_of_a_sphere(rim_deg: float) -> None:
     """E = P / (A (1 - rho f)), with f the cap's share of the sphere A."""
-    wall, share = sphere(rim_deg), 0.6
+    wall = sphere(rim_deg)
+    share = 0.6
     edge_m = wall.meet(
-        np.zeros(3), np.array([[math.sin(math.radians(rim_deg) - 1e-9), 0.0, math.cos(math.radians(rim_deg))]])
+        np.zeros(3),
+        np.array([[math.sin(math.radians(rim_deg) - 1e-9), 0.0, math.cos(math.radians(rim_deg))]]),
     )
     fraction = (1 - (edge_m[0, 2] - HEIGHT_M) / RADIUS_M) / 2
     placed = on_wall(wall, 60)
@@ -73,7 +86,8 @@ def test_cap_of_a_sphere(rim_deg: float) -> None:
 def test_light_is_conserved_in_an_ellipsoid() -> None:
     """What the closed wall absorbs, (1 - rho) E over its area, is what its LEDs emit, whatever their lobe."""
     wall = Ellipsoid(np.array([0.1, 0.0, 0.2]), semi_axes_m=np.array([1.6, 1.1, 0.9]))
-    sources, share = leds(*on_wall(wall, 60)), 0.7
+    sources = leds(*on_wall(wall, 60))
+    share = 0.7
     lobe = LobeTableConfig.model_validate(
         {"kind": "table", "angle_deg": [0, 30, 60, 90], "intensity": [1, 0.8, 0.3, 0]}
     )
@@ -81,7 +95,11 @@ def test_light_is_conserved_in_an_ellipsoid() -> None:
     directions = spiral(20_000)
     points = wall.meet(np.zeros(3), directions)
     normals = wall.inward(points)
-    area_m2 = np.sum(points**2, axis=1) * (4 * np.pi / len(points)) / -np.sum(directions * normals, axis=1)
+    area_m2 = (
+        np.sum(points**2, axis=1)
+        * (4 * np.pi / len(points))
+        / -np.sum(directions * normals, axis=1)
+    )
     absorbed = (1 - share) * np.sum(area_m2 * diffuse.irradiance_e_s_m2(points, normals))
     angle = np.linspace(0, np.pi / 2, 20_001)
     relative = np.interp(np.degrees(angle), lobe.angle_deg, lobe.intensity) * np.sin(angle)
@@ -99,7 +117,9 @@ def test_floor_under_one_led() -> None:
     diffuse = glow(wall, source, floor={"share": 0.5, "depth": "1 m", "radius": "3 m"})
     radius = np.linspace(0, 3, 60_001)
     on_floor = 2.5**2 / (radius**2 + 2.5**2) ** 2
-    back = np.trapezoid(0.5 * on_floor * 2.5**2 / (radius**2 + 2.5**2) ** 2 / np.pi * 2 * np.pi * radius, radius)
+    back = np.trapezoid(
+        0.5 * on_floor * 2.5**2 / (radius**2 + 2.5**2) ** 2 / np.pi * 2 * np.pi * radius, radius
+    )
     at_led = diffuse.irradiance_e_s_m2(np.array([[1e-9, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.0]]))
     assert at_led[0] == pytest.approx(back, rel=2e-3)
     at_floor = diffuse.irradiance_e_s_m2(np.array([[0.7, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]]))
@@ -112,11 +132,21 @@ def test_a_dome_that_stands_on_the_floor_keeps_its_light() -> None:
     rim = Rim(half_rad=math.radians(120))
     wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 1.0), rim=rim)
     source = leds(np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]))
-    diffuse = glow(wall, source, diffuse=0.7, floor={"share": 0.7, "depth": "0.5 m", "radius": f"{math.sqrt(0.75)} m"})
+    diffuse = glow(
+        wall,
+        source,
+        diffuse=0.7,
+        floor={"share": 0.7, "depth": "0.5 m", "radius": f"{math.sqrt(0.75)} m"},
+    )
     on_cap = diffuse.irradiance_e_s_m2(*on_wall(wall, 4001)).mean() * 3 * math.pi
-    turns, radius = np.arange(900) * 2.4, np.sqrt(0.75 * (np.arange(900) + 0.5) / 900)
+    turns = np.arange(900) * 2.4
+    radius = np.sqrt(0.75 * (np.arange(900) + 0.5) / 900)
     places = np.column_stack([radius * np.cos(turns), radius * np.sin(turns), np.full(900, -0.5)])
-    on_floor = diffuse.irradiance_e_s_m2(places, np.tile([0.0, 0.0, 1.0], (900, 1))).mean() * 0.75 * math.pi
+    on_floor = (
+        diffuse.irradiance_e_s_m2(places, np.tile([0.0, 0.0, 1.0], (900, 1))).mean()
+        * 0.75
+        * math.pi
+    )
     assert 0.3 * (on_cap + on_floor) == pytest.approx(math.pi, rel=0.05)
 
 
@@ -124,12 +154,18 @@ def test_a_dome_that_stands_on_the_floor_keeps_its_light() -> None:
 
 CAMERA_M = np.array([0.15, -0.1, 0.25])
 QUADRICS = {
-    "sphere": (Ellipsoid(np.array([0.0, 0.0, 0.3]), semi_axes_m=np.full(3, 1.3)), np.array([-0.2, 0.15, 0.1])),
+    "sphere": (
+        Ellipsoid(np.array([0.0, 0.0, 0.3]), semi_axes_m=np.full(3, 1.3)),
+        np.array([-0.2, 0.15, 0.1]),
+    ),
     "ellipsoid": (
         Ellipsoid(np.array([0.05, 0.0, 0.1]), semi_axes_m=np.array([1.4, 1.1, 0.9])),
         np.array([0.4, 0.2, 0.5]),
     ),
-    "cylinder": (Cylinder(np.array([0.0, 0.0, 0.2]), radius_m=1.2, axis=0), np.array([-0.1, 0.1, 0.0])),
+    "cylinder": (
+        Cylinder(np.array([0.0, 0.0, 0.2]), radius_m=1.2, axis=0),
+        np.array([-0.1, 0.1, 0.0]),
+    ),
     "flat": (Plane(np.array([0.0, 0.0, 1.2])), np.array([0.3, 0.2, 0.9])),
 }
 BORESIGHT = np.array([0.1, 0.05, 1.0])
@@ -155,7 +191,8 @@ def bounce(name: str, start: Floats, toward: Floats) -> tuple[Floats, Floats]:
         hit = start + steps[:, None] * toward
     else:
         weights = 1 / (wall.semi_axes_m if isinstance(wall, Ellipsoid) else wall.semi_axes_m()) ** 2  # type: ignore[union-attr]
-        a, b = (toward**2) @ weights, 2 * (toward * (start - wall.center_m)) @ weights
+        a = (toward**2) @ weights
+        b = 2 * (toward * (start - wall.center_m)) @ weights
         c = (start - wall.center_m) ** 2 @ weights - 1
         hit = start + ((-b + np.sqrt(b**2 - 4 * a * c)) / (2 * a))[:, None] * toward
         normal = -(hit - wall.center_m) * weights
@@ -177,17 +214,24 @@ def brute_force(name: str, led_m: Floats) -> Floats:
     rays = grid(count=count)
     missed = miss(name, rays.reshape(-1, 3), led_m).reshape(count, count)
     inner = missed[1:-1, 1:-1]
-    around = [np.roll(np.roll(missed, i, 0), j, 1)[1:-1, 1:-1] for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    around = [
+        np.roll(np.roll(missed, i, 0), j, 1)[1:-1, 1:-1]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        if i or j
+    ]
     found = []
     for row, column in np.argwhere((inner < np.min(around, axis=0)) & (inner < 0.2)):
-        best, width = rays[row + 1, column + 1], 0.01
+        best = rays[row + 1, column + 1]
+        width = 0.01
         for _ in range(40):
             steps = np.linspace(-width, width, 9)
             axes = np.linalg.svd(best[None])[2][1:]
             i, j = (part.ravel() for part in np.meshgrid(steps, steps))
             near = best + i[:, None] * axes[0] + j[:, None] * axes[1]
             near /= np.linalg.norm(near, axis=1, keepdims=True)
-            best, width = near[miss(name, near, led_m).argmin()], 0.5 * width
+            best = near[miss(name, near, led_m).argmin()]
+            width = 0.5 * width
         if miss(name, best[None], led_m)[0] < 1e-8:
             found.append(best)
     return np.array(found)
@@ -214,7 +258,9 @@ def test_images_are_as_bright_as_rays_from_the_led_say(name: str) -> None:
     """A narrow cone of random rays from the LED: the density where they cross the plane of the camera's pupil."""
     wall, led_m = QUADRICS[name]
     normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
-    images = mirrored(ReflectionConfig(specular=0.04), wall, leds(led_m[None], normal[None]), CAMERA_M, grid())
+    images = mirrored(
+        ReflectionConfig(specular=0.04), wall, leds(led_m[None], normal[None]), CAMERA_M, grid()
+    )
     rng = np.random.default_rng(8)
     for n in range(len(images)):
         toward = images.place[n, :3] - CAMERA_M
@@ -222,14 +268,20 @@ def test_images_are_as_bright_as_rays_from_the_led_say(name: str) -> None:
         toward /= distance_m
         mirror_m = bounce(name, CAMERA_M, toward[None])[0][0]
         axis = (mirror_m - led_m) / np.linalg.norm(mirror_m - led_m)
-        half, count, radius_m = 0.02, 400_000, 0.1 * 0.02 * distance_m
-        rays = axis + rng.uniform(-half, half, (count, 2)) @ np.linalg.svd(axis[None])[2][1:]  # even in solid angle
+        half = 0.02
+        count = 400_000
+        radius_m = 0.1 * 0.02 * distance_m
+        rays = (
+            axis + rng.uniform(-half, half, (count, 2)) @ np.linalg.svd(axis[None])[2][1:]
+        )  # even in solid angle
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         hit, along = bounce(name, led_m, rays)
         steps = np.sum((CAMERA_M - hit) * toward, axis=1) / np.sum(along * toward, axis=1)
         caught = (np.linalg.norm(hit + steps[:, None] * along - CAMERA_M, axis=1) < radius_m).sum()
         irradiance = caught / count * (2 * half) ** 2 / (math.pi * radius_m**2)
-        assert 1 / distance_m**2 == pytest.approx(irradiance, rel=5 / math.sqrt(caught) + 0.01), caught
+        assert 1 / distance_m**2 == pytest.approx(irradiance, rel=5 / math.sqrt(caught) + 0.01), (
+            caught
+        )
         assert images.normal[n] @ -toward == pytest.approx(normal @ axis, abs=1e-6)
         assert images.strength[n] == pytest.approx(0.04)
 
@@ -237,7 +289,11 @@ def test_images_are_as_bright_as_rays_from_the_led_say(name: str) -> None:
 def test_a_flat_wall_mirrors_at_the_same_distance_behind_it() -> None:
     wall, led_m = QUADRICS["flat"]
     images = mirrored(
-        ReflectionConfig(specular=0.04), wall, leds(led_m[None], np.array([[0.0, 0.0, 1.0]])), CAMERA_M, grid()
+        ReflectionConfig(specular=0.04),
+        wall,
+        leds(led_m[None], np.array([[0.0, 0.0, 1.0]])),
+        CAMERA_M,
+        grid(),
     )
     np.testing.assert_allclose(images.place[0], [0.3, 0.2, 1.5, 1.0], atol=1e-9)
     np.testing.assert_allclose(images.normal[0], [0.0, 0.0, -1.0], atol=1e-12)
@@ -264,7 +320,9 @@ def test_fresnel() -> None:
         math.sin(brewster - math.asin(math.sin(brewster) / n)) ** 2
     )  # r_p = 0, r_s = sin(i - t) / sin(i + t), i + t = 90 deg
     expected = [((n - 1) / (n + 1)) ** 2, s / 2, 1.0]
-    np.testing.assert_allclose(reflectance(config, np.array([1.0, math.cos(brewster), 0.0])), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        reflectance(config, np.array([1.0, math.cos(brewster), 0.0])), expected, atol=1e-12
+    )
 
 
 def test_names() -> None:

@@ -46,7 +46,9 @@ def angles(places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def edges(vertices: np.ndarray) -> np.ndarray:
     """Lengths of all edges of the triangulated sphere, by its convex hull."""
     faces = ConvexHull(vertices).simplices
-    pairs = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]]), axis=1), axis=0)
+    pairs = np.unique(
+        np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]]), axis=1), axis=0
+    )
     return np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
 
 
@@ -57,7 +59,9 @@ def edges(vertices: np.ndarray) -> np.ndarray:
 def test_a_class_1_sphere_has_ten_times_the_square_and_two(frequency: int) -> None:
     vertices = geodesic_vertices(frequency, "I")
     assert len(vertices) == 10 * frequency**2 + 2
-    assert len(edges(vertices)) == 30 * frequency**2  # Euler: a triangulation of V vertices has 3 V - 6 edges
+    assert (
+        len(edges(vertices)) == 30 * frequency**2
+    )  # Euler: a triangulation of V vertices has 3 V - 6 edges
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, rtol=0, atol=1e-15)
 
 
@@ -78,17 +82,24 @@ def test_a_class_2_sphere_has_three_quarters_as_many_triangles(frequency: int) -
         ("II", 2, {0.64085: 60, 0.71364: 30}),
     ],
 )
-def test_its_chords_are_those_of_the_tables(class_: str, frequency: int, chords: dict[float, int]) -> None:
+def test_its_chords_are_those_of_the_tables(
+    class_: str, frequency: int, chords: dict[float, int]
+) -> None:
     """Chord factors of geodesic domes as builders use them (Kenner 1976, tables), and how often each occurs."""
-    lengths, counts = np.unique(np.round(edges(geodesic_vertices(frequency, class_)), 5), return_counts=True)
-    assert dict(zip(lengths.tolist(), counts.tolist(), strict=True)) == pytest.approx(chords, abs=1e-5)
+    lengths, counts = np.unique(
+        np.round(edges(geodesic_vertices(frequency, class_)), 5), return_counts=True
+    )
+    assert dict(zip(lengths.tolist(), counts.tolist(), strict=True)) == pytest.approx(
+        chords, abs=1e-5
+    )
 
 
 def test_edges_of_a_fine_sphere_reach_the_limits_of_the_projection() -> None:
     """The icosahedron's edge e over the frequency, seen from the center: times cos(31.7 deg) at the corners, where it
     is foreshortened, and over the face's distance .7947 at the faces' centers, where it is nearest.
     """
-    frequency, edge = 40, 1.0514622
+    frequency = 40
+    edge = 1.0514622
     lengths = edges(geodesic_vertices(frequency, "I")) * frequency / edge
     assert lengths.min() == pytest.approx(np.cos(np.arcsin(edge / 2)), rel=0.03)
     assert lengths.min() > np.cos(np.arcsin(edge / 2))
@@ -112,16 +123,25 @@ def test_geodesic_leds_are_the_vertices_seen_from_the_bearing(on: dict[str, Any]
 
 
 def test_it_turns_about_the_zenith() -> None:
-    plain, turned = (lit({"kind": "geodesic", "frequency": 6, "rotation_deg": deg}).place[:, :3] for deg in (0, 25))
-    c, s = np.cos(np.radians(25)), np.sin(np.radians(25))
-    np.testing.assert_allclose(turned, plain @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), rtol=0, atol=1e-14)
+    plain, turned = (
+        lit({"kind": "geodesic", "frequency": 6, "rotation_deg": deg}).place[:, :3]
+        for deg in (0, 25)
+    )
+    c = np.cos(np.radians(25))
+    s = np.sin(np.radians(25))
+    np.testing.assert_allclose(
+        turned, plain @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), rtol=0, atol=1e-14
+    )
     assert angles(plain[1:6])[1] == pytest.approx(np.radians([-144, -72, 0, 72, 144]), abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["geodesic", "string"])
 def test_a_lit_fraction_leaves_the_others_out_and_keeps_the_numbers(kind: str) -> None:
-    layout = {"kind": kind} | ({"frequency": 20} if kind == "geodesic" else {"pitch": "16.7 mm", "spacing": "4 cm"})
-    every, some = lit(layout), lit(layout | {"lit_fraction": 0.4})
+    layout = {"kind": kind} | (
+        {"frequency": 20} if kind == "geodesic" else {"pitch": "16.7 mm", "spacing": "4 cm"}
+    )
+    every = lit(layout)
+    some = lit(layout | {"lit_fraction": 0.4})
     assert len(some) == round(0.4 * len(every))
     np.testing.assert_array_equal(every.id, np.arange(len(every)))
     np.testing.assert_array_equal(some.place, every.place[some.id])
@@ -167,7 +187,9 @@ def test_leds_of_a_circle_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -
 @pytest.mark.slow
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
 def test_leds_of_a_spiral_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -> None:
-    place_m = lit({"kind": "string", "winding": "spiral", "pitch": "33 mm", "spacing": "10 cm"}, on).place[:, :3]
+    place_m = lit(
+        {"kind": "string", "winding": "spiral", "pitch": "33 mm", "spacing": "10 cm"}, on
+    ).place[:, :3]
     tilt, azimuth = angles(place_m)
     assert tilt[0] == pytest.approx(0, abs=1e-12)
     assert np.all(np.diff(tilt) > 0)
@@ -181,7 +203,9 @@ def test_leds_of_a_spiral_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -
 
 def test_the_turns_of_a_spiral_are_a_spacing_apart() -> None:
     """On a sphere about the bearing the arc from the apex is the radius times the tilt: Archimedes' spiral."""
-    place_m = lit({"kind": "string", "winding": "spiral", "pitch": "10 mm", "spacing": "6 cm"}).place[:, :3]
+    place_m = lit(
+        {"kind": "string", "winding": "spiral", "pitch": "10 mm", "spacing": "6 cm"}
+    ).place[:, :3]
     tilt, azimuth = angles(place_m)
     turned = np.unwrap(azimuth[1:])
     np.testing.assert_allclose(1.2 * tilt[1:], 0.06 * turned / (2 * np.pi), rtol=0, atol=2e-6)
@@ -197,10 +221,17 @@ def test_circles_on_a_sphere_are_a_spacing_apart_and_as_long_as_they_are() -> No
 
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
 def test_strips_lie_on_meridians_a_pitch_apart_and_reach_the_rim(on: dict[str, Any]) -> None:
-    place_m = lit({"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on).place[:, :3]
+    place_m = lit(
+        {"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on
+    ).place[:, :3]
     tilt, azimuth = angles(place_m)
-    strips = np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64  # rim of 5 m: 64 strips
-    assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(np.unique(strips)) in (32, 64)
+    strips = (
+        np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64
+    )  # rim of 5 m: 64 strips
+    assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(np.unique(strips)) in (
+        32,
+        64,
+    )
     for strip in np.unique(strips):
         leds = place_m[strips == strip]
         assert arcs_m(inside(on), leds) == pytest.approx(0.033, rel=1e-4)
@@ -226,9 +257,13 @@ def test_tapes_are_off_by_their_pitch_and_their_glue() -> None:
     tilt, azimuth = angles(ideal)
     begins = np.flatnonzero(np.append(True, np.diff(tilt) < 0))
     radial = ideal / np.linalg.norm(ideal, axis=1, keepdims=True)
-    along = np.column_stack([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), -np.sin(tilt)])
+    along = np.column_stack(
+        [np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), -np.sin(tilt)]
+    )
     sideways_mm = 1e3 * np.sum((made - ideal) * np.cross(radial, along), axis=1)
-    whole = [slice(a, b) for a, b in zip(begins, [*begins[1:], len(ideal)], strict=True) if b - a > 20]
+    whole = [
+        slice(a, b) for a, b in zip(begins, [*begins[1:], len(ideal)], strict=True) if b - a > 20
+    ]
     assert len(whole) > 200
     stretch = [(np.diff(angles(made[one])[0]) / np.diff(tilt[one])).mean() - 1 for one in whole]
     assert np.std(stretch) == pytest.approx(0.01, rel=0.15)
@@ -247,10 +282,18 @@ def test_a_surveyed_dome_takes_both_layouts(tmp_path: Any) -> None:
     (tmp_path / "dome.csv").write_text("x,y,z\n" + lines + "\n")
     on = {"kind": "surveyed", "file": str(tmp_path / "dome.csv"), "unit": "m", "degree": 4}
     made = inside(on)
-    spiral = {"kind": "string", "winding": "spiral", "pitch": "33 mm", "spacing": "10 cm", "cap_deg": 20}
+    spiral = {
+        "kind": "string",
+        "winding": "spiral",
+        "pitch": "33 mm",
+        "spacing": "10 cm",
+        "cap_deg": 20,
+    }
     place_m = lit(spiral, on).place[:, :3]
     assert arcs_m(made, place_m[30:60]) == pytest.approx(0.033, rel=1e-3)
-    assert len(lit({"kind": "geodesic", "frequency": 10}, on)) == len(lit({"kind": "geodesic", "frequency": 10}))
+    assert len(lit({"kind": "geodesic", "frequency": 10}, on)) == len(
+        lit({"kind": "geodesic", "frequency": 10})
+    )
 
 
 # --- with fibers, panels and drives
@@ -268,12 +311,16 @@ def test_fibers_and_panels_take_their_points(points: dict[str, Any]) -> None:
     plain = lit(points)
     fibers = {"kind": "fibers", "points": points}
     ends = dome.sources(
-        DomeConfig.model_validate({"kind": "dome", "surface": SPHERE, "layout": fibers, "led": LED}), BAND
+        DomeConfig.model_validate(
+            {"kind": "dome", "surface": SPHERE, "layout": fibers, "led": LED}
+        ),
+        BAND,
     )
     np.testing.assert_array_equal(ends.place, plain.place)
     panel = {"kind": "lcd", "points": points, "pixels": [4000, 4000], "pitch": "0.5 mm"}
     drawn = dome.sources(
-        DomeConfig.model_validate({"kind": "dome", "surface": FLAT, "layout": panel, "led": LED}), BAND
+        DomeConfig.model_validate({"kind": "dome", "surface": FLAT, "layout": panel, "led": LED}),
+        BAND,
     )
     on_panel = lit(points, FLAT)
     assert len(drawn) == len(on_panel)
@@ -284,7 +331,9 @@ def test_fibers_and_panels_take_their_points(points: dict[str, Any]) -> None:
 def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
     """A controller for every 50 LEDs of the tape: each has its slot in the order along the tape."""
     drive = {"kind": "sequential", "controller": 50, "slot": "1 ms"}
-    leds = lit({"kind": "string", "winding": "spiral", "pitch": "4 cm", "spacing": "8 cm"}, drive=drive)
+    leds = lit(
+        {"kind": "string", "winding": "spiral", "pitch": "4 cm", "spacing": "8 cm"}, drive=drive
+    )
     whole = len(leds) // 50
     assert whole >= 4
     start_s = leds.start_s[: 50 * whole].reshape(whole, 50)
@@ -301,13 +350,28 @@ def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
 @pytest.mark.parametrize(
     ("layout", "complaint"),
     [
-        ("{kind: geodesic, frequency: 3, class: II, cap_deg: 30}", "3 is odd, with class: II; allowed: even"),
+        (
+            "{kind: geodesic, frequency: 3, class: II, cap_deg: 30}",
+            "3 is odd, with class: II; allowed: even",
+        ),
         ("{kind: geodesic, frequency: 0, cap_deg: 30}", "frequency: 0 is not allowed"),
-        ("{kind: geodesic, frequency: 4, class: III, cap_deg: 30}", "class: 'III' is not allowed; allowed: 'I'"),
-        ("{kind: geodesic, frequency: 4, lit_fraction: 0, cap_deg: 30}", "lit_fraction: 0 is not allowed"),
+        (
+            "{kind: geodesic, frequency: 4, class: III, cap_deg: 30}",
+            "class: 'III' is not allowed; allowed: 'I'",
+        ),
+        (
+            "{kind: geodesic, frequency: 4, lit_fraction: 0, cap_deg: 30}",
+            "lit_fraction: 0 is not allowed",
+        ),
         ("{kind: string, pitch: 1 cm, cap_deg: 30}", "light.layout.spacing: missing"),
-        ("{kind: string, pitch: 0.1 mm, spacing: 1 cm, cap_deg: 30}", "light.layout.pitch: '0.1 mm' is not allowed"),
-        ("{kind: string, pitch: 1 cm, spacing: 1 cm, winding: helix, cap_deg: 30}", "winding: 'helix' is not allowed"),
+        (
+            "{kind: string, pitch: 0.1 mm, spacing: 1 cm, cap_deg: 30}",
+            "light.layout.pitch: '0.1 mm' is not allowed",
+        ),
+        (
+            "{kind: string, pitch: 1 cm, spacing: 1 cm, winding: helix, cap_deg: 30}",
+            "winding: 'helix' is not allowed",
+        ),
     ],
 )
 def test_a_layout_that_cannot_be_is_one_line(layout: str, complaint: str) -> None:
@@ -320,11 +384,15 @@ def test_a_layout_that_cannot_be_is_one_line(layout: str, complaint: str) -> Non
 @pytest.mark.parametrize("winding", ["latitude", "spiral"])
 def test_too_much_tape_is_refused_with_its_length(winding: str) -> None:
     layout = {"kind": "string", "winding": winding, "pitch": "1 mm", "spacing": "2 mm"}
-    with pytest.raises(InputError, match=r"light.layout.pitch: .* m of tape with an LED every 0.001 m are \d+ LEDs"):
+    with pytest.raises(
+        InputError, match=r"light.layout.pitch: .* m of tape with an LED every 0.001 m are \d+ LEDs"
+    ):
         lit(layout)
 
 
-@pytest.mark.parametrize("layout", [{"kind": "geodesic", "frequency": 8}, {"kind": "string", "pitch": "3 cm"}])
+@pytest.mark.parametrize(
+    "layout", [{"kind": "geodesic", "frequency": 8}, {"kind": "string", "pitch": "3 cm"}]
+)
 def test_a_cap_beyond_the_rim_is_refused(layout: dict[str, Any]) -> None:
     layout = layout | ({"spacing": "5 cm"} if layout["kind"] == "string" else {})
     with pytest.raises(InputError, match=r"^light.layout: exceeds the surface"):

@@ -22,7 +22,8 @@ from skysim.sources.dome.shell import room as rooms
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 
-RADIUS_M, RIM_M = 1.5, 0.9
+RADIUS_M = 1.5
+RIM_M = 0.9
 HALF_WIDTH_M = np.sqrt(RADIUS_M**2 - RIM_M**2)  # 1.2 m
 CAP = {"kind": "sphere", "apex": "1.5 m", "radius": "1.5 m", "rim_height": "0.9 m"}
 LAYOUT = {"kind": "fibonacci", "count": 20, "cap_deg": 40}
@@ -31,7 +32,13 @@ LETTER_BOX = (1e-3, 1e3)  # of which the part is least too thick in its thinnest
 
 
 def check(room: dict[str, Any], on: dict[str, Any] = CAP, cap_deg: float = 40) -> None:
-    config = {"kind": "dome", "surface": on, "layout": LAYOUT | {"cap_deg": cap_deg}, "led": LED, "room": room}
+    config = {
+        "kind": "dome",
+        "surface": on,
+        "layout": LAYOUT | {"cap_deg": cap_deg},
+        "led": LED,
+        "room": room,
+    }
     dome.sources(DomeConfig.model_validate(config), Band.from_efficiency(0.5))
 
 
@@ -46,12 +53,20 @@ def part_m(segments: int, on: dict[str, Any] = CAP, **room: Any) -> np.ndarray:
 
 
 def test_a_cap_is_as_high_and_wide_as_a_spherical_cap() -> None:
-    np.testing.assert_allclose(part_m(1), [RADIUS_M - RIM_M, 2 * HALF_WIDTH_M, 2 * HALF_WIDTH_M], rtol=1e-9)
+    np.testing.assert_allclose(
+        part_m(1), [RADIUS_M - RIM_M, 2 * HALF_WIDTH_M, 2 * HALF_WIDTH_M], rtol=1e-9
+    )
 
 
 def test_a_panel_beside_the_zenith_is_sampled_from_its_near_edge_to_its_far_one() -> None:
     """From 1 mm to 1.001 m off the bearing's axis: the near edge is 0.06 deg from the zenith."""
-    panel = {"kind": "flat", "apex": "1 m", "width": "1 m", "height": "1 m", "offset": ["0.501 m", "0 m", "0 m"]}
+    panel = {
+        "kind": "flat",
+        "apex": "1 m",
+        "width": "1 m",
+        "height": "1 m",
+        "offset": ["0.501 m", "0 m", "0 m"],
+    }
     made = surface.build_surface(light.SurfaceConfig.model_validate(panel))
     x_m = rooms.shell_m(RoomConfig.model_validate({"segments": 1}), made, 40.0, np.zeros(1))[:, 0]
     np.testing.assert_allclose([x_m.min(), x_m.max()], [0.001, 1.001], rtol=0, atol=1e-12)
@@ -94,7 +109,9 @@ def test_a_panel_is_as_thin_and_as_wide_and_high_as_it_says() -> None:
 def test_a_sphere_without_a_rim_ends_where_its_leds_end() -> None:
     whole = {key: value for key, value in CAP.items() if key != "rim_height"}
     half = 1.5 * np.sin(np.radians(40))
-    np.testing.assert_allclose(part_m(1, whole), [1.5 * (1 - np.cos(np.radians(40))), 2 * half, 2 * half], rtol=1e-9)
+    np.testing.assert_allclose(
+        part_m(1, whole), [1.5 * (1 - np.cos(np.radians(40))), 2 * half, 2 * half], rtol=1e-9
+    )
 
 
 def test_a_dome_down_to_below_the_bearing_has_all_of_its_shell() -> None:
@@ -110,7 +127,11 @@ def test_the_check_says_how_a_dome_fits_its_room() -> None:
     surface_text = "{kind: sphere, apex: 1.5 m, radius: 1.5 m, rim_height: 0.9 m}"
     layout = "{kind: fibonacci, count: 300, cap_deg: 40}"
     changes = {"light.surface": surface_text, "light.layout": layout, "light.room": room}
-    (fact,) = [one for one in checks.check(build_lab(loader.load("afit_simsat", changes))).facts if one.name == "room"]
+    (fact,) = [
+        one
+        for one in checks.check(build_lab(loader.load("afit_simsat", changes))).facts
+        if one.name == "room"
+    ]
     sides = " x ".join(
         f"{side:.2f}"
         for side in rooms.largest_part_m(
@@ -260,7 +281,9 @@ def test_a_room_constrains_a_search(tmp_path: Path) -> None:
     with store.writing(tmp_path / "s.db") as kept:
         runner.prepare_store(plan, kept, resume=False)
         found = search.search(plan, kept, engines.Serial())
-    reasons = {one.levels["radius"]: (one.feasible, one.refused, one.why) for one in found.candidates}
+    reasons = {
+        one.levels["radius"]: (one.feasible, one.refused, one.why) for one in found.candidates
+    }
     assert set(reasons) == {"small", "low", "high"}
     assert reasons["small"] == reasons["low"] == (True, False, "")
     assert reasons["high"][:2] == (False, True)

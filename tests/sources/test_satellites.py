@@ -27,23 +27,29 @@ VANGUARD = (
 )
 PUBLISHED = {
     0.0: (7022.46529266, -1400.08296755, 0.03995155, 1.893841015, 6.405893759, 4.534807250),
-    360.0: (-7154.03120202, -3783.17682504, -3536.19412294, 4.741887409, -4.151817765, -2.093935425),
+    360.0: (
+        -7154.03120202,
+        -3783.17682504,
+        -3536.19412294,
+        4.741887409,
+        -4.151817765,
+        -2.093935425,
+    ),
     720.0: (-7134.59340119, 6531.68641334, 3260.27186483, -4.113793027, -2.911922039, -2.557327851),
 }
 OMM = {
-    **{
-        "OBJECT_NAME": "VANGUARD 1",
-        "OBJECT_ID": "1958-002B",
-        "NORAD_CAT_ID": "5",
-        "EPOCH": "2000-06-27T18:50:19.733568",
-    },
-    **{
-        "MEAN_MOTION": "10.82419157",
-        "ECCENTRICITY": ".1859667",
-        "INCLINATION": "34.2682",
-        "RA_OF_ASC_NODE": "348.7242",
-    },
-    **{"ARG_OF_PERICENTER": "331.7664", "MEAN_ANOMALY": "19.3264", "BSTAR": ".28098E-4", "MEAN_MOTION_DOT": ".23E-6"},
+    "OBJECT_NAME": "VANGUARD 1",
+    "OBJECT_ID": "1958-002B",
+    "NORAD_CAT_ID": "5",
+    "EPOCH": "2000-06-27T18:50:19.733568",
+    "MEAN_MOTION": "10.82419157",
+    "ECCENTRICITY": ".1859667",
+    "INCLINATION": "34.2682",
+    "RA_OF_ASC_NODE": "348.7242",
+    "ARG_OF_PERICENTER": "331.7664",
+    "MEAN_ANOMALY": "19.3264",
+    "BSTAR": ".28098E-4",
+    "MEAN_MOTION_DOT": ".23E-6",
 }
 DATE = datetime.datetime(2024, 4, 10, 3, 0, 7)
 SITE = SiteConfig(latitude_deg=40.0, longitude_deg=10.0, height="500 m")
@@ -55,7 +61,9 @@ def written(folder: Path, text: str, name: str = "elements.txt") -> str:
     return str(path)
 
 
-def tle(number: int, inclination_deg: float, node_deg: float, along_deg: float, revolutions_day: float) -> str:
+def tle(
+    number: int, inclination_deg: float, node_deg: float, along_deg: float, revolutions_day: float
+) -> str:
     """A circular orbit of 10 April 2024, 0 h."""
     lines = (
         f"1 {number:05d}U 20001A   24101.00000000  .00000000  00000-0  00000-0 0  999",
@@ -97,7 +105,9 @@ def test_omm_and_tle_are_the_same_satellite(kind: str, tmp_path: Path) -> None:
     leaves = "".join(f"<{key}>{value}</{key}>" for key, value in OMM.items())
     xml = f"<ndm><omm><body><segment><metadata/><data>{leaves}</data></segment></body></omm></ndm>"
     omm = elements.read_elements(
-        written(tmp_path, {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind], "omm")
+        written(
+            tmp_path, {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind], "omm"
+        )
     )
     line = elements.read_elements(written(tmp_path, VANGUARD))
     time = datetime.datetime(2000, 6, 28)
@@ -149,7 +159,8 @@ def test_magnitudes_follow_range_and_light() -> None:
 
 def test_the_shadow_is_a_cone_behind_the_earth() -> None:
     """On a circle about the Earth's axis the umbra ends where the limb hides all of the Sun."""
-    sun_m, radius_m = np.array([1.496e11, 0.0, 0.0]), 7e6
+    sun_m = np.array([1.496e11, 0.0, 0.0])
+    radius_m = 7e6
     sun_rad = np.arcsin(earth.SUN_RADIUS_M / 1.496e11)
     limb_rad = np.arccos(EARTH_RADIUS_M / radius_m)  # beyond 90 degrees from the Sun
 
@@ -164,7 +175,9 @@ def test_the_shadow_is_a_cone_behind_the_earth() -> None:
     assert lit(edge) == pytest.approx(0.5, abs=0.01)
     assert lit(edge - 1.02 * sun_rad) == 1
     assert lit(edge + 1.02 * sun_rad) == 0
-    half = 0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi  # area of a disc above a chord at half its radius
+    half = (
+        0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi
+    )  # area of a disc above a chord at half its radius
     assert lit(edge - 0.5 * sun_rad) == pytest.approx(half, abs=0.01)
 
 
@@ -210,7 +223,9 @@ def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: elements.El
         up = place_m[n, 0] / np.linalg.norm(place_m[n, 0])
         here = GcrsState(place_m[n, 0] - 50e3 * up, velocity_m_s[n, 0])
         view = View(up, 0.05, 0.0, 0.1)
-        found = list(satellites.known_satellites(low_orbits, 6.0, view, DATE, lambda t, at=here: at))
+        found = list(
+            satellites.known_satellites(low_orbits, 6.0, view, DATE, lambda t, at=here: at)
+        )
         assert [light.truth.id - satellites.ID_BASE for light in found] == [n + 1] * int(lit[n] > 0)
         for light in found:
             assert light.truth.range_km == pytest.approx(50)

@@ -60,18 +60,25 @@ def test_the_moon_of_skyfield_is_as_far_and_as_lit() -> None:
     moon = places.place("moon", seen)
     geometric_km = ephemeris.load_ephemeris().position_km("moon", seen.tt_jd)
     assert np.linalg.norm(geometric_km) == pytest.approx(368405.543, abs=0.01)
-    assert np.degrees(moon.phase_rad) == pytest.approx(69.0819, abs=0.006)  # Skyfield's with 20" of aberration
+    assert np.degrees(moon.phase_rad) == pytest.approx(
+        69.0819, abs=0.006
+    )  # Skyfield's with 20" of aberration
     of_date_axes = erfa.pnm06a(seen.tt_jd, 0.0)
-    direction, toward_sun = of_date_axes @ moon.direction, of_date_axes @ moon.toward_sun
+    direction = of_date_axes @ moon.direction
+    toward_sun = of_date_axes @ moon.toward_sun
     east = np.cross([0.0, 0.0, 1.0], direction)
     north = np.cross(direction, east)
-    assert np.degrees(np.arctan2(toward_sun @ east, toward_sun @ north)) % 360 == pytest.approx(285.044, abs=0.01)
+    assert np.degrees(np.arctan2(toward_sun @ east, toward_sun @ north)) % 360 == pytest.approx(
+        285.044, abs=0.01
+    )
 
 
 def test_the_earth_moves_as_fast_as_erfa_says() -> None:
     """Positions of the ephemeris, differenced over a day, against ERFA's own theory; and the Sun against its place."""
     for jd in np.linspace(2441400.5, 2487400.5, 15):
-        one, other = (ephemeris.load_ephemeris().position_km("earth", jd + half) for half in (0.05, -0.05))
+        one, other = (
+            ephemeris.load_ephemeris().position_km("earth", jd + half) for half in (0.05, -0.05)
+        )
         heliocentric, barycentric = erfa.epv00(jd, 0.0)
         km_s = (one - other) / (0.1 * 86400)
         assert np.linalg.norm(km_s - barycentric["v"] * places.AU_KM / 86400) < 1e-4
@@ -115,7 +122,8 @@ def test_the_moon_is_displaced_by_its_parallax() -> None:
         from_site = places.place("moon", seen)
         up = position_m / np.linalg.norm(position_m)
         turned = np.arctan2(
-            np.linalg.norm(np.cross(from_site.direction, moon.direction)), from_site.direction @ moon.direction
+            np.linalg.norm(np.cross(from_site.direction, moon.direction)),
+            from_site.direction @ moon.direction,
         )
         sine = np.linalg.norm(position_m) / 1e3 / moon.distance_km
         zenith = np.arccos(from_site.direction @ up)
@@ -137,7 +145,9 @@ PUBLISHED = [
 ]
 
 
-def lit(name: str, sun_au: float, observer_au: float, phase_deg: float, latitude_deg: float = 0.0) -> places.Place:
+def lit(
+    name: str, sun_au: float, observer_au: float, phase_deg: float, latitude_deg: float = 0.0
+) -> places.Place:
     """A body seen at a phase angle, Sun and observer at a latitude above its equator."""
     pole = np.array([0.0, 0.0, 1.0])
     if name in magnitudes.POLES_DEG:
@@ -146,10 +156,14 @@ def lit(name: str, sun_au: float, observer_au: float, phase_deg: float, latitude
     east = np.cross(pole, [1.0, 0.0, 0.0])
     east /= np.linalg.norm(east)
     across = np.cross(east, pole)
-    b, half = np.radians(latitude_deg), np.radians(phase_deg) / 2
+    b = np.radians(latitude_deg)
+    half = np.radians(phase_deg) / 2
     outward = np.cos(b) * east + np.sin(b) * pole
-    to_sun, to_observer = (np.cos(half) * outward + sign * np.sin(half) * across for sign in (1, -1))
-    from_sun_km, to_body_km = -to_sun * sun_au * places.AU_KM, -to_observer * observer_au * places.AU_KM
+    to_sun, to_observer = (
+        np.cos(half) * outward + sign * np.sin(half) * across for sign in (1, -1)
+    )
+    from_sun_km = -to_sun * sun_au * places.AU_KM
+    to_body_km = -to_observer * observer_au * places.AU_KM
     return places.lit_place(-to_observer, from_sun_km, to_body_km)
 
 
@@ -178,12 +192,17 @@ def test_uranus_and_neptune_are_the_authors_own() -> None:
         (-9.68, 30.207767693725, 29.8172370857530, 1.7741, 7.827),
     ):
         at = lit("neptune", sun_au, observer_au, phase_deg)
-        assert magnitudes.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(v_mag, abs=1e-3)
+        assert magnitudes.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
+            v_mag, abs=1e-3
+        )
 
 
 def test_open_rings_make_saturn_brighter() -> None:
     """Edge on -8.914, at 26.7 degrees -8.914 - (1.825 + 0.378) sin 26.7 at opposition; unlit rings give none."""
-    unit = [magnitudes.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD) for b in (0.0, 26.7)]
+    unit = [
+        magnitudes.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
+        for b in (0.0, 26.7)
+    ]
     assert unit == pytest.approx([-8.914, -8.914 - 2.203 * np.sin(np.radians(26.7))], abs=1e-6)
     at = lit("saturn", 1.0, 1.0, 0.0, 5.0)
     from_below = places.lit_place(-at.direction, at.from_sun_km, -at.to_body_km)
@@ -215,7 +234,9 @@ def test_a_lambert_sphere_has_lambert_s_phase_and_center(phase_deg: float) -> No
     mu = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     light = np.where(mu > 0, np.maximum(x * np.sin(a) + mu * np.cos(a), 0.0), 0.0)
     full = np.where(mu > 0, mu, 0.0)
-    assert light.sum() / full.sum() == pytest.approx((np.sin(a) + (np.pi - a) * np.cos(a)) / np.pi, abs=1e-3)
+    assert light.sum() / full.sum() == pytest.approx(
+        (np.sin(a) + (np.pi - a) * np.cos(a)) / np.pi, abs=1e-3
+    )
     xy, share = discs.disc_elements(discs.Surface(discs.LAMBERT, a))
     assert share.sum() == pytest.approx(1.0)
     assert share @ xy == pytest.approx([(light * x).sum() / light.sum(), 0.0], abs=2e-3)
@@ -242,7 +263,9 @@ def test_earthshine_lights_the_whole_disc() -> None:
     x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
     dark = (x < -0.02) & (np.hypot(x, y) < 0.98)
     assert np.ptp(share[dark]) < 1e-9 * share[dark].max()
-    assert share[dark].sum() == pytest.approx(0.01 / 1.01 * dark.sum() / (np.hypot(x, y) < 1).sum(), rel=1e-3)
+    assert share[dark].sum() == pytest.approx(
+        0.01 / 1.01 * dark.sum() / (np.hypot(x, y) < 1).sum(), rel=1e-3
+    )
 
 
 def test_the_sun_s_limb_is_dark() -> None:
@@ -256,8 +279,14 @@ def test_the_sun_s_limb_is_dark() -> None:
     ("name", "b_v"),
     # Mallama, Krobusek & Pavlov 2017, table 3; the Moon's of color index catalogs.
     [
-        *(("mercury", 0.97), ("venus", 0.70), ("mars", 1.36), ("jupiter", 0.86), ("saturn", 1.07)),
-        *(("uranus", 0.50), ("neptune", 0.39), ("moon", 0.92)),
+        ("mercury", 0.97),
+        ("venus", 0.70),
+        ("mars", 1.36),
+        ("jupiter", 0.86),
+        ("saturn", 1.07),
+        ("uranus", 0.50),
+        ("neptune", 0.39),
+        ("moon", 0.92),
     ],
 )
 def test_albedos_have_the_measured_colors(name: str, b_v: float) -> None:
@@ -279,12 +308,15 @@ def test_reflected_light_follows_the_albedo() -> None:
 
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
-    lights = bodies_from(BodiesConfig(), observer.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND)
+    lights = bodies_from(
+        BodiesConfig(), observer.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND
+    )
     assert {light.name for light in lights} == set(BODIES)
     distances = [light.place.distance_km for light in lights]
     assert distances == sorted(distances, reverse=True)
     by_name = {light.name: light for light in lights}
-    sun, moon = by_name["sun"], by_name["moon"]
+    sun = by_name["sun"]
+    moon = by_name["moon"]
     ratio = moon.flux_e_s_m2 / (1 + moon.earthshine) / sun.flux_e_s_m2
     # The Moon is redder than the Sun, so it is brighter in a band beyond V than its magnitude says.
     assert 0.0 < moon.magnitude - sun.magnitude + 2.5 * np.log10(ratio) < 0.25

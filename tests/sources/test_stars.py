@@ -19,7 +19,11 @@ from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 MAS_RAD = np.pi / 180 / 3.6e6
 ARCSEC_RAD = 1000 * MAS_RAD
-DATES = [datetime.datetime(1995, 1, 3), datetime.datetime(2016, 6, 21, 7, 30), datetime.datetime(2027, 10, 9)]
+DATES = [
+    datetime.datetime(1995, 1, 3),
+    datetime.datetime(2016, 6, 21, 7, 30),
+    datetime.datetime(2027, 10, 9),
+]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +47,10 @@ def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_apparent_places_are_skycoord_s(stars: Catalog, date: datetime.datetime) -> None:
     # Stars whose parallax is known: SkyCoord needs a distance for space motion.
     near = stars.take(stars.parallax_rad > 1 * MAS_RAD)
-    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+    ):
         icrs = SkyCoord(
             ra=near.ra_rad * u.rad,
             dec=near.dec_rad * u.rad,
@@ -68,8 +75,13 @@ def test_aberration_is_a_year_s_ellipse_of_20_5_arcsec() -> None:
     # The constant of aberration is 20.4955"; perihelion and the Sun's own motion add or take 0.35" and 0.01".
     pole = star(ra_rad=np.radians(270.0), dec_rad=np.radians(66.56))  # the pole of the ecliptic
     days = [datetime.datetime(2021, 1, 1) + datetime.timedelta(days=5 * n) for n in range(73)]
-    straight = np.array([np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]])
-    off = np.array([separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days]) / ARCSEC_RAD
+    straight = np.array(
+        [np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]]
+    )
+    off = (
+        np.array([separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days])
+        / ARCSEC_RAD
+    )
     assert off.max() == pytest.approx(20.4955 + 0.34, abs=0.03)
     assert off.min() == pytest.approx(20.4955 - 0.34, abs=0.03)
 
@@ -79,7 +91,9 @@ def test_a_star_ahead_of_the_observer_is_drawn_forward() -> None:
     ahead = np.array([0.0, 0.0, 7600.0])
     still = star_sources.apparent(star(), DATES[1])[0]
     moving = star_sources.apparent(star(), DATES[1], ahead)[0]
-    assert (moving - still)[2] / ARCSEC_RAD == pytest.approx(7600 / 299792458 / ARCSEC_RAD, rel=1e-3)
+    assert (moving - still)[2] / ARCSEC_RAD == pytest.approx(
+        7600 / 299792458 / ARCSEC_RAD, rel=1e-3
+    )
     assert abs((moving - still)[1]) / ARCSEC_RAD < 0.001  # second order in v/c
 
 
@@ -107,7 +121,9 @@ def test_proper_motion_is_along_the_parallel_and_the_meridian() -> None:
     north = star_sources.apparent(star(**place, pm_dec_rad_yr=ARCSEC_RAD), date)[0] - still
     # 0.01": aberration itself changes by 1e-4 of the 20", and 20 years of 365.25 days end half a day off.
     np.testing.assert_allclose(east / ARCSEC_RAD, [0, 20, 0], rtol=0, atol=0.01)
-    np.testing.assert_allclose(north / ARCSEC_RAD, [-20 * np.sin(np.radians(60)), 0, 20 * 0.5], rtol=0, atol=0.01)
+    np.testing.assert_allclose(
+        north / ARCSEC_RAD, [-20 * np.sin(np.radians(60)), 0, 20 * 0.5], rtol=0, atol=0.01
+    )
 
 
 def test_the_sun_bends_light_outward() -> None:
@@ -133,7 +149,9 @@ def test_a_rolled_camera_by_hand() -> None:
     np.testing.assert_allclose(matrix, [[0, 0, 1], [0, -1, 0], [1, 0, 0]], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize(("ra_deg", "dec_deg"), [(83.8, -5.4), (0.1, 45.0), (359.9, -70.0), (200.0, 89.0)])
+@pytest.mark.parametrize(
+    ("ra_deg", "dec_deg"), [(83.8, -5.4), (0.1, 45.0), (359.9, -70.0), (200.0, 89.0)]
+)
 def test_north_is_up_and_east_is_left(ra_deg: float, dec_deg: float) -> None:
     cam = star_sources.cam_from_icrs(ra_deg, dec_deg, 0.0)
 
@@ -143,7 +161,8 @@ def test_north_is_up_and_east_is_left(ra_deg: float, dec_deg: float) -> None:
 
     # 1e-15: rounding of the unit vectors.
     np.testing.assert_allclose(look(ra_deg, dec_deg), [0, 0, 1], rtol=0, atol=1e-15)
-    north, east = look(ra_deg, dec_deg + 0.1), look(ra_deg + 0.1, dec_deg)
+    north = look(ra_deg, dec_deg + 0.1)
+    east = look(ra_deg + 0.1, dec_deg)
     np.testing.assert_allclose(north[:2], [0, -np.sin(np.radians(0.1))], rtol=0, atol=1e-15)
     assert east[0] < 0
     assert abs(east[1]) < 0.1 * abs(east[0])
@@ -151,7 +170,8 @@ def test_north_is_up_and_east_is_left(ra_deg: float, dec_deg: float) -> None:
 
 @pytest.mark.parametrize("roll_deg", [-120.0, 30.0, 250.0])
 def test_roll_is_the_position_angle_of_up(roll_deg: float) -> None:
-    ra_deg, dec_deg = 150.0, 35.0
+    ra_deg = 150.0
+    dec_deg = 35.0
     up_icrs = star_sources.cam_from_icrs(ra_deg, dec_deg, roll_deg).inv().apply([0.0, -1e-6, 1.0])
     center = SkyCoord(ra_deg, dec_deg, unit="deg")
     toward = SkyCoord(*up_icrs, representation_type="cartesian").represent_as("unitspherical")
@@ -182,7 +202,9 @@ def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalog) -> None:
 
 def test_sources_are_as_bright_as_their_magnitude_and_color(stars: Catalog) -> None:
     """In half of all photons of 400-1000 nm, against the reference's 5.62e10 photons/s/m² of a G2 star at V = 0."""
-    seen = star_sources.sources(stars, DATES[1], 2.0, Rotation.identity(), Band.from_efficiency(0.5))
+    seen = star_sources.sources(
+        stars, DATES[1], 2.0, Rotation.identity(), Band.from_efficiency(0.5)
+    )
     relative = {
         int(hip): strength / (0.5 * 5.62e10 * 10 ** (-0.4 * v_mag))
         for hip, strength, v_mag in zip(seen.id, seen.strength, seen.magnitude, strict=True)
@@ -193,4 +215,11 @@ def test_sources_are_as_bright_as_their_magnitude_and_color(stars: Catalog) -> N
 
 
 def test_no_star_so_bright_gives_no_source(stars: Catalog) -> None:
-    assert len(star_sources.sources(stars, DATES[0], -5.0, Rotation.identity(), Band.from_efficiency(0.5))) == 0
+    assert (
+        len(
+            star_sources.sources(
+                stars, DATES[0], -5.0, Rotation.identity(), Band.from_efficiency(0.5)
+            )
+        )
+        == 0
+    )

@@ -26,7 +26,12 @@ TRIAXIAL = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38 in", "45 in"
 FLAT = {"kind": "flat", "apex": "48 in"}
 VAULT = {"kind": "cylinder", "axis": "x", "apex": "48 in", "radius": "52 in"}
 DRUM = {"kind": "cylinder", "axis": "z", "apex": "30 in", "radius": "48 in", "length": "50 in"}
-WALL = {"thickness_apex": "0.2036 in", "thickness_base": "0.25 in", "base_deg": 40, "radius_of": "mid_wall"}
+WALL = {
+    "thickness_apex": "0.2036 in",
+    "thickness_base": "0.25 in",
+    "base_deg": 40,
+    "radius_of": "mid_wall",
+}
 DESIGN = {"kind": "sphere", "apex": "48.033 in", "radius": "48.135 in", "wall": WALL}
 MOVED = {"offset": ["1 in", "-2 in", "0.5 in"], "tilt_deg": [3.0, -2.0]}
 KINDS = {
@@ -50,7 +55,8 @@ def rays_up(count: int, seed: int, most_deg: float = 35.0) -> np.ndarray:
     """Directions within an angle of the zenith, of lengths other than 1."""
     rng = np.random.default_rng(seed)
     up = rng.uniform(np.cos(np.radians(most_deg)), 1, count)
-    azimuth, length = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.3, 3, count)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    length = rng.uniform(0.3, 3, count)
     out = np.sqrt(1 - up**2)
     return np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up]) * length[:, None]
 
@@ -69,8 +75,13 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def dome_points_m(count: int, seed: int, most_deg: float = 41.0) -> np.ndarray:
     rays = rays_up(count - 40, seed, most_deg)
-    edge, azimuth = np.radians(most_deg), np.arange(40) * (2 * np.pi / 40)
-    ring = [np.sin(edge) * np.cos(azimuth), np.sin(edge) * np.sin(azimuth), np.full(40, np.cos(edge))]
+    edge = np.radians(most_deg)
+    azimuth = np.arange(40) * (2 * np.pi / 40)
+    ring = [
+        np.sin(edge) * np.cos(azimuth),
+        np.sin(edge) * np.sin(azimuth),
+        np.full(40, np.cos(edge)),
+    ]
     return made(MEASURED).meet(np.zeros(3), np.vstack([rays, np.column_stack(ring)]))
 
 
@@ -111,7 +122,8 @@ def off_equation(name: str, points_m: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("origin_in", [(0, 0, 0), (2, -1, 15)])
 def test_points_lie_on_their_rays_and_satisfy_the_equation(name: str, origin_in: tuple) -> None:
-    origin, rays = INCH_M * np.array(origin_in, float), rays_for(name, 300, 1)
+    origin = INCH_M * np.array(origin_in, float)
+    rays = rays_for(name, 300, 1)
     met = made(KINDS[name]).meet(origin, rays)
     assert np.isfinite(met).all()
     np.testing.assert_allclose(off_equation(name, met), 0, rtol=0, atol=3e-14)  # rounding of a root
@@ -140,13 +152,16 @@ def test_normals_are_the_numerical_gradient_s(name: str, cloud: dict) -> None:
 def test_offset_and_tilt_are_a_rigid_motion_about_the_center(name: str, cloud: dict) -> None:
     """Turn the rays instead: first about x by 3 deg, then about y by -2 deg, written out as matrices."""
     part = cloud if name == "cloud" else KINDS[name]
-    still, moved = made(part), made(part, **MOVED)
+    still = made(part)
+    moved = made(part, **MOVED)
     a, b = np.radians(MOVED["tilt_deg"])
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    turn, shift = about_y @ about_x, INCH_M * np.array([1, -2, 0.5])
+    turn = about_y @ about_x
+    shift = INCH_M * np.array([1, -2, 0.5])
     pivot = np.zeros(3) if name == "cloud" else still.center_m
-    origin, rays = np.array([0.05, -0.02, 0.1]), rays_for(name, 100, 5)
+    origin = np.array([0.05, -0.02, 0.1])
+    rays = rays_for(name, 100, 5)
     before = still.meet(pivot + turn.T @ (origin - shift - pivot), rays @ turn)
     expected = (before - pivot) @ turn.T + pivot + shift
     met = moved.meet(origin, rays)
@@ -170,7 +185,8 @@ def test_rays_that_never_leave_the_surface_are_nan(name: str, cloud: dict) -> No
 
 def test_no_rays_give_no_points(cloud: dict) -> None:
     for part in (*KINDS.values(), cloud):
-        shape, none = made(part), np.zeros((0, 3))
+        shape = made(part)
+        none = np.zeros((0, 3))
         assert shape.meet(np.zeros(3), none).shape == shape.inward(none).shape == (0, 3)
 
 
@@ -178,12 +194,15 @@ def test_a_wall_of_one_thickness_is_a_sphere() -> None:
     """Newton's points against the quadratic's."""
     even = DESIGN | {"wall": WALL | {"thickness_base": "0.2036 in", "radius_of": "outside"}}
     ball = made({"kind": "sphere", "apex": "48.033 in", "radius": "47.9314 in"}, **MOVED)
-    origin, rays = np.array([0.1, 0.2, 0.3]), rays_up(500, 8, 120)
+    origin = np.array([0.1, 0.2, 0.3])
+    rays = rays_up(500, 8, 120)
     met = made(even, **MOVED).meet(origin, rays)
     np.testing.assert_allclose(met, ball.meet(origin, rays), rtol=0, atol=1e-14)
 
 
-def test_newton_settles_in_few_steps_from_anywhere_inside(cloud: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newton_settles_in_few_steps_from_anywhere_inside(
+    cloud: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Eight are allowed here of the 200 by which bisection alone would end."""
     monkeypatch.setattr("skysim.sources.dome.shell.surface.MAX_STEPS", 8)
     rng = np.random.default_rng(2)
@@ -196,10 +215,14 @@ def test_newton_settles_in_few_steps_from_anywhere_inside(cloud: dict, monkeypat
             assert len(far) > 20
 
 
-def test_a_ray_that_does_not_settle_is_an_error_not_a_point(cloud: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ray_that_does_not_settle_is_an_error_not_a_point(
+    cloud: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shape = made(cloud)
     monkeypatch.setattr("skysim.sources.dome.shell.surface.MAX_STEPS", 1)
-    with pytest.raises(ArithmeticError, match=r"no convergence on the surface for \d+ rays in 1 steps"):
+    with pytest.raises(
+        ArithmeticError, match=r"no convergence on the surface for \d+ rays in 1 steps"
+    ):
         shape.meet(np.array([0.1, 0.0, 0.3]), rays_up(10, 1))
 
 
@@ -209,9 +232,12 @@ def test_a_ray_that_does_not_settle_is_an_error_not_a_point(cloud: dict, monkeyp
 @pytest.mark.parametrize("name", ["sphere", "oblate", "wall", "cloud"])
 def test_a_rim_s_half_angle_is_seen_from_the_bearing(name: str, cloud: dict) -> None:
     part = cloud if name == "cloud" else KINDS[name]
-    shape, whole = made(part, rim_deg=30), made(part)
+    shape = made(part, rim_deg=30)
+    whole = made(part)
     angle_deg = np.array([0, 15, 29.999, 30.001, 40])
-    rays = np.column_stack([0 * angle_deg, np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))])
+    rays = np.column_stack(
+        [0 * angle_deg, np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))]
+    )
     met = shape.meet(np.zeros(3), rays)
     np.testing.assert_array_equal(np.isnan(met[:, 0]), angle_deg > 30)
     np.testing.assert_array_equal(met[:3], whole.meet(np.zeros(3), rays)[:3])
@@ -221,8 +247,11 @@ def test_a_rim_s_half_angle_is_seen_from_the_bearing(name: str, cloud: dict) -> 
 def test_a_rim_s_height_goes_with_the_dome(name: str, cloud: dict) -> None:
     """Upright it is a height above the bearing; displaced, nothing is left beneath the displaced plane."""
     part = cloud if name == "cloud" else KINDS[name]
-    rim, rays = 40 * INCH_M, rays_up(4000, 4, 60)
-    met, whole = (one.meet(np.zeros(3), rays) for one in (made(part, rim_height="40 in"), made(part)))
+    rim = 40 * INCH_M
+    rays = rays_up(4000, 4, 60)
+    met, whole = (
+        one.meet(np.zeros(3), rays) for one in (made(part, rim_height="40 in"), made(part))
+    )
     lower = ~(whole[:, 2] >= rim)
     np.testing.assert_array_equal(np.isnan(met[:, 0]), lower)
     assert 100 < lower.sum() < 3900
@@ -238,7 +267,9 @@ def test_a_panel_and_a_vault_end_at_their_sides() -> None:
     panel = made({"kind": "flat", "apex": "1 m", "width": "1 m", "height": "0.6 m"})
     missed = [False, True, True, False, True]
     np.testing.assert_array_equal(np.isnan(panel.meet(np.zeros(3), rays)[:, 0]), missed)
-    vault = made({"kind": "cylinder", "axis": "y", "apex": "1 m", "radius": "1 m", "length": "0.6 m"})
+    vault = made(
+        {"kind": "cylinder", "axis": "y", "apex": "1 m", "radius": "1 m", "length": "0.6 m"}
+    )
     along = np.array([[0, 0.29, 1], [0, 0.31, 1], [0, -0.29, 1], [0, -0.31, 1]])
     np.testing.assert_array_equal(np.isnan(vault.meet(np.zeros(3), along)[:, 0]), [False, True] * 2)
 
@@ -269,17 +300,22 @@ def test_the_design_s_sphere_is_not_its_outside() -> None:
 
 
 def test_the_wall_thickens_evenly_with_the_angle_and_no_more_beyond_its_base() -> None:
-    shape, angle = made(DESIGN), np.radians([0, 10, 20, 30, 40, 60])
+    shape = made(DESIGN)
+    angle = np.radians([0, 10, 20, 30, 40, 60])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
     radius_in = np.linalg.norm(shape.meet(shape.center_m, rays) - shape.center_m, axis=1) / INCH_M
     wall_in = 2 * (48.135 - radius_in)
-    np.testing.assert_allclose(wall_in, [0.2036, 0.2152, 0.2268, 0.2384, 0.25, 0.25], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        wall_in, [0.2036, 0.2152, 0.2268, 0.2384, 0.25, 0.25], rtol=0, atol=1e-11
+    )
 
 
 def test_the_measured_dome_s_rim_is_the_reference_s() -> None:
     """Reference A4: rim at z = 36.66 in, 11.34 in under the apex, 48.011 in off; 48.29 in at most, near 29 deg."""
     angle_deg = np.arange(0, 45, 0.002)
-    rays = np.column_stack([np.sin(np.radians(angle_deg)), 0 * angle_deg, np.cos(np.radians(angle_deg))])
+    rays = np.column_stack(
+        [np.sin(np.radians(angle_deg)), 0 * angle_deg, np.cos(np.radians(angle_deg))]
+    )
     met_in = made(MEASURED, rim_height="36.66 in").meet(np.zeros(3), rays) / INCH_M
     met_in = met_in[np.isfinite(met_in[:, 0])]
     far_in = np.linalg.norm(met_in, axis=1)
@@ -339,7 +375,9 @@ def test_a_wall_s_and_a_tilted_ellipsoid_s_nearest_ellipsoid_say_how_near_they_a
     wall = made(DESIGN, rim_deg=40).nearest_ellipsoid()
     assert wall.rms_m < 0.001 * INCH_M
     assert wall.semi_axes_m[2] > wall.semi_axes_m[0] == pytest.approx(wall.semi_axes_m[1], rel=1e-6)
-    near, far = (made(MEASURED, rim_deg=35, tilt_deg=[t, 0]).nearest_ellipsoid() for t in (0.5, 1.0))
+    near, far = (
+        made(MEASURED, rim_deg=35, tilt_deg=[t, 0]).nearest_ellipsoid() for t in (0.5, 1.0)
+    )
     assert 0 < near.rms_m < far.rms_m < 1e-3
     assert far.rms_m == pytest.approx(2 * near.rms_m, rel=0.05)
 
@@ -371,13 +409,17 @@ def test_zernike_polynomials_are_the_textbook_s_and_their_gradients_their_own() 
             k = (n - m) // 2
             radial = (-1) ** k * radius**m * eval_jacobi(k, m, 0, 1 - 2 * radius**2)
             for trig in (np.cos, np.sin)[: 1 + (m > 0)]:
-                np.testing.assert_allclose(value[:, column], radial * trig(m * azimuth), rtol=0, atol=1e-13)
+                np.testing.assert_allclose(
+                    value[:, column], radial * trig(m * azimuth), rtol=0, atol=1e-13
+                )
                 column += 1
     assert column == value.shape[1] == 45
     assert np.abs(value).max() <= 1 + 1e-13
     for axis in (0, 1):
         step = 1e-5 * np.eye(2)[axis]
-        chord = (point_cloud.zernike(8, disk + step)[0] - point_cloud.zernike(8, disk - step)[0]) / 2e-5
+        chord = (
+            point_cloud.zernike(8, disk + step)[0] - point_cloud.zernike(8, disk - step)[0]
+        ) / 2e-5
         np.testing.assert_allclose(slope[..., axis], chord, rtol=0, atol=1e-6)
 
 
@@ -387,7 +429,8 @@ def test_a_cloud_without_noise_is_the_dome_to_two_micrometers(tmp_path: Path) ->
     assert isinstance(shape, Radial)
     assert shape.fit is not None
     assert shape.fit.rms_m < 1e-6
-    rays, true = rays_up(500, 9), made(MEASURED)
+    rays = rays_up(500, 9)
+    true = made(MEASURED)
     expected = true.meet(np.zeros(3), rays)
     met = shape.meet(np.zeros(3), rays)
     np.testing.assert_allclose(met, expected, rtol=0, atol=3e-6)
@@ -410,7 +453,9 @@ def test_a_cloud_with_noise_comes_back_within_theory(cloud: dict) -> None:
     kept = np.isfinite(met[:, 0])
     assert kept.mean() > 0.98  # all but those beyond the least far sector
     apart = np.linalg.norm(met[kept], axis=1) - np.linalg.norm(true[kept], axis=1)
-    assert np.sqrt(np.mean(apart**2)) / (1e-4 * np.sqrt(lean)) == pytest.approx(1, abs=4 / np.sqrt(56))
+    assert np.sqrt(np.mean(apart**2)) / (1e-4 * np.sqrt(lean)) == pytest.approx(
+        1, abs=4 / np.sqrt(56)
+    )
     # The greatest of 3,000 normal deviates is 3.2 to 5 sigma but once in a thousand.
     assert 3.0e-4 < shape.fit.max_residual_m < 5.0e-4
     assert shape.fit.max_residual_m == np.abs(shape.fit.residual_m).max()
@@ -420,7 +465,9 @@ def test_a_cloud_s_best_ellipsoid_is_the_dome_s_within_its_noise(cloud: dict) ->
     """The axes themselves are ill told by a cap; where the ellipsoid is, is not."""
     believed = made(cloud, rim_deg=38).nearest_ellipsoid()
     assert believed.rms_m < 3e-5
-    met = (made(MEASURED).meet(np.zeros(3), rays_up(500, 4)) - believed.center_m) / believed.semi_axes_m
+    met = (
+        made(MEASURED).meet(np.zeros(3), rays_up(500, 4)) - believed.center_m
+    ) / believed.semi_axes_m
     size = np.linalg.norm(met, axis=1)
     apart_m = (size - 1) * size / np.linalg.norm(met / believed.semi_axes_m, axis=1)
     assert np.sqrt(np.mean(apart_m**2)) < 1e-4 * np.sqrt(28 / 3000) * 1.5
@@ -542,23 +589,38 @@ def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path) -> None:
         "x,y,z\n1,2,3\n1,2\n",
     ):
         path.write_text(text)
-        assert surveyed_complaint(path).startswith(f"light.surface.file: {path}: not a point file (")
+        assert surveyed_complaint(path).startswith(
+            f"light.surface.file: {path}: not a point file ("
+        )
 
 
 def test_points_that_tell_no_smooth_dome_are_refused(tmp_path: Path) -> None:
-    path, rng = tmp_path / "bad.csv", np.random.default_rng(1)
+    path = tmp_path / "bad.csv"
+    rng = np.random.default_rng(1)
     good = dome_points_m(500, 1)
     written(path, good[:83])
     assert "83 points; allowed: at least 84 for degree 6" in surveyed_complaint(path)
     written(path, good * [1, 1, 0] + [0, 0, 1.2])
-    assert "the points lie in a plane or on a line; allowed: points of a dome" in surveyed_complaint(path)
+    assert (
+        "the points lie in a plane or on a line; allowed: points of a dome"
+        in surveyed_complaint(path)
+    )
     written(path, good[good[:, 0] > 0])
-    assert "parts of the dome have no points; allowed: points all around +z" in surveyed_complaint(path)
+    assert "parts of the dome have no points; allowed: points all around +z" in surveyed_complaint(
+        path
+    )
     written(path, good + 3e-3 * rng.standard_normal(good.shape))
-    assert re.search(r"0.00\d+ m rms off .*worst 0.0\d+ m\); allowed: rms_limit 0.001 m", surveyed_complaint(path))
-    assert made({"kind": "surveyed", "file": str(path), "unit": "mm", "rms_limit": "5 mm"}).inside(np.zeros(3))
+    assert re.search(
+        r"0.00\d+ m rms off .*worst 0.0\d+ m\); allowed: rms_limit 0.001 m",
+        surveyed_complaint(path),
+    )
+    assert made({"kind": "surveyed", "file": str(path), "unit": "mm", "rms_limit": "5 mm"}).inside(
+        np.zeros(3)
+    )
     written(path, good)
-    assert "do not reach the rim; allowed: a rim within 41." in surveyed_complaint(path, ", rim_deg: 60")
+    assert "do not reach the rim; allowed: a rim within 41." in surveyed_complaint(
+        path, ", rim_deg: 60"
+    )
     assert "do not reach the rim" in surveyed_complaint(path, ", rim_height: 60 cm")
     far = "check file, unit, offset"
     assert far in surveyed_complaint(path, ", offset: [0 m, 0 m, -2 m]")
@@ -566,10 +628,15 @@ def test_points_that_tell_no_smooth_dome_are_refused(tmp_path: Path) -> None:
 
 def test_every_kind_of_part_has_its_surface() -> None:
     assert set(light.SURFACE_CONFIGS) == set(SURFACES)
-    assert all(part.model_fields["kind"].annotation.__args__ == (kind,) for kind, part in light.SURFACE_CONFIGS.items())
+    assert all(
+        part.model_fields["kind"].annotation.__args__ == (kind,)
+        for kind, part in light.SURFACE_CONFIGS.items()
+    )
 
 
-@pytest.mark.parametrize(("rim_deg", "mean_z"), [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)])
+@pytest.mark.parametrize(
+    ("rim_deg", "mean_z"), [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)]
+)
 def test_samples_are_even_over_the_solid_angle_down_to_the_rim_or_the_horizon(
     rim_deg: float | None, mean_z: float | None
 ) -> None:

@@ -36,7 +36,11 @@ BARE_CAMERA = {
 
 
 def loaded(name: str = "afit_simsat", **changes: str) -> Scene:
-    return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}, refuses_unused=False)
+    return loader.load(
+        name,
+        {key.replace("__", "."): value for key, value in changes.items()},
+        refuses_unused=False,
+    )
 
 
 def believing(**changes: str) -> tuple[DomeTracker, Lab]:
@@ -82,7 +86,9 @@ def test_over_the_seeds_the_camera_s_place_errs_by_lever_sigma() -> None:
 
 def test_over_the_seeds_the_surface_is_raised_by_its_declared_error() -> None:
     inside = inside_of(error="0.3 mm")
-    is_chi_square(np.array([survey_errors.surface_offset_m(inside, seed) for seed in range(500)]) / 3e-4)
+    is_chi_square(
+        np.array([survey_errors.surface_offset_m(inside, seed) for seed in range(500)]) / 3e-4
+    )
 
 
 def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
@@ -95,7 +101,9 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
     raised_m = survey_errors.surface_offset_m(inside, 9)
     assert 1e-4 < abs(raised_m) < 1e-2
     np.testing.assert_allclose(semi_axes_m, 1 + raised_m, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(np.linalg.norm(assumed_m - center_m, axis=1), semi_axes_m[0], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        np.linalg.norm(assumed_m - center_m, axis=1), semi_axes_m[0], rtol=0, atol=1e-14
+    )
     np.testing.assert_allclose(
         (assumed_m - place_m) @ np.array([0, 0, 1]),
         -raised_m * inside.inward(place_m)[:, 2],
@@ -112,10 +120,13 @@ def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> No
     leds = eyes.leds
     directions = (lab.camera.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
     normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    support = np.linalg.norm(normals * leds.semi_axes_m, axis=1)  # of the plane that touches it with that normal
+    support = np.linalg.norm(
+        normals * leds.semi_axes_m, axis=1
+    )  # of the plane that touches it with that normal
     true_axes_m = leds.semi_axes_m - raised_m
     share = (support - np.linalg.norm(normals * true_axes_m, axis=1)) / raised_m
-    longest, shortest = true_axes_m.max(), true_axes_m.min()
+    longest = true_axes_m.max()
+    shortest = true_axes_m.min()
     assert share.min() > 2 * np.sqrt(longest * shortest) / (longest + shortest) - 1e-3
     assert share.max() < 1 + 1e-3
     # Patch boards are flat and stand a little off the surface, where the normal is nearly the same.
@@ -144,7 +155,10 @@ def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_do
     def places(seed: int, own: int) -> tuple[bytes, ...]:
         told = ALL.format(lever="0.1 mm", seed=own)
         eyes, _ = believing(seed=str(seed), tracker__survey=told, light__surface__error="0.1 mm")
-        return tuple(one.tobytes() for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m))
+        return tuple(
+            one.tobytes()
+            for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m)
+        )
 
     first = places(1, 5)
     assert places(2, 5) == first
@@ -172,7 +186,9 @@ def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_distance(seed: int) -> None:
+def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_distance(
+    seed: int,
+) -> None:
     """The sight of an LED at p from the bearing stays as it was if the vehicle turns by p x shift / |p|^2.
 
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
@@ -185,11 +201,15 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
     assert answer.cam_from_ref is not None
     shift = eyes.lever.camera_body_m - lab.camera.mount.camera_body_m
     to_body = truth.lab_from_body.inv()
-    middle = to_body.apply(lab.camera.sources.place[np.isin(lab.camera.sources.id, truth.sources.id), :3]).mean(axis=0)
+    middle = to_body.apply(
+        lab.camera.sources.place[np.isin(lab.camera.sources.id, truth.sources.id), :3]
+    ).mean(axis=0)
     expected = lab.camera.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
     found = (answer.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     assert np.linalg.norm(expected[:2]) > 1e-3
-    np.testing.assert_allclose(found[:2], expected[:2], rtol=0, atol=0.05 * np.linalg.norm(expected[:2]))
+    np.testing.assert_allclose(
+        found[:2], expected[:2], rtol=0, atol=0.05 * np.linalg.norm(expected[:2])
+    )
 
 
 # --- what is refused ----------------------------------------------------------------------------------------
@@ -211,12 +231,17 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
         ),
         (
             "afit_simsat",
-            {"tracker.survey": "{lever_sigma: 1 mm}", "tracker.assumed_camera_body": "[0 m, 0 m, 0.4 m]"},
+            {
+                "tracker.survey": "{lever_sigma: 1 mm}",
+                "tracker.assumed_camera_body": "[0 m, 0 m, 0.4 m]",
+            },
             r"conflicts with assumed_camera_body; allowed: 0, or the survey alone",
         ),
     ],
 )
-def test_what_cannot_be_surveyed_is_told_in_one_line(name: str, changes: dict[str, str], complaint: str) -> None:
+def test_what_cannot_be_surveyed_is_told_in_one_line(
+    name: str, changes: dict[str, str], complaint: str
+) -> None:
     with pytest.raises(InputError, match=complaint) as refused:
         loader.load(name, changes)
     assert "\n" not in str(refused.value)
@@ -225,5 +250,8 @@ def test_what_cannot_be_surveyed_is_told_in_one_line(name: str, changes: dict[st
 def test_a_survey_that_leaves_no_dome_is_refused() -> None:
     inside = inside_of(error="1 m")
     seed = next(seed for seed in range(100) if survey_errors.surface_offset_m(inside, seed) < -1.0)
-    with pytest.raises(InputError, match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less"):
+    with pytest.raises(
+        InputError,
+        match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less",
+    ):
         survey_errors.assumed_ellipsoid(inside, SurveyErrorsConfig(seed=seed))

@@ -32,7 +32,9 @@ STATION = {
     "orientation_sigma_arcsec": 90,
     "leveling_sigma_arcsec": 50,
 }
-PLACES_M = np.array([[0.0, 0.0, 1.2], [0.3, 0.5, 1.0], [-0.9, 0.1, 0.6], [0.9, -0.3, 1.1], [0.8, 0.9, -0.2]])
+PLACES_M = np.array(
+    [[0.0, 0.0, 1.2], [0.3, 0.5, 1.0], [-0.9, 0.1, 0.6], [0.9, -0.3, 1.1], [0.8, 0.9, -0.2]]
+)
 DRAWS = 6_000
 
 
@@ -50,7 +52,9 @@ def draws(config: TotalStationConfig, own: bool, setup: bool) -> np.ndarray:
                 config,
                 PLACES_M,
                 own * rng.standard_normal(shape),
-                total_station.draw_setup(config, setup * rng.standard_normal(total_station.SETUP_ERRORS)),
+                total_station.draw_setup(
+                    config, setup * rng.standard_normal(total_station.SETUP_ERRORS)
+                ),
             )
             - PLACES_M
             for _ in range(DRAWS)
@@ -106,7 +110,11 @@ def test_no_leds_and_no_errors_of_the_set_up_are_empty() -> None:
         "distance_sigma": "1 mm",
     }
     for config, errors in ((TotalStationConfig.model_validate(perfect), 0), (station(), 8)):
-        assert total_station.common_displacements_m(config, np.zeros((0, 3))).shape == (errors, 0, 3)
+        assert total_station.common_displacements_m(config, np.zeros((0, 3))).shape == (
+            errors,
+            0,
+            3,
+        )
 
 
 def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
@@ -114,7 +122,9 @@ def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     place_m = np.array([[100.0, 0.0, 0.0]])
     config = station(position=["0 m", "0 m", "0 m"], angle_sigma_arcsec=1, distance_sigma="1 mm")
     covariance = total_station.covariance_m2(config, place_m)[0]
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [1e-3, 100 * ARCSEC, 100 * ARCSEC], rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(covariance)), [1e-3, 100 * ARCSEC, 100 * ARCSEC], rtol=1e-12
+    )
     assert 100 * ARCSEC == pytest.approx(0.5e-3, rel=0.05)  # noqa: SIM300
     # Toward the zenith the horizontal direction matters less, by the sine of the zenith angle.
     steep = total_station.covariance_m2(config, np.array([[10.0, 0.0, 10 * np.sqrt(3)]]))[0]
@@ -124,8 +134,18 @@ def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
 def test_distances_err_by_a_plus_b_ppm() -> None:
     """sigma^2 = a^2 + (b D)^2 over surveys: a in each distance, b in the scale of a survey."""
     config = station(
-        **{"position": ["0 m", "0 m", "0 m"], "distance_sigma": "1 mm", "distance_ppm": 1.5, "zero_sigma": "0 m"},
-        **{"centering": "0 m", "orientation_sigma_arcsec": 0, "leveling_sigma_arcsec": 0, "angle_sigma_arcsec": 0},
+        **{
+            "position": ["0 m", "0 m", "0 m"],
+            "distance_sigma": "1 mm",
+            "distance_ppm": 1.5,
+            "zero_sigma": "0 m",
+        },
+        **{
+            "centering": "0 m",
+            "orientation_sigma_arcsec": 0,
+            "leveling_sigma_arcsec": 0,
+            "angle_sigma_arcsec": 0,
+        },
     )
     places = np.array([[1000.0, 0, 0], [0, 10.0, 0]])
     own = total_station.covariance_m2(config, places)
@@ -137,7 +157,9 @@ def test_distances_err_by_a_plus_b_ppm() -> None:
 def test_tolerances_bound_every_part() -> None:
     config = station(angle_sigma_arcsec={"tolerance": 60}, centering={"tolerance": "0.5 mm"})
     rng = np.random.default_rng(2)
-    setup = np.array([total_station.draw_setup(config, rng.standard_normal(8)) for _ in range(2000)])
+    setup = np.array(
+        [total_station.draw_setup(config, rng.standard_normal(8)) for _ in range(2000)]
+    )
     assert np.abs(setup[:, :3]).max() <= 5e-4
     assert setup[:, :3].std() == pytest.approx(5e-4 / np.sqrt(3), rel=0.03)
     claimed = total_station.covariance_m2(config, np.array([[0.8, 9.7, -0.2]]))[0]
@@ -155,9 +177,13 @@ def survey_of(**more: Any) -> SurveyErrorsConfig:
 def test_the_tracker_believes_what_the_station_measured() -> None:
     """Places, covariance and common errors, over surveys: all errors together are chi-square as claimed."""
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate({"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m", "error": "0.4 mm"})
+        light.SurfaceConfig.model_validate(
+            {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m", "error": "0.4 mm"}
+        )
     )
-    place_m = inside.meet(np.zeros(3), np.random.default_rng(3).normal(size=(6, 3)) * [0.3, 0.3, 0] + [0, 0, 1])
+    place_m = inside.meet(
+        np.zeros(3), np.random.default_rng(3).normal(size=(6, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
+    )
     config = survey_of(led_sigma="0.2 mm")
     own = survey_errors.led_covariance_m2(place_m, config)
     common = survey_errors.common_displacements_m(inside, place_m, config)
@@ -170,7 +196,10 @@ def test_the_tracker_believes_what_the_station_measured() -> None:
     claimed += flat.T @ flat
     surveys = 400
     error = [
-        (survey_errors.assumed_leds_m(inside, place_m, survey_of(led_sigma="0.2 mm", seed=seed)) - place_m).ravel()
+        (
+            survey_errors.assumed_leds_m(inside, place_m, survey_of(led_sigma="0.2 mm", seed=seed))
+            - place_m
+        ).ravel()
         for seed in range(surveys)
     ]
     squares = np.einsum("di,ij,dj->d", error, np.linalg.inv(claimed), error)
@@ -185,7 +214,9 @@ def test_the_error_across_the_line_from_the_bearing_is_that_of_drawn_errors() ->
     along = PLACES_M / np.linalg.norm(PLACES_M, axis=1, keepdims=True)
     across_m = error_m - np.sum(error_m * along, axis=2, keepdims=True) * along
     measured_m = np.sqrt(np.mean(np.sum(across_m**2, axis=2), axis=0) / 2)
-    assert survey_errors.across_sigma_m(PLACES_M, own_m2) == pytest.approx(measured_m, rel=6 / np.sqrt(2 * DRAWS))
+    assert survey_errors.across_sigma_m(PLACES_M, own_m2) == pytest.approx(
+        measured_m, rel=6 / np.sqrt(2 * DRAWS)
+    )
 
 
 def test_the_final_match_admits_what_the_identification_admits() -> None:
@@ -194,9 +225,16 @@ def test_the_final_match_admits_what_the_identification_admits() -> None:
     An LED that the identification matches and the final match does not makes the tracker refuse the frame: 2 % of the
     attitudes of such a dome, when the sigma was the rms of all three axes. The final match has a radius of 4 sigma.
     """
-    beside = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
+    beside = {
+        "kind": "total_station",
+        "position": ["1 m", "0 m", "-0.5 m"],
+        "angle_sigma_arcsec": 2,
+    }
     survey = {"instrument": beside | {"distance_sigma": "1 mm"}, "seed": 1}
-    scene = loader.load("afit_simsat", {"tracker.survey": yaml.safe_dump(survey, default_flow_style=True, width=999)})
+    scene = loader.load(
+        "afit_simsat",
+        {"tracker.survey": yaml.safe_dump(survey, default_flow_style=True, width=999)},
+    )
     tracker = build_tracker(build_lab(scene).camera)
     assert isinstance(tracker, DomeTracker)
     index = build_dome_index(tracker.leds, tracker.lever, tracker.camera)
@@ -218,13 +256,22 @@ def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
     inside = surface.build_surface(
         light.SurfaceConfig.model_validate({"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"})
     )
-    exact = {"angle_sigma_arcsec": 0, "distance_sigma": "0 m", "zero_sigma": "0 m", "distance_ppm": 0}
+    exact = {
+        "angle_sigma_arcsec": 0,
+        "distance_sigma": "0 m",
+        "zero_sigma": "0 m",
+        "distance_ppm": 0,
+    }
     config = survey_of(instrument=STATION | exact)
-    place_m = inside.meet(np.zeros(3), np.random.default_rng(3).normal(size=(50, 3)) * [0.3, 0.3, 0] + [0, 0, 1])
+    place_m = inside.meet(
+        np.zeros(3), np.random.default_rng(3).normal(size=(50, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
+    )
     center_m, axes_m = survey_errors.assumed_ellipsoid(inside, config)
     found_m = survey_errors.assumed_leds_m(inside, place_m, config)
     assert np.linalg.norm(center_m) > 1e-4
-    np.testing.assert_allclose(np.linalg.norm(found_m - center_m, axis=1), axes_m[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        np.linalg.norm(found_m - center_m, axis=1), axes_m[0], rtol=0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize(
@@ -236,7 +283,10 @@ def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
             "tracker.survey.instrument.angle_sigma_arcsec: missing",
         ),
         (
-            {"tracker.survey": "{focal_length_sigma: 10 um}", "tracker.assumed_focal_length": "35 mm"},
+            {
+                "tracker.survey": "{focal_length_sigma: 10 um}",
+                "tracker.assumed_focal_length": "35 mm",
+            },
             "survey.focal_length_sigma: conflicts with assumed_focal_length",
         ),
     ],
@@ -263,12 +313,15 @@ def test_a_station_at_an_led_is_refused() -> None:
 def test_over_the_seeds_the_focal_length_errs_as_its_survey_says() -> None:
     config = SurveyErrorsConfig.model_validate({"focal_length_sigma": {"tolerance": "20 um"}})
     error = [
-        survey_errors.assumed_focal_length_m(0.035, config.model_copy(update={"seed": seed})) - 0.035
+        survey_errors.assumed_focal_length_m(0.035, config.model_copy(update={"seed": seed}))
+        - 0.035
         for seed in range(500)
     ]
     assert np.abs(error).max() <= 20e-6
     assert np.std(error) == pytest.approx(20e-6 / np.sqrt(3), rel=0.1)
-    lab = build_lab(loader.load("shefex2", {"tracker.survey": "{focal_length_sigma: 10 um, seed: 4}"}))
+    lab = build_lab(
+        loader.load("shefex2", {"tracker.survey": "{focal_length_sigma: 10 um, seed: 4}"})
+    )
     camera = build_tracker(lab.camera).camera
     assert camera.focal_sigma == pytest.approx(10e-6 / 0.025, rel=1e-12)
     assert camera.focal_px != pytest.approx(lab.scene.camera.focal_px, rel=1e-6)

@@ -27,7 +27,8 @@ LEVELS = {
 def test_measured_fluxes_scatter_about_the_expected_ones_as_leds_do(drive: dict[str, str]) -> None:
     """By 8 % from LED to LED, as the scene has it, and little more; and every attitude of the spiral is found."""
     lab = build_lab(loader.load("coded_spiral", LEVELS | drive))
-    tracker, ratios = build_tracker(lab.camera), []
+    tracker = build_tracker(lab.camera)
+    ratios = []
     for index in range(6):
         tilt = Rotation.from_euler("zyx", [60 * index, 4 * index, -3 * index], degrees=True)
         frame, truth = render_at_rest(lab.camera, tilt, index)

@@ -32,7 +32,11 @@ PERFECT = (
 ARCSEC = math.pi / 180 / 3600
 TUMBLE = "[3, -2, 20]"
 SINGLE = {"tracker.detector": "default", "tracker.min_area_px": "1"}
-NO_CONTROL = {"motion.control": "none", "motion.maneuver": "[]", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
+NO_CONTROL = {
+    "motion.control": "none",
+    "motion.maneuver": "[]",
+    "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
+}
 
 
 def flown(until_s: float, **changes: str) -> Flight:
@@ -60,7 +64,9 @@ def error(telemetry: Telemetry) -> Floats:
 
 def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
     """At 30 deg/s about an axis that stands still, to 1e-5 arcsec after five seconds."""
-    telemetry = telemetry_of(flown(5.0, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]"))
+    telemetry = telemetry_of(
+        flown(5.0, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
+    )
     assert np.abs(error(telemetry)).max() < 1e-5 * ARCSEC
     assert telemetry.saturated is not None
     assert not telemetry.saturated.any()
@@ -69,7 +75,8 @@ def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
 def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> None:
     """An increment is no rotation vector, but short of one by w x dw/dt T^3 / 12 in every T: 0.02 arcsec here."""
     flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
-    telemetry, step_s = telemetry_of(flight), 1 / 100
+    telemetry = telemetry_of(flight)
+    step_s = 1 / 100
     rate = telemetry.rate_body_rad_s
     cone = np.cross(rate, np.gradient(rate, telemetry.t_s, axis=0)) * step_s**2 / 12
     lost = telemetry.lab_from_body.apply(cone)[:-1].sum(axis=0) * 0.01
@@ -80,15 +87,23 @@ def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> No
 
 def test_uncompensated_earth_rate_makes_the_navigator_drift_by_15_deg_an_hour() -> None:
     """About the Earth's axis in the lab, however the vehicle turns: lab_from_imu = exp(W t) lab_from_body."""
-    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}", motion__rate_deg_s="[0, 0, 30]")
+    flight = flown(
+        5.0,
+        vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}",
+        motion__rate_deg_s="[0, 0, 30]",
+    )
     telemetry = telemetry_of(flight)
     drift = error(telemetry)[-1] / telemetry.t_s[-1]
     assert np.degrees(np.linalg.norm(drift)) * 3600 == pytest.approx(15.041, abs=1e-3)
-    np.testing.assert_allclose(drift, imu.earth_rate_lab_rad_s(flight.lab.scene.site), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        drift, imu.earth_rate_lab_rad_s(flight.lab.scene.site), rtol=0, atol=1e-9
+    )
 
 
 def test_compensated_earth_rate_is_taken_away_again() -> None:
-    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]")
+    flight = flown(
+        5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]"
+    )
     assert np.abs(error(telemetry_of(flight))).max() < 1e-4 * ARCSEC
 
 
@@ -96,11 +111,17 @@ def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
     """Turn-on bias and an Earth nobody takes away: minus the mean rate of the navigator's drift in body axes."""
     unit = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 30, scale_ppm: 0, quantum_arcsec: 0,"
     unit += " misalignment_arcsec: 0}, earth_rate: uncompensated}"
-    telemetry = telemetry_of(flown(5.0, vehicle__imu=unit, motion__start="{roll_deg: 20, yaw_deg: 70}"))
+    telemetry = telemetry_of(
+        flown(5.0, vehicle__imu=unit, motion__start="{roll_deg: 20, yaw_deg: 70}")
+    )
     assert telemetry.lab_from_imu is not None
     assert telemetry.bias_rad_s is not None
-    drift = (telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec()[-1] / telemetry.t_s[-1]
-    np.testing.assert_allclose(telemetry.bias_rad_s[-1], drift, rtol=0, atol=1e-4 * np.linalg.norm(drift))
+    drift = (telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec()[
+        -1
+    ] / telemetry.t_s[-1]
+    np.testing.assert_allclose(
+        telemetry.bias_rad_s[-1], drift, rtol=0, atol=1e-4 * np.linalg.norm(drift)
+    )
     assert np.degrees(np.linalg.norm(drift)) * 3600 > 20
 
 
@@ -111,7 +132,9 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
     telemetry = telemetry_of(flown(1.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__start=start))
     assert telemetry.lab_from_imu is not None
     believed = telemetry.lab_from_imu.as_euler("ZYX", degrees=True)[:, ::-1]
-    np.testing.assert_allclose(believed, np.tile([4.5, 11.0, -42.0], (len(believed), 1)), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        believed, np.tile([4.5, 11.0, -42.0], (len(believed), 1)), rtol=0, atol=1e-8
+    )
 
 
 @pytest.mark.long
@@ -152,8 +175,14 @@ def test_the_imu_feels_the_vibration() -> None:
 def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
     """The samples of all ticks together are those of the whole flight at once: as many, and their sum to 1e-9 rad."""
     place = np.array([0.1, 0.1, 0.14])
-    flight = flown(1.2345, vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}", motion__rate_deg_s=TUMBLE, seed="3")
-    telemetry, knots = telemetry_of(flight), flight.trajectory()
+    flight = flown(
+        1.2345,
+        vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}",
+        motion__rate_deg_s=TUMBLE,
+        seed="3",
+    )
+    telemetry = telemetry_of(flight)
+    knots = flight.trajectory()
     last_s = telemetry.t_s[-1]
     ends_s = np.arange(1, round(last_s * rate_hz) + 1) / rate_hz
     whole = imu.ideal_increments(
@@ -178,7 +207,8 @@ def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     lab = flight.lab
     there = [lab.camera.mount], lab.start, np.zeros(3), 9.8, np.random.default_rng(1)
     navigation = Navigation(lab.scene, *there)
-    knots, counts = flight.trajectory(), []
+    knots = flight.trajectory()
+    counts = []
     for end in range(7, 100, 7):
         begin = max(end - 10, 0)
         piece = slice(begin, end + 1)
@@ -190,13 +220,17 @@ def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     assert sum(counts) == navigation.samples == 39  # 97.5 of 98 ms
     angle = Rotation.from_quat(navigation.attitude_wxyz("imu"), scalar_first=True).as_rotvec()
     np.testing.assert_allclose(np.degrees(angle), [0, 0, 30 * 39 * 2.5e-3], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(np.degrees(navigation.body_rate_rad_s("imu")), [0, 0, 30], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.degrees(navigation.body_rate_rad_s("imu")), [0, 0, 30], rtol=0, atol=1e-9
+    )
 
 
 def test_a_turn_beyond_the_gyros_limit_is_missing_for_good() -> None:
     """25 deg/s on gyros that stop at 10: two seconds lose 30 deg."""
     limited = PERFECT.replace("{arw", "{rate_limit_deg_s: 10, arw")
-    telemetry = telemetry_of(flown(2.0, vehicle__imu=f"{{{limited}}}", motion__rate_deg_s="[0, 0, 25]"))
+    telemetry = telemetry_of(
+        flown(2.0, vehicle__imu=f"{{{limited}}}", motion__rate_deg_s="[0, 0, 25]")
+    )
     assert telemetry.saturated is not None
     assert telemetry.saturated[1:].all()
     lost = np.degrees(error(telemetry)[-1])
@@ -212,7 +246,9 @@ def test_without_a_filter_its_answer_is_the_navigator_s() -> None:
     mount = multibody.camera_mount(vehicle)
     start = Rotation.from_rotvec([0.1, 0.2, 0.3])
     navigation = Navigation(loaded, [mount], start, np.zeros(3), 9.8, np.random.default_rng(1))
-    np.testing.assert_array_equal(navigation.attitude_wxyz("filter"), navigation.attitude_wxyz("imu"))
+    np.testing.assert_array_equal(
+        navigation.attitude_wxyz("filter"), navigation.attitude_wxyz("imu")
+    )
     np.testing.assert_array_equal(navigation.body_rate_rad_s("filter"), np.zeros(3))
     assert navigation.update_filter(0.0, Attitude("no stars")) == "no stars"
     expected = start.as_quat(scalar_first=True)
@@ -231,7 +267,9 @@ def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
     aside = type(mount)(mount.camera_body_m, Rotation.from_euler("y", -90, degrees=True))
     boresight_body = aside.cam_from_body.inv().apply([0, 0, 1])
     truth = Rotation.from_rotvec([0.02, -0.03, 0.04])
-    navigation = Navigation(loaded, [aside], Rotation.identity(), np.zeros(3), 9.8, np.random.default_rng(1))
+    navigation = Navigation(
+        loaded, [aside], Rotation.identity(), np.zeros(3), 9.8, np.random.default_rng(1)
+    )
     spread = np.diag([1.0, 1.0, 100.0]) * (20 * ARCSEC) ** 2
     solution = Attitude("solved", aside.cam_from_body * truth.inv(), spread)
     assert navigation.update_filter(0.0, solution) == "used"
@@ -250,13 +288,19 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
     loaded = loader.load("afit_simsat", {"vehicle.imu": "{}", "filter": keys})
     assert loaded.filter is not None
     built = build_filter(loaded.filter, Rotation.identity())
-    for name, sigma in (("scale", 300e-6), ("misalignment", 20 * ARCSEC), ("mounting", 50 * ARCSEC)):
+    for name, sigma in (
+        ("scale", 300e-6),
+        ("misalignment", 20 * ARCSEC),
+        ("mounting", 50 * ARCSEC),
+    ):
         np.testing.assert_allclose(built.state.sigma(name), sigma, rtol=1e-12, atol=0)
     # One precise solution: attitude and mount share the 50, the slow error adds its 30, of which nothing is learned.
     assert built.update(0.0, Rotation.identity(), (ARCSEC * np.eye(3)) ** 2).status == "used"
     sigma = built.state.sigma_attitude_rad / ARCSEC
     start = np.radians(0.1) / ARCSEC
-    np.testing.assert_allclose(sigma, 1 / np.sqrt(1 / (50**2 + 30**2 + 1) + 1 / start**2), rtol=1e-3)
+    np.testing.assert_allclose(
+        sigma, 1 / np.sqrt(1 / (50**2 + 30**2 + 1) + 1 / start**2), rtol=1e-3
+    )
     assert (built.state.sigma("mounting") < 50 * ARCSEC).all()
     np.testing.assert_array_equal(built.state.others["scale"], np.zeros(3))
     # Nine tenths of the rate limit is a saturation, without the IMU's word.
@@ -279,10 +323,14 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
         ),
     ],
 )
-def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(changes: dict[str, str], why: str) -> None:
+def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(
+    changes: dict[str, str], why: str
+) -> None:
     """And it is rendered all the same: a lab may light one LED."""
     lab = build_lab(loader.load("afit_simsat_ideal", changes))
-    with pytest.raises(InputError, match=f"light: the star tracker cannot use .*: {why}") as refused:
+    with pytest.raises(
+        InputError, match=f"light: the star tracker cannot use .*: {why}"
+    ) as refused:
         build_tracker(lab.camera)
     assert "\n" not in str(refused.value)
     assert len(lab.camera.sources) >= 1
@@ -316,7 +364,10 @@ def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted
 @pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
 def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
     """Its frames would be black, without a word."""
-    far = {"vehicle.camera": "[0 m, 1.3 m, 0 m]", "vehicle.inertia": "[120 kg m2, 120 kg m2, 120 kg m2]"}
+    far = {
+        "vehicle.camera": "[0 m, 1.3 m, 0 m]",
+        "vehicle.inertia": "[120 kg m2, 120 kg m2, 120 kg m2]",
+    }
     (line,) = doubted_of(scene, far)
     assert line.startswith("vehicle.camera: 1.3 m from the bearing, outside of light.surface")
     assert not any("vehicle.camera" in line for line in doubted_of(scene, {}))
@@ -349,9 +400,13 @@ def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: st
 
 
 @pytest.mark.slow
-def test_a_doubt_is_one_line_before_the_run_which_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_doubt_is_one_line_before_the_run_which_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
-    run_command.run("afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, scene_3d=False, json=True)
+    run_command.run(
+        "afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, scene_3d=False, json=True
+    )
     said = capsys.readouterr()
     assert said.err.startswith("skysim: light.surface: differs by")
     assert said.err.count("\n") == 1
@@ -363,7 +418,9 @@ def test_a_doubt_is_one_line_before_the_run_which_goes_on(tmp_path: Path, capsys
 
 def test_the_exposure_control_is_the_chart_s_unless_the_scene_says_otherwise() -> None:
     """The schema repeats the estimator's constants, as it may not ask it for them."""
-    plain = exposure_control.control_settings(loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 150}"}))
+    plain = exposure_control.control_settings(
+        loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 150}"})
+    )
     assert plain == Control(mean_dn=150.0)
     part = "{mean_dn: 99, shortest: 1 ms, longest: 90 ms, step: 3 ms, min_stars: 5, overexposed_objects: 6,"
     told = exposure_control.control_settings(
@@ -381,11 +438,15 @@ def test_without_control_every_frame_is_exposed_for_as_long() -> None:
 
 def test_a_defect_is_no_star_and_lengthens_the_exposure() -> None:
     """Five stars are enough; five bright pixels, sharper than any optics, are none."""
-    meter = ExposureController(loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"} | SINGLE))
+    meter = ExposureController(
+        loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"} | SINGLE)
+    )
     rng = np.random.default_rng(5)
     y, x = np.mgrid[:493, :659]
     places = [(100, 100), (200, 400), (300, 150), (400, 500), (250, 600)]
-    spots = np.sum([600 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2 / 0.8**2) for b, a in places], axis=0)
+    spots = np.sum(
+        [600 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2 / 0.8**2) for b, a in places], axis=0
+    )
     spikes = np.zeros((493, 659))
     for place in places:
         spikes[place] = 600

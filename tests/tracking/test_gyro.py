@@ -26,7 +26,8 @@ FLIGHT = {
 def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
     """An LN-200 tells the rate to a few seconds of arc a second; the frame alone to some hundred."""
     flight = open_flight(load("shefex2", FLIGHT | {"tracker.gyro": str(gyro).lower()}))
-    sigma, error = [], []
+    sigma = []
+    error = []
     for shot in flight.shots():
         rate = shot.report.attitude.rate
         assert rate is not None
@@ -43,7 +44,8 @@ def test_the_rate_of_a_frame_is_that_of_the_samples_of_the_whole_flight() -> Non
     flight = open_flight(scene)
     shots = list(flight.shots())
     forgetful = list(open_flight(scene, keeps_history=False).shots())
-    samples, mount = flight.imu_samples(), flight.lab.camera.mount
+    samples = flight.imu_samples()
+    mount = flight.lab.camera.mount
     assert samples is not None
     assert scene.vehicle.imu is not None
     assert len(shots) == len(forgetful) == 4
@@ -51,7 +53,9 @@ def test_the_rate_of_a_frame_is_that_of_the_samples_of_the_whole_flight() -> Non
         window = exposure_window(scene, shot.frame.index)
         after = rate_of_frame(samples, window, scene.camera.height_px, scene.vehicle.imu, mount)
         rates = [shot.rate, other.rate, after]
-        np.testing.assert_allclose(np.ptp([rate.rate_rad_s for rate in rates], axis=0), 0, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            np.ptp([rate.rate_rad_s for rate in rates], axis=0), 0, rtol=0, atol=1e-9
+        )
         solved = [one.report.attitude.rate.rate_rad_s for one in (shot, other)]
         np.testing.assert_allclose(solved[0], solved[1], rtol=0, atol=1e-9)
 
@@ -61,9 +65,13 @@ def test_the_rate_is_honest_and_none_if_saturated() -> None:
     """Its error over the units of production: squared, over the claim, 3 in the mean (biases and noise are normal)."""
     nees = []
     for unit in range(40):
-        scene = load("shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)})
+        scene = load(
+            "shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)}
+        )
         flight = simulate_motion(scene)
-        config, samples, mount = scene.vehicle.imu, flight.imu_samples(), flight.lab.camera.mount
+        config = scene.vehicle.imu
+        samples = flight.imu_samples()
+        mount = flight.lab.camera.mount
         assert config is not None
         assert samples is not None
         _, truth = flight.render(0)
@@ -77,7 +85,11 @@ def test_the_rate_is_honest_and_none_if_saturated() -> None:
     assert rate_of_frame(full, window, 493, config, mount) is None
     assert rate_of_frame(full, exposure_window(scene, 2), 493, config, mount) is not None
     assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, mount) is None
-    assert sigma_rad_s(config, 1.0, 0.05) > sigma_rad_s(config, 0.0, 0.05) > sigma_rad_s(config, 0.0, 5.0)
+    assert (
+        sigma_rad_s(config, 1.0, 0.05)
+        > sigma_rad_s(config, 0.0, 0.05)
+        > sigma_rad_s(config, 0.0, 5.0)
+    )
 
 
 def test_old_samples_are_dropped() -> None:

@@ -70,13 +70,17 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
     ],
 )
 def test_what_is_no_answer_is_told_in_one_line(answer: object, told: str) -> None:
-    with pytest.raises(ValueError, match=told if isinstance(answer, Answer) else "allowed: Answer") as raised:
+    with pytest.raises(
+        ValueError, match=told if isinstance(answer, Answer) else "allowed: Answer"
+    ) as raised:
         check_answer(answer)
     assert "\n" not in str(raised.value)
 
 
 def test_an_answer_of_single_precision_is_made_a_unit() -> None:
-    told = check_answer(Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9))
+    told = check_answer(
+        Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9)
+    )
     np.testing.assert_allclose(told.cam_from_ref_xyzw, UNIT, rtol=0, atol=1e-15)
     assert check_answer(Answer("no\nstars")).status == "no stars"
 
@@ -84,10 +88,15 @@ def test_an_answer_of_single_precision_is_made_a_unit() -> None:
 def test_a_set_up_comes_through_json_as_it_was() -> None:
     stars = Stars(np.array([5, 9]), np.eye(3)[:2], np.array([1.25, 3.0]))
     leds = Leds(np.array([1]), np.ones((1, 3)), np.array([0.1, 0, 0.2]), np.array(UNIT))
-    for told in (replace(SETUP, stars=stars, options={"a": 1.5}), replace(SETUP, reference="lab", leds=leds)):
+    for told in (
+        replace(SETUP, stars=stars, options={"a": 1.5}),
+        replace(SETUP, reference="lab", leds=leds),
+    ):
         again = Setup.of_tree(json.loads(json.dumps(told.as_tree())))
         assert again.as_tree() == told.as_tree()
-    np.testing.assert_array_equal(Setup.of_tree(replace(SETUP, stars=stars).as_tree()).stars.direction, np.eye(3)[:2])
+    np.testing.assert_array_equal(
+        Setup.of_tree(replace(SETUP, stars=stars).as_tree()).stars.direction, np.eye(3)[:2]
+    )
 
 
 # --- programs -----------------------------------------------------------------------------------------------
@@ -156,7 +165,8 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
     ],
 )
 def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told: str) -> None:
-    runs, begin_s = program(FRAMES + text, 0.5 if "sleep" in text else 5.0), time.monotonic()
+    runs = program(FRAMES + text, 0.5 if "sleep" in text else 5.0)
+    begin_s = time.monotonic()
     with pytest.raises(ProgramError, match=told) as raised:
         runs.solve(PICTURE)
     assert "\n" not in str(raised.value)
@@ -172,7 +182,9 @@ def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told
         ("os.remove(h['file']); os.mkdir(h['file'])", r"Is a directory|Operation not permitted"),
     ],
 )
-def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(kind: str, harm: str, told: str) -> None:
+def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(
+    kind: str, harm: str, told: str
+) -> None:
     answer = 'print(\'{"frame": 7, "status": "x"}\', flush=True)'
     text = f"import shutil\nfor line in g:\n    h = json.loads(line); {harm}; {answer}"
     runs = program(READY + text, kind=kind)
@@ -192,7 +204,8 @@ def test_a_program_that_does_not_read_is_not_waited_for() -> None:
 
 def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: Path) -> None:
     """The first dies once; of the other every one does."""
-    mark, answer = str(tmp_path / "mark"), 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
+    mark = str(tmp_path / "mark")
+    answer = 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
     once = f"if not os.path.exists({mark!r}): open({mark!r}, 'x'); sys.exit(1)\n    "
     flaky = program(FRAMES + once + answer)
     with pytest.raises(ProgramError, match="code 1"):
@@ -210,7 +223,11 @@ def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: P
 def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
     beat = tmp_path / "beat"
     child = f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
-    runs = program(f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}])\n" + FRAMES + "pass")
+    runs = program(
+        f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}])\n"
+        + FRAMES
+        + "pass"
+    )
     until_s = time.monotonic() + 5
     while not (beat.exists() and beat.stat().st_size) and time.monotonic() < until_s:
         time.sleep(0.01)
@@ -224,7 +241,10 @@ def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ('print(\'{"ready": false, "status": "no LEDs please"}\')', "tracker.name: mine: no LEDs please"),
+        (
+            'print(\'{"ready": false, "status": "no LEDs please"}\')',
+            "tracker.name: mine: no LEDs please",
+        ),
         ("import sys; sys.exit('no licence')", r"ended \(code 1\): no licence"),
     ],
 )
@@ -233,7 +253,9 @@ def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
         program(text)
 
 
-@pytest.mark.parametrize("told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"])
+@pytest.mark.parametrize(
+    "told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"]
+)
 def test_a_program_s_name_and_command_are_checked(told: str) -> None:
     with pytest.raises(InputError, match=r"^programs"):
         process.program_commands([told])
@@ -276,11 +298,15 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
-def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp_path: Path) -> None:
+def test_a_trial_of_another_release_of_a_tracker_is_another(
+    installed: None, tmp_path: Path
+) -> None:
     told = loader.load("shefex2", {"tracker.name": "offset"})
     before = setups.scene_hash(told)
     assert interface.TRACKERS.release("offset") == "offset 1.0"
-    (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n")
+    (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
+    )
     assert interface.TRACKERS.release("offset") == "offset 1.1"
     assert setups.scene_hash(told) != before
 
@@ -290,18 +316,31 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     told = loader.load("shefex2", {"exposure.frames": "3"})
     truths = [shot.truth.cam_from_lab for shot in open_flight(told).shots(solves=False)]
-    options = {f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())}
-    config = told.tracker.model_copy(update={"name": "offset", "options": options | {"roll_deg": 0.2}})
+    options = {
+        f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())
+    }
+    config = told.tracker.model_copy(
+        update={"name": "offset", "options": options | {"roll_deg": 0.2}}
+    )
     lab = build_lab(told.model_copy(update={"tracker": config}))
     trackers = tracker_comparison.build_trackers(lab, ["offset", "own"], {})
     shots = tracker_comparison.compare_frames(Flight(lab), trackers)
     both = [answers for _, _, answers in shots]
-    rows, own = [answers["offset"] for answers in both], [answers["own"] for answers in both]
-    assert [(row.status, row.wrong, row.matched > 5) for row in own] == [("solved", False, True)] * 3
+    rows = [answers["offset"] for answers in both]
+    own = [answers["own"] for answers in both]
+    assert [(row.status, row.wrong, row.matched > 5) for row in own] == [
+        ("solved", False, True)
+    ] * 3
     assert [row.truth_deg for row in own] == [row.truth_deg for row in rows]
-    assert [row.status for row in rows] == ["solved", "failed: RuntimeError: cloudy today", "solved"]
+    assert [row.status for row in rows] == [
+        "solved",
+        "failed: RuntimeError: cloudy today",
+        "solved",
+    ]
     assert [row.wrong for row in rows] == [False, False, True]
-    np.testing.assert_allclose([rows[0].cross_arcsec, rows[0].roll_arcsec], [36, 0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        [rows[0].cross_arcsec, rows[0].roll_arcsec], [36, 0], rtol=0, atol=1e-6
+    )
     assert rows[2].roll_arcsec == pytest.approx(720, abs=1e-3)
     assert rows[0].roll_sigma_arcsec == pytest.approx(1e-4 / ARCSEC_RAD, rel=1e-9)
     assert [row.detected for row in rows] == [1, 0, 1]
@@ -321,7 +360,9 @@ def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:
     told = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
-    with pytest.raises(InputError, match=r"tracker\.name: unknown tracker 'mine'; .*a program as mine=COMMAND"):
+    with pytest.raises(
+        InputError, match=r"tracker\.name: unknown tracker 'mine'; .*a program as mine=COMMAND"
+    ):
         build_lab(told)
     for key in ("tracker.command", "tracker.program"):
         with pytest.raises(InputError, match="unknown key"):
@@ -342,10 +383,16 @@ responses: [identified, refused]
 def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
     path = tmp_path / "who.yaml"
     path.write_text(STUDY)
-    with pytest.raises(InputError, match=r"factors\.who: 'mine': tracker\.name: unknown tracker 'mine'; allowed:"):
+    with pytest.raises(
+        InputError, match=r"factors\.who: 'mine': tracker\.name: unknown tracker 'mine'; allowed:"
+    ):
         study_loader.load(path, programs={})
-    (tmp_path / "mine.py").write_text(FRAMES + 'print(\'{"frame": 0, "status": "cloudy"}\', flush=True)')
-    commands = process.program_commands([f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"])
+    (tmp_path / "mine.py").write_text(
+        FRAMES + 'print(\'{"frame": 0, "status": "cloudy"}\', flush=True)'
+    )
+    commands = process.program_commands(
+        [f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"]
+    )
     with pytest.raises(InputError, match="needs frames; allowed: own"):
         study_loader.load(path, {"trial.kind": "centroids"}, commands)
     told = study_loader.load(path, programs=commands)
@@ -379,7 +426,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     about.mkdir()
     named = "Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n".format(**project)
     (about / "METADATA").write_text(named)
-    points = [f"{name} = {place}" for name, place in project["entry-points"]["skysim.trackers"].items()]
+    points = [
+        f"{name} = {place}" for name, place in project["entry-points"]["skysim.trackers"].items()
+    ]
     (about / "entry_points.txt").write_text("\n".join(["[skysim.trackers]", *points]))
     (folder / "bin").mkdir()
     (folder / "bin/python").symlink_to(sys.executable)
@@ -413,7 +462,9 @@ def test_the_page_s_json_is_of_the_protocol() -> None:
     assert list(header) == list(said)
     assert header["bytes"] == header["width_px"] * header["height_px"] * 2
     for answer in answers:
-        check_answer(Answer.of_tree({key: value for key, value in answer.items() if key != "frame"}))
+        check_answer(
+            Answer.of_tree({key: value for key, value in answer.items() if key != "frame"})
+        )
 
 
 # What stands where the page has LOST: of the frame it sees one pixel, which says what it is to print.
@@ -447,7 +498,9 @@ def of_lost(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
 
 def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
     """Its Attitude::Rotate and Camera::SpatialToCamera: where a star falls, from the upper left corner."""
-    _, x, y, z = multiplied(multiplied(quaternion, np.array([0, *star])), quaternion * [1, -1, -1, -1])
+    _, x, y, z = multiplied(
+        multiplied(quaternion, np.array([0, *star])), quaternion * [1, -1, -1, -1]
+    )
     assert x > 0
     return [-y / x * 100 + 8 / 2, -z / x * 100 + 6 / 2]
 
@@ -455,7 +508,8 @@ def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
 @pytest.mark.long
 def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> None:
     """By LOST's own formulas: its stars and ours fall on the same pixels, whose corner is (-0.5, -0.5) for us."""
-    lost, adapter = tmp_path / "lost", tmp_path / "lost.py"
+    lost = tmp_path / "lost"
+    adapter = tmp_path / "lost.py"
     adapter.write_text(next(block for block in blocks("python") if block.startswith("# lost.py")))
     lost.mkdir()
     (lost / "lost").write_text(LOST.format(python=sys.executable))
@@ -480,9 +534,17 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         for ray in ([0, 0, 1], [0.03, 0, 1], [-0.02, 0.025, 1]):
             star = turn.inv().apply(ray / np.linalg.norm(ray))
             seen = 100 * np.array(ray[:2]) + SETUP.center_px + 0.5
-            np.testing.assert_allclose(pixel_of_lost(of_lost(*pointed), star), seen, rtol=0, atol=1e-3)
+            np.testing.assert_allclose(
+                pixel_of_lost(of_lost(*pointed), star), seen, rtol=0, atol=1e-3
+            )
 
 
 def test_every_key_of_the_protocol_is_on_the_page() -> None:
-    keys = [*Setup.__slots__, *Picture.__slots__, *Answer.__slots__, *Stars.__slots__, *Leds.__slots__]
+    keys = [
+        *Setup.__slots__,
+        *Picture.__slots__,
+        *Answer.__slots__,
+        *Stars.__slots__,
+        *Leds.__slots__,
+    ]
     assert [key for key in keys if f"`{key}`" not in PAGE] == []

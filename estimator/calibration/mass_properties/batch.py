@@ -49,8 +49,12 @@ from estimator.filter.models import TrackerModel
 
 MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
-MISFIT_TOLERANCE, MAX_FACTORS = 0.1, 8  # of the logarithm of the misfit; fits to reach it
-FACTOR_POWER, FACTOR_LIMITS = 1.5, (1e-3, 1e3)  # above 1: the random torque's share of the misfit stays
+# of the logarithm of the misfit; fits to reach it
+MISFIT_TOLERANCE = 0.1
+MAX_FACTORS = 8
+# above 1: the random torque's share of the misfit stays
+FACTOR_POWER = 1.5
+FACTOR_LIMITS = (1e-3, 1e3)
 MOMENTUM = slice(3, 6)  # of a state
 BANDS = 2 * STATE  # of the normal matrix: a state and its neighbor
 
@@ -73,7 +77,8 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
     """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
     values = prior.values.copy()
     motions = [first_states(record, lab, values) for record in records]
-    information, attitudes = np.diag(prior.sigma**-2), sum(len(record.t_s) for record in records)
+    information = np.diag(prior.sigma**-2)
+    attitudes = sum(len(record.t_s) for record in records)
     for iteration in range(1, MAX_ITERATIONS + 1):
         parts = [reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)]
         normal = information + sum(part.normal for part in parts)
@@ -87,11 +92,17 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
         values = values + step
         if np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))):
             covariance = covariance + considered(records, parts, covariance)
-            chi2 = sum(part.chi2 for part in parts) + np.sum(((prior.values - values) / prior.sigma) ** 2)
-            return MassEstimate(values, covariance, float(chi2 / (3 * attitudes - 6 * len(records))), iteration)
+            chi2 = sum(part.chi2 for part in parts) + np.sum(
+                ((prior.values - values) / prior.sigma) ** 2
+            )
+            return MassEstimate(
+                values, covariance, float(chi2 / (3 * attitudes - 6 * len(records))), iteration
+            )
         if not np.all(np.isfinite(values)):
             break
-    raise ImageError("mass properties: the fit does not converge; allowed: a motion that the assumed values describe")
+    raise ImageError(
+        "mass properties: the fit does not converge; allowed: a motion that the assumed values describe"
+    )
 
 
 def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
@@ -109,7 +120,9 @@ def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior
     return replace(estimate, attitude_factor=factor)
 
 
-def considered(records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats) -> Floats:
+def considered(
+    records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats
+) -> Floats:
     """(P, P) what errors that attitudes share add to the covariance of the parameters.
 
     An attitude's error e_n changes the parameters by K_n e_n = C (B - X_n)^T W_n e_n: C their covariance by the noise,
@@ -117,7 +130,9 @@ def considered(records: Sequence[BearingRecord], parts: Sequence[Reduced], covar
     fitted one. Errors of covariance S_n = L_n L_n^T whose correlation r falls with the rotation between two attitudes
     add sum K_m L_m r_mn L_n^T K_n^T. The process is that of `filter.models.TrackerModel`, without its time.
     """
-    size, effects, attitudes = len(covariance), [], []
+    size = len(covariance)
+    effects = []
+    attitudes = []
     by_bias = np.zeros((3, size))
     by_bias[:, BIAS] = np.eye(3)
     for record, part in zip(records, parts, strict=True):
@@ -126,11 +141,14 @@ def considered(records: Sequence[BearingRecord], parts: Sequence[Reduced], covar
         fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
         gain = covariance @ (by_bias - fitted).transpose(0, 2, 1) @ np.linalg.inv(record.noise_rad2)
         values, axes = np.linalg.eigh(record.systematic_rad2)
-        effects.append(gain @ (axes * np.sqrt(np.maximum(values, 0))[:, None]) @ axes.transpose(0, 2, 1))
+        effects.append(
+            gain @ (axes * np.sqrt(np.maximum(values, 0))[:, None]) @ axes.transpose(0, 2, 1)
+        )
         attitudes.append(record.lab_from_body)
     if not effects:
         return np.zeros((size, size))
-    effect, quaternion = np.concatenate(effects), Rotation.concatenate(attitudes).as_quat()
+    effect = np.concatenate(effects)
+    quaternion = Rotation.concatenate(attitudes).as_quat()
     angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
     shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
     return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
@@ -139,7 +157,9 @@ def considered(records: Sequence[BearingRecord], parts: Sequence[Reduced], covar
 def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
     """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
     motion = Motion(record, lab, values[:, None], values)
-    turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(record.t_s)[:, None]
+    turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(
+        record.t_s
+    )[:, None]
     middle_s = (record.t_s[1:] + record.t_s[:-1]) / 2
     rate = np.array([np.interp(record.t_s, middle_s, one) for one in turned.T])
     inertia = inertia_matrix(values[:6]) + record.added_inertia_kg_m2
@@ -148,18 +168,26 @@ def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
     return States(quaternion, turn(quaternion, own), np.zeros_like(rate))
 
 
-def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior) -> Reduced:
+def reduced(
+    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+) -> Reduced:
     """Linearize a record's residuals and eliminate its states."""
-    count, size = len(record.t_s), len(values)
+    count = len(record.t_s)
+    size = len(values)
     rows = whitened_links(record, states, lab, values, prior)
     products = rows.transpose(0, 2, 1) @ rows
-    before, after, rest = slice(0, STATE), slice(STATE, 2 * STATE), slice(2 * STATE, None)
-    diagonal, border = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, size + 1))
+    before = slice(0, STATE)
+    after = slice(STATE, 2 * STATE)
+    rest = slice(2 * STATE, None)
+    diagonal = np.zeros((count, STATE, STATE))
+    border = np.zeros((count, STATE, size + 1))
     for block, to in ((before, slice(None, -1)), (after, slice(1, None))):
         diagonal[to] += products[:, block, block]
         border[to] += products[:, block, rest]
     corner = products[:, rest, rest].sum(axis=0)
-    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(record, states, lab, values, (diagonal, border, corner))
+    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(
+        record, states, lab, values, (diagonal, border, corner)
+    )
     flat = border.reshape(-1, size + 1)
     try:
         solved = solveh_banded(lower_band(diagonal, products[:, before, after]), flat, lower=True)
@@ -169,7 +197,9 @@ def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, pri
     return Reduced(corner[:-1, :-1], -corner[:-1, -1], -solved[:, -1], solved[:, :-1], chi2)
 
 
-def whitened_links(record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior) -> Floats:
+def whitened_links(
+    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+) -> Floats:
     """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
     residuals, in standard deviations.
 
@@ -185,14 +215,20 @@ def whitened_links(record: BearingRecord, states: States, lab: Lab, values: Floa
     scale[:, MOMENTUM, MOMENTUM] = momentum_scale(record, before, values, prior.values)
     R_lab_from_body = before.rotation.as_matrix()
     in_body = R_lab_from_body.transpose(0, 2, 1) @ misfit[:, MOMENTUM]
-    turned = np.einsum("ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body)
+    turned = np.einsum(
+        "ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body
+    )
     rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
     noise = scale @ link.noise @ scale.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows)
 
 
 def add_measured(
-    record: BearingRecord, states: States, lab: Lab, values: Floats, to: tuple[Floats, Floats, Floats]
+    record: BearingRecord,
+    states: States,
+    lab: Lab,
+    values: Floats,
+    to: tuple[Floats, Floats, Floats],
 ) -> float:
     """Add the attitudes (N), and what is known of the first random torque; return their chi-square.
 
@@ -200,7 +236,8 @@ def add_measured(
     (N, 9, P + 1) and corner (P + 1, P + 1); the last column is the gradient.
     """
     diagonal, border, corner = to
-    weight, torque_weight = np.linalg.inv(record.noise_rad2), lab.torque_rms_nm**-2.0
+    weight = np.linalg.inv(record.noise_rad2)
+    torque_weight = lab.torque_rms_nm**-2.0
     off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
     pull = np.einsum("nij,nj->ni", weight, off)
     diagonal[:, :3, :3] += weight
@@ -216,7 +253,9 @@ def add_measured(
 
 def measured_minus(measured: Rotation, lab_from_body: Rotation, bias_rad: Floats) -> Floats:
     """(N, 3) rotation vectors of attitudes measured minus those of the states with the tracker's bias."""
-    return np.asarray(((lab_from_body * Rotation.from_rotvec(bias_rad)).inv() * measured).as_rotvec())
+    return np.asarray(
+        ((lab_from_body * Rotation.from_rotvec(bias_rad)).inv() * measured).as_rotvec()
+    )
 
 
 def lower_band(diagonal: Floats, beside: Floats) -> Floats:

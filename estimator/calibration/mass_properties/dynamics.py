@@ -44,7 +44,9 @@ from estimator.core.arrays import Floats, Ints
 MAX_STEP_S = 0.1  # of Runge-Kutta steps: relative error below 1e-7 at 0.5 rad/s
 STATE = 9  # attitude error, momentum, torque
 GAUSS_X, GAUSS_W = np.polynomial.legendre.leggauss(8)
-ATTITUDE_STEP_RAD, RELATIVE_STEP = 1e-5, 1e-5  # of the difference quotients
+# of the difference quotients
+ATTITUDE_STEP_RAD = 1e-5
+RELATIVE_STEP = 1e-5
 
 
 class States(NamedTuple):
@@ -88,7 +90,9 @@ class Transition(NamedTuple):
 
 def cross(a: Floats, b: Floats) -> Floats:
     """(3, B)"""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
@@ -104,33 +108,42 @@ class Motion:
     assumed : (P,) parameters with the inertia J0
     """
 
-    def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats, assumed: Floats) -> None:
+    def __init__(
+        self, record: BearingRecord, lab: Lab, parameters: Floats, assumed: Floats
+    ) -> None:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
-        self.inverse: Floats = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64).transpose(
-            1, 2, 0
-        )
+        self.inverse: Floats = np.asarray(
+            np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64
+        ).transpose(1, 2, 0)
         self.torque_scale = np.einsum("ijb,jk->ikb", inertia, inverse_inertia(record, assumed))
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
-        self.lab_torque, self.drag = parameters[LAB_TORQUE], parameters[DRAG]
+        self.lab_torque = parameters[LAB_TORQUE]
+        self.drag = parameters[DRAG]
         self.wheel_scale = 1 + parameters[WHEELS:]
-        self.axes, self.earth = lab.wheel_axes, lab.earth_lab_rad_s[:, None]
+        self.axes = lab.wheel_axes
+        self.earth = lab.earth_lab_rad_s[:, None]
         self.gravity = np.array([[0.0], [0.0], [-lab.gravity_m_s2]])
         self.record = record
 
     def stored(self, t_s: Floats) -> Floats:
         """(3, B) momentum of the wheels in body axes."""
-        measured = [np.interp(t_s, self.record.wheel_t_s, one) for one in self.record.wheel_momentum_nms.T]
+        measured = [
+            np.interp(t_s, self.record.wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
+        ]
         return np.asarray(self.axes @ (self.wheel_scale * np.array(measured)))
 
     def rate(self, states: States, stored: Floats) -> Floats:
         """(3, B) in the lab, body axes."""
         own = turn(states.quaternion, states.momentum, inverse=True) - stored
         turned: Floats = np.einsum("ijb,jb->ib", self.inverse, own)
-        return turned - turn(states.quaternion, np.broadcast_to(self.earth, own.shape), inverse=True)
+        return turned - turn(
+            states.quaternion, np.broadcast_to(self.earth, own.shape), inverse=True
+        )
 
     def slope(self, t_s: Floats, states: States) -> States:
         """Derivatives with respect to time, without the torque's decay."""
-        q, rate = states.quaternion, self.rate(states, self.stored(t_s))
+        q = states.quaternion
+        rate = self.rate(states, self.stored(t_s))
         viscous, quadratic = self.drag
         drag = turn(q, (viscous + quadratic * np.abs(rate)) * rate)
         torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
@@ -139,14 +152,17 @@ class Motion:
         spin = np.vstack([vector, -np.sum(q[:3] * rate, axis=0)[None]]) / 2
         return States(spin, torque + self.lab_torque + turn(q, in_body) - drag, np.zeros_like(rate))
 
-    def integrate(self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float) -> States:
+    def integrate(
+        self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float
+    ) -> States:
         """States at end_s (B,) by the fourth-order Runge-Kutta method; the torque is its mean in each step."""
         steps = max(1, int(np.ceil(np.max(end_s - begin_s) / MAX_STEP_S)))
         h = (end_s - begin_s) / steps
         decay = np.exp(-h / correlation_s)
         mean = correlation_s / h * (1 - decay)
         for n in range(steps):
-            t_s, last = begin_s + n * h, states.torque
+            t_s = begin_s + n * h
+            last = states.torque
             now = states._replace(torque=mean * last)
             a = self.slope(t_s, now)
             b = self.slope(t_s + h / 2, moved_on(now, a, h / 2))
@@ -169,22 +185,29 @@ def moved_on(states: States, slope: States, by_s: Floats | float) -> States:
     return States(*(one + by_s * rate for one, rate in zip(states, slope, strict=True)))
 
 
-def difference_steps(values: Floats, sigma: Floats, momentum_nms: float, torque_nm: float) -> tuple[Floats, Floats]:
+def difference_steps(
+    values: Floats, sigma: Floats, momentum_nms: float, torque_nm: float
+) -> tuple[Floats, Floats]:
     """Steps of the difference quotients: (9,) of the states, (P,) of the parameters."""
     state = np.repeat([ATTITUDE_STEP_RAD, RELATIVE_STEP * momentum_nms, torque_nm], 3)
     return state, np.minimum(1e-3 * sigma, RELATIVE_STEP * np.maximum(np.abs(values), sigma))
 
 
-def transition(record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, prior: Prior) -> Transition:
+def transition(
+    record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, prior: Prior
+) -> Transition:
     """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
 
     values : (P,) parameters;  prior : its standard deviations scale the steps of their difference quotients
 
     Every interval is integrated once for each element of state and parameters, a little changed, all at once.
     """
-    count, size = before.momentum.shape[1], len(values)
+    count = before.momentum.shape[1]
+    size = len(values)
     largest = float(np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA]))))
-    state_step, step = difference_steps(values, prior.sigma, largest, float(np.max(lab.torque_rms_nm)))
+    state_step, step = difference_steps(
+        values, prior.sigma, largest, float(np.max(lab.torque_rms_nm))
+    )
     columns = 1 + STATE + size
     change = np.zeros((STATE, columns))
     change[:, 1 : 1 + STATE] = np.diag(state_step)
@@ -207,7 +230,12 @@ def transition(record: BearingRecord, lab: Lab, first: int, before: States, valu
 
 
 def torque_noise(
-    duration_s: Floats, record: BearingRecord, before: States, values: Floats, assumed: Floats, lab: Lab
+    duration_s: Floats,
+    record: BearingRecord,
+    before: States,
+    values: Floats,
+    assumed: Floats,
+    lab: Lab,
 ) -> Floats:
     """(K, 9, 9) covariance of the states after K intervals due to the random torque and to the wheels' speed noise.
 
@@ -222,21 +250,30 @@ def torque_noise(
     s = duration_s[:, None] * (1 + GAUSS_X) / 2
     c = np.exp(-s / tau)
     b = tau * (1 - c)
-    moments = np.einsum("iks,jks,ks->kij", *2 * [np.array([tau * (s - b), b, c])], duration_s[:, None] * GAUSS_W / 2)
+    moments = np.einsum(
+        "iks,jks,ks->kij", *2 * [np.array([tau * (s - b), b, c])], duration_s[:, None] * GAUSS_W / 2
+    )
     density = np.diag(2 * lab.torque_rms_nm**2 / tau)
     spread = np.zeros((len(duration_s), 3, 3, 3))
-    R_body_from_lab, inverse = before.rotation.inv().as_matrix(), inverse_inertia(record, assumed)
+    R_body_from_lab = before.rotation.inv().as_matrix()
+    inverse = inverse_inertia(record, assumed)
     spread[:, 0] = inverse @ R_body_from_lab
     spread[:, 1] = momentum_scale(record, before, assumed, values)
     spread[:, 2] = np.eye(3)
-    noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(-1, STATE, STATE)
+    noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(
+        -1, STATE, STATE
+    )
     sample_s = float(np.median(np.diff(record.wheel_t_s)))
-    walk = lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
+    walk = (
+        lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
+    )
     noise[:, :3, :3] += walk * duration_s[:, None, None]
     return np.asarray(noise)
 
 
-def momentum_scale(record: BearingRecord, states: States, values: Floats, assumed: Floats) -> Floats:
+def momentum_scale(
+    record: BearingRecord, states: States, values: Floats, assumed: Floats
+) -> Floats:
     """(K, 3, 3) R J0 J^-1 R^T: of a change of momentum it makes that of the assumed inertia at the same rate."""
     R_lab_from_body = states.rotation.as_matrix()
     scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))

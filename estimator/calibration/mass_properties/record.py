@@ -10,9 +10,17 @@ from scipy.spatial.transform import Rotation
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 
-INERTIA, MOMENT, LAB_TORQUE, DRAG = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 14)
-BIAS, WHEELS = slice(14, 17), 17  # the wheels' are the last
-TRIANGLE = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))  # rows and columns of the six numbers of an inertia tensor
+INERTIA = slice(0, 6)
+MOMENT = slice(6, 9)
+LAB_TORQUE = slice(9, 12)
+DRAG = slice(12, 14)
+# the wheels' are the last
+BIAS = slice(14, 17)
+WHEELS = 17
+TRIANGLE = (
+    (0, 1, 2, 0, 0, 1),
+    (0, 1, 2, 1, 2, 2),
+)  # rows and columns of the six numbers of an inertia tensor
 MIN_ATTITUDES = 4
 
 
@@ -41,7 +49,9 @@ class BearingRecord:
 
     def __post_init__(self) -> None:
         if len(self.t_s) < MIN_ATTITUDES:
-            raise ImageError(f"mass properties: {len(self.t_s)} attitudes; allowed: {MIN_ATTITUDES} or more")
+            raise ImageError(
+                f"mass properties: {len(self.t_s)} attitudes; allowed: {MIN_ATTITUDES} or more"
+            )
         if not (np.all(np.diff(self.t_s) > 0) and np.all(np.diff(self.wheel_t_s) > 0)):
             raise ImageError("mass properties: times do not ascend")
         if self.t_s[0] < self.wheel_t_s[0] or self.t_s[-1] > self.wheel_t_s[-1]:
@@ -53,7 +63,11 @@ class BearingRecord:
     @property
     def noise_rad2(self) -> Floats:
         """(N, 3, 3) the part of covariance_rad2 that is independent from attitude to attitude."""
-        return self.covariance_rad2 if self.systematic_rad2 is None else self.covariance_rad2 - self.systematic_rad2
+        return (
+            self.covariance_rad2
+            if self.systematic_rad2 is None
+            else self.covariance_rad2 - self.systematic_rad2
+        )
 
     def with_noise(self, factor: float) -> BearingRecord:
         """The record with its independent part scaled."""
@@ -94,7 +108,9 @@ class Prior:
 
     def __post_init__(self) -> None:
         if not (np.all(np.isfinite(self.values)) and np.all(self.sigma > 0)):
-            raise ImageError("mass properties: assumed values must be finite and their standard deviations above 0")
+            raise ImageError(
+                "mass properties: assumed values must be finite and their standard deviations above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,14 @@ import numpy as np
 
 from estimator.calibration.mass_properties.batch import estimate_mass, first_states, measured_minus
 from estimator.calibration.mass_properties.dynamics import STATE, transition
-from estimator.calibration.mass_properties.record import BIAS, MIN_ATTITUDES, BearingRecord, Lab, MassEstimate, Prior
+from estimator.calibration.mass_properties.record import (
+    BIAS,
+    MIN_ATTITUDES,
+    BearingRecord,
+    Lab,
+    MassEstimate,
+    Prior,
+)
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 
@@ -32,8 +39,11 @@ def filter_mass(record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassE
     """
     least = START + MIN_ATTITUDES
     if len(record.t_s) < least:
-        raise ImageError(f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more")
-    begun, rest = estimate_mass([cut(record, slice(0, START))], lab, prior), cut(record, slice(START, None))
+        raise ImageError(
+            f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more"
+        )
+    begun = estimate_mass([cut(record, slice(0, START))], lab, prior)
+    rest = cut(record, slice(START, None))
     yield from filter_from(begun, rest, lab, prior)
 
 
@@ -48,9 +58,12 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
     )
 
 
-def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassEstimate]:
+def filter_from(
+    begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Prior
+) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
-    size, values = len(begun.values), begun.values
+    size = len(begun.values)
+    values = begun.values
     states = first_states(record, lab, values).take(slice(1, 2))
     covariance = first_covariance(begun, record, lab)
     at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
@@ -68,15 +81,20 @@ def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Pri
         chi2 += float(off @ np.linalg.solve(innovation, off))
         change = gain @ off
         covariance = joseph(covariance, gain, record.covariance_rad2[n])
-        states, values = link.after.moved(change[:STATE, None]), values + change[STATE:]
+        states = link.after.moved(change[:STATE, None])
+        values = values + change[STATE:]
         yield MassEstimate(values, covariance[STATE:, STATE:], chi2 / (3 * (n - 1)))
 
 
 def first_covariance(begun: MassEstimate, record: BearingRecord, lab: Lab) -> Floats:
     """(9 + P, 9 + P) at the second attitude. H = R (J w + A (1 + e) h): its errors are those of rate and parameters."""
-    values, P = begun.values, begun.covariance
-    one, step = cut(record, slice(0, MIN_ATTITUDES)), begun.sigma
-    momenta = [first_states(one, lab, each).momentum[:, 1] for each in (values, *(values + np.diag(step)))]
+    values = begun.values
+    P = begun.covariance
+    one = cut(record, slice(0, MIN_ATTITUDES))
+    step = begun.sigma
+    momenta = [
+        first_states(one, lab, each).momentum[:, 1] for each in (values, *(values + np.diag(step)))
+    ]
     slope = np.zeros((STATE, len(values)))
     slope[3:6] = ((np.array(momenta[1:]) - momenta[0]) / step[:, None]).T
     own = np.zeros((STATE, STATE))

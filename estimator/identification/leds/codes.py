@@ -22,7 +22,9 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 GROSS = 7.0  # misfit of a gross error: one of a thousand
-ROUGH, LIKELY = 0.1, 40.0  # errors at first sight, and the greatest excess of their misfit
+# errors at first sight, and the greatest excess of their misfit
+ROUGH = 0.1
+LIKELY = 40.0
 PHASES_PER_BIT = 8  # phases that a free-running receiver tries
 
 
@@ -39,11 +41,19 @@ class LedCode:
 
     def __post_init__(self) -> None:
         levels = checks.floats("code: levels", self.levels, (None, None))
-        if levels.size == 0 or not ((levels >= 0) & (levels <= 1)).all() or not (np.ptp(levels, axis=1) > 0).all():
-            raise ImageError("code: levels; allowed: 0 to 1, of each LED two different ones or more")
+        if (
+            levels.size == 0
+            or not ((levels >= 0) & (levels <= 1)).all()
+            or not (np.ptp(levels, axis=1) > 0).all()
+        ):
+            raise ImageError(
+                "code: levels; allowed: 0 to 1, of each LED two different ones or more"
+            )
         object.__setattr__(self, "levels", levels)
         if self.bit_time_s is not None:
-            bit_time_s = checks.number("code: bit_time_s", self.bit_time_s, 1e-9, 1e9, "above 0, or None")
+            bit_time_s = checks.number(
+                "code: bit_time_s", self.bit_time_s, 1e-9, 1e9, "above 0, or None"
+            )
             object.__setattr__(self, "bit_time_s", bit_time_s)
 
     @property
@@ -77,7 +87,9 @@ class LedCode:
 
     def _shown_until(self, time: Floats) -> Floats:
         """(N, P) integral of each LED's level from 0 to P times, in bits."""
-        total = np.concatenate([np.zeros((len(self.levels), 1)), np.cumsum(self.levels, axis=1)], axis=1)
+        total = np.concatenate(
+            [np.zeros((len(self.levels), 1)), np.cumsum(self.levels, axis=1)], axis=1
+        )
         periods, within = np.divmod(time, self.bits)
         bit = np.minimum(within.astype(np.int64), self.bits - 1)
         return total[:, -1:] * periods + total[:, bit] + (within - bit) * self.levels[:, bit]
@@ -116,11 +128,16 @@ def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, ou
 
 
 @jit
-def _brightness(light: Floats, weight: Floats, template: Floats, start: float, selects: bool) -> float:
+def _brightness(
+    light: Floats, weight: Floats, template: Floats, start: float, selects: bool
+) -> float:
     """Least-squares brightness; with `selects` of the frames without a gross error at a first brightness."""
-    product, square = 0.0, 0.0
+    product = 0.0
+    square = 0.0
     for j in range(len(light)):
-        if weight[j] == 0 or (selects and (light[j] - start * template[j]) ** 2 * weight[j] > 2 * GROSS):
+        if weight[j] == 0 or (
+            selects and (light[j] - start * template[j]) ** 2 * weight[j] > 2 * GROSS
+        ):
             continue
         product += weight[j] * light[j] * template[j]
         square += weight[j] * template[j] ** 2
@@ -142,7 +159,8 @@ def likely(light: Floats, templates: Floats) -> Ints:
     By least squares with errors of ROUGH of the brightest frame, which make little of an edge or a failed bit.
     """
     seen = np.isfinite(light)
-    y, shown = light[seen] / light[seen].max() / ROUGH, templates[:, seen]
+    y = light[seen] / light[seen].max() / ROUGH
+    shown = templates[:, seen]
     square = np.maximum(np.einsum("wj,wj->w", shown, shown), 1e-300)
     misfit = (y @ y - (shown @ y) ** 2 / square) / 2
     return np.flatnonzero(misfit <= misfit.min() + LIKELY)

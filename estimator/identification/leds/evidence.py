@@ -18,10 +18,18 @@ from estimator.core import least_squares, vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.core.vectors import Vector
-from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex, middle, separation
+from estimator.identification.chance import (
+    GATE_SIGMA,
+    MIN_EVIDENCE_MATCHES,
+    counts_dex,
+    middle,
+    separation,
+)
 from estimator.identification.leds.index import DomeIndex
 
-STRAY, STRAY_DENSITY = 0.01, 0.1  # part of the lights of any brightness: blends, reflections; per unit of logarithm
+# part of the lights of any brightness: blends, reflections; per unit of logarithm
+STRAY = 0.01
+STRAY_DENSITY = 0.1
 
 
 class LedDetections(NamedTuple):
@@ -105,9 +113,15 @@ def evaluate(
         info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
             return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
-        observed, star, missing = _match(detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0)
-        dex = _evidence(detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info)
-    return LedHypothesis(observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf)
+        observed, star, missing = _match(
+            detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0
+        )
+        dex = _evidence(
+            detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
+        )
+    return LedHypothesis(
+        observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf
+    )
 
 
 @jit
@@ -136,22 +150,37 @@ def _match(
     """
     left, right, top, bottom = dome.field_tan
     first = dome.pairs.first
-    count, missing, total = 0, 0, len(detections.ray)
-    observed, star, distances2 = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
+    count = 0
+    missing = 0
+    total = len(detections.ray)
+    observed = np.empty(total, np.int64)
+    star = np.empty(total, np.int64)
+    distances2 = np.empty(total)
     # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
     for entry in range(first[center] - 1, first[center + 1]):
         s = center if entry < first[center] else dome.pairs.neighbor[entry]
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
-        qx, qy = focal_ratio * qx, focal_ratio * qy
-        if not (qz > 0 and 1.1 * left * qz < qx < 1.1 * right * qz and 1.1 * top * qz < qy < 1.1 * bottom * qz):
+        qx = focal_ratio * qx
+        qy = focal_ratio * qy
+        if not (
+            qz > 0
+            and 1.1 * left * qz < qx < 1.1 * right * qz
+            and 1.1 * top * qz < qy < 1.1 * bottom * qz
+        ):
             continue
-        x, y = qx / qz, qy / qz
-        variance = base_variance + direction_variance * ((x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2)
-        best, distance2 = -1, GATE_SIGMA**2 * variance  # in units of the detection's variance
+        x = qx / qz
+        y = qy / qz
+        variance = base_variance + direction_variance * (
+            (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
+        )
+        # in units of the detection's variance
+        best = -1
+        distance2 = GATE_SIGMA**2 * variance
         for n in range(total):
             residual2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
             if residual2 < distance2 * detections.sigma[n] ** 2:
-                best, distance2 = n, residual2 / detections.sigma[n] ** 2
+                best = n
+                distance2 = residual2 / detections.sigma[n] ** 2
         if best < 0:
             missing += left < x < right and top < y < bottom
             continue
@@ -159,12 +188,15 @@ def _match(
         while slot < count and observed[slot] != best:
             slot += 1
         if slot == count:
-            observed[count], star[count], distances2[count] = best, s, distance2
+            observed[count] = best
+            star[count] = s
+            distances2[count] = distance2
             count += 1
             continue
         missing += 1  # two LEDs match one detection: the farther one is missing
         if distance2 < distances2[slot]:
-            star[slot], distances2[slot] = s, distance2
+            star[slot] = s
+            distances2[slot] = distance2
     return observed[:count], star[:count], missing
 
 
@@ -184,13 +216,19 @@ def _fit(
     Returns the Fisher information of w, in camera axes, and of that logarithm, (3, 3) or (4, 4), and the focal ratio.
     """
     count = 4 if detections.focal_uncertainty > 0 else 3
-    info, factor, step, slopes = np.zeros((count, count)), np.empty((count, count)), np.zeros(count), np.empty(4)
+    info = np.zeros((count, count))
+    factor = np.empty((count, count))
+    step = np.zeros(count)
+    slopes = np.empty(4)
     for k in range(len(observed)):
         q = _vector_from_pupil(dome, R_cam_from_lab, star[k])
-        bx, by, bz = q[0] + dome.pupil_m[0], q[1] + dome.pupil_m[1], q[2] + dome.pupil_m[2]
+        bx = q[0] + dome.pupil_m[0]
+        by = q[1] + dome.pupil_m[1]
+        bz = q[2] + dome.pupil_m[2]
         weight = 1 / detections.sigma[observed[k]] ** 2
         for axis in range(2):
-            by_component, by_depth = focal_ratio / q[2], -focal_ratio * q[axis] / q[2] ** 2
+            by_component = focal_ratio / q[2]
+            by_depth = -focal_ratio * q[axis] / q[2] ** 2
             slopes[0] = by * by_depth - axis * bz * by_component
             slopes[1] = (1 - axis) * bz * by_component - bx * by_depth
             slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
@@ -247,7 +285,8 @@ def _evidence(
     a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a factor
     of 2 (it is lit or not).
     """
-    density, group = len(detections.ray) / dome.field_area, dome.pairs.group
+    density = len(detections.ray) / dome.field_area
+    group = dome.pairs.group
     root_det = _factorize(info, np.empty_like(info))
     total = len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
     if detections.focal_uncertainty > 0:
@@ -255,7 +294,8 @@ def _evidence(
     for k in range(len(observed)):
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star[k])
         variance = detections.sigma[observed[k]] ** 2
-        x, y = detections.tangent[observed[k], 0], detections.tangent[observed[k], 1]
+        x = detections.tangent[observed[k], 0]
+        y = detections.tangent[observed[k], 1]
         residual2 = (x - focal_ratio * qx / qz) ** 2 + (y - focal_ratio * qy / qz) ** 2
         match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
         match_dex += light_dex(detections, dome, observed[k], star[k])

@@ -81,7 +81,8 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     fields, and a second-order term. Raises ImageError if there are no pairs.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
-    median_m, lever_m = float(np.median(radius)), float(np.linalg.norm(lever.camera_body_m))
+    median_m = float(np.median(radius))
+    lever_m = float(np.linalg.norm(lever.camera_body_m))
     rays = corner_rays(camera)
     inner, half_size = inner_field(rays)
     alpha = float(np.arccos(rays[:, 2].min()))
@@ -114,7 +115,9 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
 
 def corner_rays(camera: Camera) -> Floats:
     """(4, 3) unit rays of the sensor's corners, in camera axes."""
-    return camera.rays(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width_px, camera.height_px] - 0.5)
+    return camera.rays(
+        np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width_px, camera.height_px] - 0.5
+    )
 
 
 def inner_field(corners: Floats) -> tuple[Floats, Floats]:
@@ -124,8 +127,11 @@ def inner_field(corners: Floats) -> tuple[Floats, Floats]:
     the full field.
     """
     tangent = corners[:, :2] / corners[:, 2:]
-    mean, half_size = (tangent.max(axis=0) + tangent.min(axis=0)) / 2, np.ptp(tangent, axis=0) / 2
-    return np.array([mean - INNER_FRACTION * half_size, mean + INNER_FRACTION * half_size]).T.ravel(), half_size
+    mean = (tangent.max(axis=0) + tangent.min(axis=0)) / 2
+    half_size = np.ptp(tangent, axis=0) / 2
+    return np.array(
+        [mean - INNER_FRACTION * half_size, mean + INNER_FRACTION * half_size]
+    ).T.ravel(), half_size
 
 
 def build_grid(directions: Floats) -> DirectionGrid:
@@ -141,7 +147,9 @@ def build_grid(directions: Floats) -> DirectionGrid:
     number = row * side + column
     order = np.argsort(number, kind="stable")
     first = np.searchsorted(number[order], np.arange(side * side + 1))
-    return DirectionGrid(R_grid_from_lab, float(cell), side, first, np.ascontiguousarray(in_grid[order]))
+    return DirectionGrid(
+        R_grid_from_lab, float(cell), side, first, np.ascontiguousarray(in_grid[order])
+    )
 
 
 def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:

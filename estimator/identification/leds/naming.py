@@ -72,9 +72,13 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     rows = np.arange(len(lights.ray))
     matched = star[best] >= 0
     by_code = excess[rows[matched], star[best][matched]]
-    if by_code.sum() > TRUSTED * np.sqrt(matched.sum()) or matched.sum() < max(2, 2 * len(rows) / 3):
+    if by_code.sum() > TRUSTED * np.sqrt(matched.sum()) or matched.sum() < max(
+        2, 2 * len(rows) / 3
+    ):
         return CONTRADICTED
-    return StarMatch(rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX)
+    return StarMatch(
+        rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX
+    )
 
 
 def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
@@ -104,10 +108,15 @@ def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _pair_names(lights: NamedLights, sphere: Sphere, excess: Floats, first: int, second: int) -> Ints:
+def _pair_names(
+    lights: NamedLights, sphere: Sphere, excess: Floats, first: int, second: int
+) -> Ints:
     """(M, 2) names of two lights, the likeliest ones, whose angle about the bearing is that of the lights."""
     rows = [np.flatnonzero(excess[light] <= REACH) for light in (first, second)]
-    seen = [_seen_directions(lights.ray[light], sphere, row) for light, row in zip((first, second), rows, strict=True)]
+    seen = [
+        _seen_directions(lights.ray[light], sphere, row)
+        for light, row in zip((first, second), rows, strict=True)
+    ]
     known = [sphere.direction[row] for row in rows]
     gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
     pairs = np.empty((_alike(*seen, *known, gate, np.empty((0, 2), np.int64)), 2), np.int64)
@@ -129,50 +138,70 @@ def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, 
     for a in range(len(u)):
         for b in range(len(v)):
             cosine = u[a, 0] * v[b, 0] + u[a, 1] * v[b, 1] + u[a, 2] * v[b, 2]
-            known = known_u[a, 0] * known_v[b, 0] + known_u[a, 1] * known_v[b, 1] + known_u[a, 2] * known_v[b, 2]
+            known = (
+                known_u[a, 0] * known_v[b, 0]
+                + known_u[a, 1] * known_v[b, 1]
+                + known_u[a, 2] * known_v[b, 2]
+            )
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
-                    pairs[found, 0], pairs[found, 1] = a, b
+                    pairs[found, 0] = a
+                    pairs[found, 1] = b
                 found += 1
     return found
 
 
 def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
     """(K, 3) direction from the bearing to the point where a ray meets the sphere of each of these LEDs' radii."""
-    radius, along = sphere.radius_m[rows], float(ray @ sphere.pupil_m)
+    radius = sphere.radius_m[rows]
+    along = float(ray @ sphere.pupil_m)
     reach = -along + np.sqrt(np.maximum(along**2 - sphere.pupil_m @ sphere.pupil_m + radius**2, 0))
     return (sphere.pupil_m + reach[:, None] * ray) / radius[:, None]
 
 
 def _attitudes(lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints) -> Floats:
     """(M, 3, 3) R_cam_from_lab of each pair of names."""
-    seen = [_seen_directions(lights.ray[light], sphere, names[:, k]) for k, light in enumerate((first, second))]
+    seen = [
+        _seen_directions(lights.ray[light], sphere, names[:, k])
+        for k, light in enumerate((first, second))
+    ]
     known = [sphere.direction[names[:, k]] for k in range(2)]
     return np.einsum("mia,mib->mab", _frames(*seen), _frames(*known))
 
 
 def _frames(u: Floats, v: Floats) -> Floats:
     """(M, 3, 3) orthonormal axes, in rows, of pairs of unit vectors: their middle, the third, and their normal."""
-    middle, normal = u + v, np.cross(u, v)
+    middle = u + v
+    normal = np.cross(u, v)
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     return np.stack([middle, np.cross(normal, middle), normal], axis=1)
 
 
 def _evaluate(
-    lights: NamedLights, sphere: Sphere, excess: Floats, R_cam_from_lab: Floats, pair: tuple[int, int], names: Ints
+    lights: NamedLights,
+    sphere: Sphere,
+    excess: Floats,
+    R_cam_from_lab: Floats,
+    pair: tuple[int, int],
+    names: Ints,
 ) -> tuple[Floats, NDArray[np.int64]]:
     """(M,) misfit of each hypothesis and (M, T) its names of the lights, -1 for none."""
-    offset = (R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T).reshape(-1, 3, len(sphere.position_m))
+    offset = (R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T).reshape(
+        -1, 3, len(sphere.position_m)
+    )
     offset = offset - sphere.pupil_m[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         tangent = np.where(offset[:, 2:] > 0, offset[:, :2] / offset[:, 2:], np.inf)
     seen = lights.ray[:, :2] / lights.ray[:, 2:]
-    middle, length2 = seen[list(pair)].mean(axis=0), np.sum((seen[pair[0]] - seen[pair[1]]) ** 2)
+    middle = seen[list(pair)].mean(axis=0)
+    length2 = np.sum((seen[pair[0]] - seen[pair[1]]) ** 2)
     total = excess[pair[0], names[:, 0]] + excess[pair[1], names[:, 1]]
     star = np.full((len(names), len(seen)), -1)
     star[:, pair] = names
-    cost = np.full((len(names), len(sphere.position_m) + 1), STRANGER)  # of each LED, and at last (-1) of none of them
+    cost = np.full(
+        (len(names), len(sphere.position_m) + 1), STRANGER
+    )  # of each LED, and at last (-1) of none of them
     named = list(pair)
     for light in set(range(len(seen))) - set(pair):
         # The pair's attitude adds half of a light's variance, and more with the distance from the pair's middle.

@@ -52,7 +52,9 @@ from estimator.identification.leds.evidence import (
 from estimator.identification.leds.index import DirectionGrid, DomeIndex
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
-AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
+AMBIGUOUS_DEX = (
+    2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
+)
 MIN_SEPARATION = 1e-9  # of a pair, in tangents: closer detections have no direction between them
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
@@ -86,7 +88,9 @@ def identify(
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
-    return StarMatch(hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex)
+    return StarMatch(
+        hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex
+    )
 
 
 def build_detections(
@@ -130,13 +134,16 @@ def _brightness(flux_s: Floats | None, dome: DomeIndex) -> tuple[Floats, Floats]
 
 
 @jit
-def _search(detections: LedDetections, dome: DomeIndex, max_checks: int) -> tuple[LedHypothesis, float]:
+def _search(
+    detections: LedDetections, dome: DomeIndex, max_checks: int
+) -> tuple[LedHypothesis, float]:
     """The best hypothesis, and the evidence of the best one with another attitude."""
     R_cam_from_lab = np.zeros((3, 3))
     for axis in range(3):
         R_cam_from_lab[axis, axis] = 1.0
     best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_lab, -np.inf)
-    rival_dex, checks = -np.inf, np.zeros(1, np.int64)
+    rival_dex = -np.inf
+    checks = np.zeros(1, np.int64)
     order = _ordered_pairs(detections, dome)
     for rank in range(len(order)):
         a, b = order[rank]
@@ -146,7 +153,9 @@ def _search(detections: LedDetections, dome: DomeIndex, max_checks: int) -> tupl
             # rivals so far, and the same pair is tested again; then a second pair is tested.
             min_rival_dex = best.dex - MARGIN_DEX
             if min_rival_dex < ACCEPT_DEX:
-                best, rival_dex = _test_pair(detections, dome, a, b, min_rival_dex, best, rival_dex, checks)
+                best, rival_dex = _test_pair(
+                    detections, dome, a, b, min_rival_dex, best, rival_dex, checks
+                )
             a, b = order[_disjoint_pair(order, rank, best)]
             return _test_pair(detections, dome, a, b, min_rival_dex, best, rival_dex, checks)
         if checks[0] > max_checks:
@@ -161,8 +170,10 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
     Short pairs also match few LED pairs, but determine the roll about the boresight poorly. Coincident detections are
     left out.
     """
-    total, min_length = len(detections.ray), SHORT_PAIR * sqrt(dome.field_area)
-    pair, cost = np.empty((total * (total - 1) // 2, 2), np.int64), np.empty(total * (total - 1) // 2)
+    total = len(detections.ray)
+    min_length = SHORT_PAIR * sqrt(dome.field_area)
+    pair = np.empty((total * (total - 1) // 2, 2), np.int64)
+    cost = np.empty(total * (total - 1) // 2)
     count = 0
     for a in range(total):
         for b in range(a + 1, total):
@@ -170,33 +181,49 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
             if not length > MIN_SEPARATION:
                 continue
             begin, end, _ = _pair_range(detections, dome, a, b)
-            pair[count, 0], pair[count, 1] = a, b
+            pair[count, 0] = a
+            pair[count, 1] = b
             cost[count] = end - begin if length >= min_length else 1e9 - length
             count += 1
     return pair[:count][np.argsort(cost[:count])]
 
 
 @jit
-def _pair_range(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> tuple[int, int, float]:
+def _pair_range(
+    detections: LedDetections, dome: DomeIndex, a: int, b: int
+) -> tuple[int, int, float]:
     """Half-open range of index pairs that two detections may be, and the gate of their angle about the bearing, rad."""
-    gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2) * _bearing_angle_ratio(dome)
-    direction_a, direction_b = vectors.row(detections.direction, a), vectors.row(detections.direction, b)
+    gate = (
+        GATE_SIGMA
+        * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
+        * _bearing_angle_ratio(dome)
+    )
+    direction_a = vectors.row(detections.direction, a)
+    direction_b = vectors.row(detections.direction, b)
     angle = 2 * np.arcsin(min(vectors.chord(direction_a, direction_b) / 2, 1.0))
-    slack, uncertainty = gate + dome.scaling_error_rad, detections.focal_uncertainty
-    begin, end = pair_range(dome.pairs, angle / (1 + uncertainty) - slack, angle / (1 - uncertainty) + slack)
+    slack = gate + dome.scaling_error_rad
+    uncertainty = detections.focal_uncertainty
+    begin, end = pair_range(
+        dome.pairs, angle / (1 + uncertainty) - slack, angle / (1 - uncertainty) + slack
+    )
     return begin, end, gate
 
 
 @jit
 def _bearing_angle_ratio(dome: DomeIndex) -> float:
     """Ratio of an angle about the bearing to the angle seen by the camera: (R - M) / R."""
-    return 1 - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2) / dome.median_radius_m
+    return (
+        1
+        - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2)
+        / dome.median_radius_m
+    )
 
 
 @jit
 def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
     """Rank of the first pair of two matched detections that shares none with pair `rank`, or as few as possible."""
-    best_rank, cost = rank, 9
+    best_rank = rank
+    cost = 9
     for other in range(len(pairs)):
         penalty = 0
         for end in range(2):
@@ -206,7 +233,8 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
             penalty += 3 * (not is_matched)  # an unmatched detection is worse than two shared ones
             penalty += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
         if penalty < cost:
-            best_rank, cost = other, penalty
+            best_rank = other
+            cost = penalty
     return best_rank
 
 
@@ -227,20 +255,29 @@ def _test_pair(
     rival.
     checks : (1,) effort so far, increased in place
     """
-    index, radius = dome.pairs, dome.radius_m
+    index = dome.pairs
+    radius = dome.radius_m
     begin, end, gate = _pair_range(detections, dome, a, b)
     attitude_dex = _attitude_dex(detections, dome, a, b)
     most_light_dex = _most_light_dex(detections, dome)
-    required = required_matches(detections.sigma, dome.field_area, attitude_dex, min_dex, most_light_dex)
+    required = required_matches(
+        detections.sigma, dome.field_area, attitude_dex, min_dex, most_light_dex
+    )
     gates = _pair_gates(detections, dome, a, b)
-    in_cam, in_lab, R_cam_from_lab = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    in_cam = np.empty((3, 3))
+    in_lab = np.empty((3, 3))
+    R_cam_from_lab = np.empty((3, 3))
     R_grid_from_cam = np.empty((3, 3))
     checks[0] += 2 * (end - begin)
     for p in range(begin, end):
         for flip in range(2):
-            i, j = index.pair[p, flip], index.pair[p, 1 - flip]
-            led_i, led_j = vectors.row(index.vectors, i), vectors.row(index.vectors, j)
-            focal_ratio = _fit_focal_ratio(detections, dome, a, b, radius[i], radius[j], vectors.chord(led_i, led_j))
+            i = index.pair[p, flip]
+            j = index.pair[p, 1 - flip]
+            led_i = vectors.row(index.vectors, i)
+            led_j = vectors.row(index.vectors, j)
+            focal_ratio = _fit_focal_ratio(
+                detections, dome, a, b, radius[i], radius[j], vectors.chord(led_i, led_j)
+            )
             if abs(focal_ratio - 1) > detections.focal_uncertainty:
                 continue
             direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius[i])
@@ -252,7 +289,9 @@ def _test_pair(
             vectors.pair_frame(led_i, led_j, in_lab)
             vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
             vectors.multiply_transposed(dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam)
-            counted = _quick_check(detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required)
+            counted = _quick_check(
+                detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required
+            )
             if counted < required:
                 continue
             checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
@@ -271,14 +310,21 @@ def _ray(detections: LedDetections, n: int, focal_ratio: float) -> Vector:
     """Unit ray of a detection in camera axes, if the focal length is `focal_ratio` times the assumed one."""
     if focal_ratio == 1:
         return vectors.row(detections.ray, n)
-    x, y = detections.tangent[n, 0] / focal_ratio, detections.tangent[n, 1] / focal_ratio
+    x = detections.tangent[n, 0] / focal_ratio
+    y = detections.tangent[n, 1] / focal_ratio
     inverse = 1 / sqrt(x * x + y * y + 1)
     return x * inverse, y * inverse, inverse
 
 
 @jit
 def _fit_focal_ratio(
-    detections: LedDetections, dome: DomeIndex, a: int, b: int, radius_a_m: float, radius_b_m: float, chord: float
+    detections: LedDetections,
+    dome: DomeIndex,
+    a: int,
+    b: int,
+    radius_a_m: float,
+    radius_b_m: float,
+    chord: float,
 ) -> float:
     """The focal ratio at which two detections are two LEDs with this chord of directions from the bearing.
 
@@ -287,8 +333,12 @@ def _fit_focal_ratio(
     focal_ratio = 1.0
     if detections.focal_uncertainty > 0:
         for _ in range(3):
-            direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius_a_m)
-            direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius_b_m)
+            direction_a = _direction_from_bearing(
+                _ray(detections, a, focal_ratio), dome, radius_a_m
+            )
+            direction_b = _direction_from_bearing(
+                _ray(detections, b, focal_ratio), dome, radius_b_m
+            )
             focal_ratio *= vectors.chord(direction_a, direction_b) / chord
     return focal_ratio
 
@@ -298,7 +348,9 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
     """Unit vector from the bearing to the point where a camera ray meets the sphere of radius_m, in camera axes."""
     px, py, pz = dome.pupil_m
     along = ray[0] * px + ray[1] * py + ray[2] * pz
-    distance = -along + sqrt(max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0))
+    distance = -along + sqrt(
+        max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
+    )
     inverse = 1 / radius_m
     return (
         (px + distance * ray[0]) * inverse,
@@ -322,10 +374,15 @@ def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) ->
     The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it; that of the focal
     length, if the pair has to tell it too, is sqrt(2) sigma / separation.
     """
-    sigma, length = least(detections.sigma), separation(detections.tangent, a, b)
-    attitude_dex = 1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
+    sigma = least(detections.sigma)
+    length = separation(detections.tangent, a, b)
+    attitude_dex = (
+        1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
+    )
     if detections.focal_uncertainty > 0:
-        attitude_dex += log10(sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty))
+        attitude_dex += log10(
+            sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty)
+        )
     return attitude_dex
 
 
@@ -362,7 +419,9 @@ def _quick_check(
     Stops as soon as `required` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
     (radius_m) by a first-order step from the median radius, or exactly if the focal length is another one.
     """
-    count, total, radius_offset_m = 2, len(detections.ray), radius_m - dome.median_radius_m
+    count = 2
+    total = len(detections.ray)
+    radius_offset_m = radius_m - dome.median_radius_m
     for n in range(total):
         if count >= required or count + total - n < required:
             break
@@ -381,8 +440,11 @@ def _quick_check(
 @jit
 def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
     """Whether any LED is within `gate` (rad) of a direction in grid axes."""
-    inverse, half, reach = 1 / grid.cell, grid.side / 2, gate / grid.cell
-    x, y = direction[0] * inverse + half, direction[1] * inverse + half
+    inverse = 1 / grid.cell
+    half = grid.side / 2
+    reach = gate / grid.cell
+    x = direction[0] * inverse + half
+    y = direction[1] * inverse + half
     for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
         left = line * grid.side + cell_of(x - reach, grid.side)
         right = line * grid.side + cell_of(x + reach, grid.side - 1)

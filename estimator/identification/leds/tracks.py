@@ -42,8 +42,13 @@ class LightTracks:
         patience: int,
         goes_dark: bool,
     ) -> None:
-        self.camera, self.pupil_m, self.radius_m = camera, pupil_m, radius_m
-        self.frames, self.gate_px, self.patience, self.goes_dark = frames, gate_px, patience, goes_dark
+        self.camera = camera
+        self.pupil_m = pupil_m
+        self.radius_m = radius_m
+        self.frames = frames
+        self.gate_px = gate_px
+        self.patience = patience
+        self.goes_dark = goes_dark
         self.clear()
 
     def clear(self) -> None:
@@ -51,11 +56,17 @@ class LightTracks:
         self.point_m = np.empty((0, 3))
         self.light = np.empty((0, self.frames))
         self.sigma = np.empty((0, self.frames))
-        self.row, self.missed = np.empty(0, np.int64), np.empty(0, np.int64)
-        self.rate_rad_s, self.column = np.zeros(3), -1
+        self.row = np.empty(0, np.int64)
+        self.missed = np.empty(0, np.int64)
+        self.rate_rad_s = np.zeros(3)
+        self.column = -1
 
     def advance(
-        self, centroids: Centroids, sigma: Floats, elapsed_s: float, now_from_then: Rotation | None = None
+        self,
+        centroids: Centroids,
+        sigma: Floats,
+        elapsed_s: float,
+        now_from_then: Rotation | None = None,
     ) -> None:
         """Continue the tracks with a frame's lights, and begin new ones.
 
@@ -70,10 +81,20 @@ class LightTracks:
         self.row = _mutual_nearest(xy_px, centroids.xy_px, self.gate_px)
         self._measure_motion(seen_m, elapsed_s)
         found = self.row >= 0
-        self.point_m = np.where(found[:, None], seen_m[self.row] if len(seen_m) else predicted_m, predicted_m)
-        self._record(centroids, sigma, self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX))
+        self.point_m = np.where(
+            found[:, None], seen_m[self.row] if len(seen_m) else predicted_m, predicted_m
+        )
+        self._record(
+            centroids, sigma, self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX)
+        )
         self.missed = np.where(found, 0, self.missed + 1)
-        self._keep(found | ((self.missed <= self.patience) & self.camera.contains(np.nan_to_num(xy_px, nan=-1e9))))
+        self._keep(
+            found
+            | (
+                (self.missed <= self.patience)
+                & self.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
+            )
+        )
         self._begin(centroids, sigma, seen_m)
 
     def _measure_motion(self, seen_m: Floats, elapsed_s: float) -> None:

@@ -43,10 +43,15 @@ from estimator.identification.direct_match import (
 )
 from estimator.identification.options import Options
 
-MAG_GATE_SIGMA = 3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
-MIN_SIDE_FRACTION = 0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
+MAG_GATE_SIGMA = (
+    3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
+)
+MIN_SIDE_FRACTION = (
+    0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
+)
 # Least fraction of the observed stars that must match: basic, and with false stars.
-MIN_FRACTION_BASIC, MIN_FRACTION_FALSE_STARS = 0.5, 0.3
+MIN_FRACTION_BASIC = 0.5
+MIN_FRACTION_FALSE_STARS = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +101,10 @@ def search_options(
         raise ImageError(
             f"fialho: tolerance {tolerance_rad} rad, magnitude error {settings.epsilon_mag}; allowed: more than 0"
         )
-    x, y, z, chord2 = 0.0, 0.0, 1.0, 5.0
+    x = 0.0
+    y = 0.0
+    z = 1.0
+    chord2 = 5.0
     if settings.boresight_ref is not None:
         x, y, z = settings.boresight_ref
         chord2 = 4 * np.sin(min(settings.within_rad, np.pi) / 2) ** 2
@@ -116,24 +124,36 @@ def search_options(
     )
 
 
-def fialho_1(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def fialho_1(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """The basic algorithm: one triangle, each list from the whole catalog, no boresight prior. See `fialho_4`."""
     settings = replace(Options(**options), boresight_ref=None)
     return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False)
 
 
-def fialho_2(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def fialho_2(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
-    return _identify(vectors_cam, index, tolerance_rad, Options(**options), MIN_FRACTION_BASIC, True, False)
+    return _identify(
+        vectors_cam, index, tolerance_rad, Options(**options), MIN_FRACTION_BASIC, True, False
+    )
 
 
-def fialho_3(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def fialho_3(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
     settings = Options(**options)
-    return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_FALSE_STARS, True, True)
+    return _identify(
+        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_FALSE_STARS, True, True
+    )
 
 
-def fialho_4(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> MagnitudeMatch | None:
+def fialho_4(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> MagnitudeMatch | None:
     """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
@@ -185,7 +205,9 @@ def _identify(
 
 
 @jit
-def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
+def search(
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+) -> DirectMatch:
     """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
     rays, magnitudes : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
@@ -193,7 +215,8 @@ def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOp
     chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
-    min_side_rad, base = MIN_SIDE_FRACTION * index.max_angle_rad, min(options.base, len(rays))
+    min_side_rad = MIN_SIDE_FRACTION * index.max_angle_rad
+    base = min(options.base, len(rays))
     corners = _brightest(rays, base, min_side_rad)
     if corners[0] < 0:
         return no_match()
@@ -207,7 +230,9 @@ def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOp
                 if count >= options.triangles or tried[1] >= options.checks:
                     return no_match()
                 next_corners = np.array([i, i + dj, i + dj + dk])
-                if (next_corners == corners).all() or _shortest_side(rays, next_corners) < min_side_rad:
+                if (next_corners == corners).all() or _shortest_side(
+                    rays, next_corners
+                ) < min_side_rad:
                     continue
                 match = triplets(rays, magnitudes, index, next_corners, options, tried)
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
@@ -259,11 +284,19 @@ def triplets(
 
 @jit
 def _direct_match(
-    rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, options: SearchOptions, tried: int
+    rays: Floats,
+    index: PairIndex,
+    corners: NDArray,
+    stars: NDArray,
+    options: SearchOptions,
+    tried: int,
 ) -> DirectMatch:
     """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
     match = match_field(rays, index, corners, stars, options.tolerance_rad, options.stretch, tried)
-    if len(match.observed) <= options.min_fraction * len(rays) or match.log10_chance > ACCEPT_LOG10_CHANCE:
+    if (
+        len(match.observed) <= options.min_fraction * len(rays)
+        or match.log10_chance > ACCEPT_LOG10_CHANCE
+    ):
         return no_match()
     return match
 
@@ -271,7 +304,9 @@ def _direct_match(
 @jit
 def _candidate(index: PairIndex, star: int, magnitude: float, options: SearchOptions) -> bool:
     """Whether a star is within the magnitude gate and near enough to the prior boresight."""
-    if abs(index.magnitude[star] - magnitude) > options.gate_mag:  # False for NaN: an unknown magnitude passes
+    if (
+        abs(index.magnitude[star] - magnitude) > options.gate_mag
+    ):  # False for NaN: an unknown magnitude passes
         return False
     x, y, z = index.vectors[star]
     return (x - options.x) ** 2 + (y - options.y) ** 2 + (z - options.z) ** 2 <= options.chord2
@@ -332,7 +367,8 @@ def _test_neighbors(
 @jit
 def _all_candidates(index: PairIndex, magnitude: float, options: SearchOptions) -> NDArray:
     """Candidates for one star, from the whole catalog."""
-    out, count = np.empty(len(index.vectors), np.int64), 0
+    out = np.empty(len(index.vectors), np.int64)
+    count = 0
     for star in range(len(index.vectors)):
         if _candidate(index, star, magnitude, options):
             out[count] = star

@@ -21,7 +21,13 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
-from estimator.identification.direct_match import DirectMatch, angle, match_field, no_match, to_star_match
+from estimator.identification.direct_match import (
+    DirectMatch,
+    angle,
+    match_field,
+    no_match,
+    to_star_match,
+)
 from estimator.identification.options import Options
 
 
@@ -56,24 +62,33 @@ def master_star(
     if count < MIN_MATCHES:
         return None
     parameters = SearchOptions(
-        tolerance_rad, settings.stretch, 3 * settings.epsilon_mag, min(masters, count), settings.max_checks
+        tolerance_rad,
+        settings.stretch,
+        3 * settings.epsilon_mag,
+        min(masters, count),
+        settings.max_checks,
     )
     rays = np.ascontiguousarray(vectors_cam)
     return to_star_match(search(rays, settings.magnitudes(count), index, parameters))
 
 
 @jit
-def search(rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
+def search(
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+) -> DirectMatch:
     """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
     for master in range(options.masters):
         begin, end = magnitude_range(index, magnitudes[master], options.gate_mag)
         angle_counts = np.zeros(end - begin, np.int64)
         for candidate in range(begin, end):
-            angle_counts[candidate - begin] = _count_angles(rays, index, master, candidate, options, tried)
+            angle_counts[candidate - begin] = _count_angles(
+                rays, index, master, candidate, options, tried
+            )
         if len(angle_counts) == 0 or angle_counts.max() < MIN_MATCHES - 1:
             continue
-        best, rival = no_match(), np.zeros(1)
+        best = no_match()
+        rival = np.zeros(1)
         # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
         for candidate in np.flatnonzero(angle_counts >= angle_counts.max() - 1) + begin:
             best = _best_match(rays, index, master, candidate, options, tried, best, rival)
@@ -97,7 +112,12 @@ def _contradict(first: DirectMatch, second: DirectMatch) -> bool:
 
 @jit
 def _count_angles(
-    rays: Floats, index: PairIndex, master: int, candidate: int, options: SearchOptions, tried: NDArray
+    rays: Floats,
+    index: PairIndex,
+    master: int,
+    candidate: int,
+    options: SearchOptions,
+    tried: NDArray,
 ) -> int:
     """Number of the master's angles that the candidate has to any of its neighbors."""
     count = 0
@@ -108,7 +128,9 @@ def _count_angles(
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
         place = first_neighbor(index, candidate, side - tolerance)
         tried[1] += 1
-        count += place < index.first[candidate + 1] and index.separation_rad[place] <= side + tolerance
+        count += (
+            place < index.first[candidate + 1] and index.separation_rad[place] <= side + tolerance
+        )
     return count
 
 
@@ -132,13 +154,18 @@ def _best_match(
     for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
         place = first_neighbor(index, candidate, sides[n] - tolerance)
-        while place < index.first[candidate + 1] and index.separation_rad[place] <= sides[n] + tolerance:
+        while (
+            place < index.first[candidate + 1]
+            and index.separation_rad[place] <= sides[n] + tolerance
+        ):
             stars = np.array([candidate, index.neighbor[place]], np.int64)
             place += 1
             tried[0] += 1
             tried[1] += len(rays)
             pair = np.array([master, n])
-            match = match_field(rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0])
+            match = match_field(
+                rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0]
+            )
             if len(match.observed) and _contradict(best, match):
                 rival[0] = min(rival[0], max(best.log10_chance, match.log10_chance))
             if match.log10_chance < best.log10_chance:

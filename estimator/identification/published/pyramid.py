@@ -50,7 +50,9 @@ class SearchOptions(NamedTuple):
     bottom: float
 
 
-def pyramid(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def pyramid(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
@@ -97,10 +99,14 @@ def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMat
 
 
 @jit
-def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray) -> DirectMatch:
+def _triangle(
+    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+) -> DirectMatch:
     """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
     i, j, k = corners
-    ij, ik, jk = angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])
+    ij = angle(rays[i], rays[j])
+    ik = angle(rays[i], rays[k])
+    jk = angle(rays[j], rays[k])
     t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array([ij, ik, jk])
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return no_match()
@@ -116,10 +122,12 @@ def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchO
         if abs(side - ij) > t_ij:
             continue
         for flip in range(2):
-            a, b = index.pair[p, flip], index.pair[p, 1 - flip]
+            a = index.pair[p, flip]
+            b = index.pair[p, 1 - flip]
             place = first_neighbor(index, a, ik - t_ik)
             while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
-                c, side_ac = index.neighbor[place], index.separation_rad[place]
+                c = index.neighbor[place]
+                side_ac = index.separation_rad[place]
                 place += 1
                 tried[2] += 1
                 if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
@@ -130,7 +138,9 @@ def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchO
                 if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 # One factor for all three sides: the assumed over the true focal length.
-                tangent_scale = (side + side_ac + side_bc) / (ij + ik + jk) if options.focal_unknown else 1.0
+                tangent_scale = (
+                    (side + side_ac + side_bc) / (ij + ik + jk) if options.focal_unknown else 1.0
+                )
                 misfit = max(
                     abs(side - tangent_scale * ij) - residual_stretch * ij,
                     abs(side_ac - tangent_scale * ik) - residual_stretch * ik,
@@ -140,7 +150,9 @@ def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchO
                     continue
                 tried[1] += 1
                 scaled = _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
-                match = _pyramid(scaled, index, corners, np.array([a, b, c]), options, residual_stretch, tried)
+                match = _pyramid(
+                    scaled, index, corners, np.array([a, b, c]), options, residual_stretch, tried
+                )
                 if match.log10_chance < ACCEPT_LOG10_CHANCE:
                     return match
     return no_match()
@@ -164,7 +176,9 @@ def _pyramid(
         reach = angle(rays[corners[0]], rays[r])
         tolerance = sqrt(2.0) * options.tolerance + stretch * reach
         place = first_neighbor(index, stars[0], reach - tolerance)
-        while place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + tolerance:
+        while (
+            place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + tolerance
+        ):
             d = index.neighbor[place]
             place += 1
             fits = True
@@ -184,9 +198,12 @@ def _scale_tangents(rays: Floats, factor: float) -> Floats:
     out = np.empty_like(rays)
     for n in range(len(rays)):
         z = rays[n, 2]
-        x, y = rays[n, 0] / z * factor, rays[n, 1] / z * factor
+        x = rays[n, 0] / z * factor
+        y = rays[n, 1] / z * factor
         length = sqrt(x * x + y * y + 1)
-        out[n, 0], out[n, 1], out[n, 2] = x / length, y / length, 1 / length
+        out[n, 0] = x / length
+        out[n, 1] = y / length
+        out[n, 2] = 1 / length
     return out
 
 
@@ -204,19 +221,26 @@ def _match_with_penalty(
     match = match_field(rays, index, corners, stars, options.tolerance, stretch, hypotheses)
     if len(match.observed) == 0 or options.missed_dex <= 0:
         return match
-    missing = max(_count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0)
+    missing = max(
+        _count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0
+    )
     chance = match.log10_chance + options.missed_dex * missing
     return DirectMatch(match.observed, match.star, match.R_cam_from_ref, chance)
 
 
 @jit
-def _count_in_field(index: PairIndex, center: int, R_cam_from_ref: Floats, options: SearchOptions) -> int:
+def _count_in_field(
+    index: PairIndex, center: int, R_cam_from_ref: Floats, options: SearchOptions
+) -> int:
     """Number of catalog stars in the field at an attitude; `center` is a star whose neighbors are tested."""
     count = 0
-    begin, end = index.first[center], index.first[center + 1]
+    begin = index.first[center]
+    end = index.first[center + 1]
     for place in range(begin - 1, end):
         s = center if place < begin else index.neighbor[place]
         x, y, z = R_cam_from_ref @ index.vectors[s]
-        inside = options.left * z < x < options.right * z and options.top * z < y < options.bottom * z
+        inside = (
+            options.left * z < x < options.right * z and options.top * z < y < options.bottom * z
+        )
         count += z > 0 and inside
     return count

@@ -38,7 +38,9 @@ RIVAL_PAIRS = 10
 MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
 
 
-def saa(vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def saa(
+    vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2): two bright stars, all pairs like them, all other stars.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first
@@ -56,7 +58,11 @@ def saa(vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: floa
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    sep_rad = np.sqrt(2) / 3 * tolerance_rad if settings.epsilon_sep_rad is None else settings.epsilon_sep_rad
+    sep_rad = (
+        np.sqrt(2) / 3 * tolerance_rad
+        if settings.epsilon_sep_rad is None
+        else settings.epsilon_sep_rad
+    )
     if not min(sep_rad, tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
             f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"
@@ -82,11 +88,18 @@ class AssumptionPool:
     deviations, and the number of stars matched beside the pair.
     """
 
-    def __init__(self, stars: SearchInput, field_tan: tuple[float, float, float, float], missed_dex: float) -> None:
-        self.stars, self.field_tan, self.missed_dex = stars, field_tan, missed_dex
+    def __init__(
+        self, stars: SearchInput, field_tan: tuple[float, float, float, float], missed_dex: float
+    ) -> None:
+        self.stars = stars
+        self.field_tan = field_tan
+        self.missed_dex = missed_dex
         self.assumptions: list[tuple[Ints, Floats, Ints]] = []
-        self.count, self.cost, self.star = 0, np.inf, np.full(len(stars.vectors_cam), -1, np.int32)
-        self.p, self.missing = 1.0, 0.0
+        self.count = 0
+        self.cost = np.inf
+        self.star = np.full(len(stars.vectors_cam), -1, np.int32)
+        self.p = 1.0
+        self.missing = 0.0
         # Of the assumptions that contradict the best: count, sum of matches, least cost.
         self._contradictions = np.zeros(3)
 
@@ -99,8 +112,11 @@ class AssumptionPool:
         self.count += len(cost)
         best = int(cost.argmin())
         if cost[best] < self.cost:
-            self.cost, self.star = float(cost[best]), star[best]
-            self.p, self.missing = _chance_statistics(self.stars, primary, star[best], self.field_tan)
+            self.cost = float(cost[best])
+            self.star = star[best]
+            self.p, self.missing = _chance_statistics(
+                self.stars, primary, star[best], self.field_tan
+            )
             # A new best: all earlier assumptions are compared with it again.
             self._contradictions = np.array([0.0, 0.0, np.inf])
             for earlier in self.assumptions:
@@ -114,7 +130,8 @@ class AssumptionPool:
 
         On a lattice false assumptions match often; their match rate is measured on those that contradict the best.
         """
-        trials, hits = len(self.star) - 2, int((self.star >= 0).sum()) - 2
+        trials = len(self.star) - 2
+        hits = int((self.star >= 0).sum()) - 2
         if hits + 2 < MIN_MATCHES:
             return 0.0
         count, matches, _ = self._contradictions
@@ -124,13 +141,16 @@ class AssumptionPool:
 
     def best_match(self) -> StarMatch | None:
         """The best assumption, or None if it is not significant or a contradicting one is nearly as likely."""
-        chance, margin = self.log10_chance, -2 * np.log(10) * ACCEPT_LOG10_CHANCE
+        chance = self.log10_chance
+        margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
         count, _, rival_cost = self._contradictions
         if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
             return None
         observed = np.flatnonzero(self.star >= 0)
         star = self.star[observed].astype(np.int64)
-        cam_from_ref = quest(self.stars.vectors_cam[observed], self.stars.vectors[star], np.ones(len(star)))
+        cam_from_ref = quest(
+            self.stars.vectors_cam[observed], self.stars.vectors[star], np.ones(len(star))
+        )
         return StarMatch(observed, star, cam_from_ref, chance)
 
 
@@ -139,7 +159,8 @@ def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: 
 
     One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions.
     """
-    stars, remaining = pool.stars, settings.max_triangles
+    stars = pool.stars
+    remaining = settings.max_triangles
     budget = min(settings.max_checks // len(stars.vectors_cam), MAX_ASSUMPTIONS)
     max_rad = index.max_rad if isinstance(index, PairCatalog) else index.max_angle_rad
     find_pairs = candidates if isinstance(index, PairCatalog) else pair_range
@@ -156,12 +177,17 @@ def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: 
             remaining = RIVAL_PAIRS
 
 
-def _primary_pairs(stars: SearchInput, base_stars: int, max_rad: float) -> Iterator[tuple[int, int, float]]:
+def _primary_pairs(
+    stars: SearchInput, base_stars: int, max_rad: float
+) -> Iterator[tuple[int, int, float]]:
     """Step 2: pairs of observed stars, the brightest first, far enough apart to determine the roll; and their angle."""
-    base, gates = min(base_stars, len(stars.vectors_cam)), stars.gates
+    base = min(base_stars, len(stars.vectors_cam))
+    gates = stars.gates
     chord = np.linalg.norm(stars.vectors_cam[:base, None] - stars.vectors_cam[:base], axis=2)
     angles = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
-    for rank_sum in range(1, 2 * base - 2):  # sum of the two rows: the brightest pairs have the least
+    for rank_sum in range(
+        1, 2 * base - 2
+    ):  # sum of the two rows: the brightest pairs have the least
         for a in range(max(rank_sum - base + 1, 0), (rank_sum + 1) // 2):
             angle = float(angles[a, rank_sum - a])
             if 4 * 3 * gates.separation_rad < angle <= max_rad + gate_rad(gates, angle):
@@ -183,7 +209,9 @@ def _chance_statistics(
     left, right, top, bottom = field_tan
     x, y, z = predicted.T
     field = (z > 0) & (x > left * z) & (x < right * z) & (y > top * z) & (y < bottom * z)
-    from_midpoint_rad = 2 * np.arcsin(np.minimum(np.linalg.norm(predicted - primary.midpoint, axis=1) / 2, 1.0))
+    from_midpoint_rad = 2 * np.arcsin(
+        np.minimum(np.linalg.norm(predicted - primary.midpoint, axis=1) / 2, 1.0)
+    )
     rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
     rows = rows[(rows != pair[0]) & (rows != pair[1])]
     difference_mag = np.abs(stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows])

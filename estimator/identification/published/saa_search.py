@@ -85,7 +85,8 @@ def triad(a: Floats, b: Floats) -> Floats:
 
     The rotation that maps one pair's triad to another's is Wahba's solution for two stars of equal weight."""
     rows = np.empty((3, 3))
-    rows[0], rows[1] = a + b, a - b
+    rows[0] = a + b
+    rows[1] = a - b
     rows[2, 0] = b[1] * a[2] - b[2] * a[1]
     rows[2, 1] = b[2] * a[0] - b[0] * a[2]
     rows[2, 2] = b[0] * a[1] - b[1] * a[0]
@@ -102,12 +103,20 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
     the pair's attitude: with noise sigma, a pair of separation b rotates by sqrt(2) sigma / b and shifts by
     sigma / sqrt(2). At distance d from its middle the variance is sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is used here.
     """
-    gates, vectors_cam = stars.gates, stars.vectors_cam
-    a, b, count = vectors_cam[row_a], vectors_cam[row_b], len(vectors_cam) - 2
+    gates = stars.gates
+    vectors_cam = stars.vectors_cam
+    a = vectors_cam[row_a]
+    b = vectors_cam[row_b]
+    count = len(vectors_cam) - 2
     midpoint = (a + b) / np.sqrt(np.sum((a + b) ** 2))
-    base_rad, reach_rad = angle(a, b), 0.0
-    others, corner, gate = np.empty(count, np.int64), np.empty((2, count)), np.empty((2, count))
-    sigma, radius, area = np.empty(count), np.empty(count), np.empty(count)
+    base_rad = angle(a, b)
+    reach_rad = 0.0
+    others = np.empty(count, np.int64)
+    corner = np.empty((2, count))
+    gate = np.empty((2, count))
+    sigma = np.empty(count)
+    radius = np.empty(count)
+    area = np.empty(count)
     k = 0
     for n in range(len(vectors_cam)):
         x = vectors_cam[n]
@@ -116,8 +125,10 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
         if n in (row_a, row_b):
             continue
         others[k] = n
-        corner[0, k], corner[1, k] = angle(x, a), angle(x, b)
-        gate[0, k], gate[1, k] = gate_rad(gates, corner[0, k]), gate_rad(gates, corner[1, k])
+        corner[0, k] = angle(x, a)
+        corner[1, k] = angle(x, b)
+        gate[0, k] = gate_rad(gates, corner[0, k])
+        gate[1, k] = gate_rad(gates, corner[1, k])
         sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_midpoint_rad / base_rad) ** 2)
         radius[k] = 3 * sigma[k] + gates.stretch * from_midpoint_rad
         # The rings about A and B, of the gates' widths, cross at X in a rhombus; its angle is that of A and B seen
@@ -129,7 +140,9 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
         k += 1
     rows = np.array([row_a, row_b])
     reach_rad += gate_rad(gates, 0.0)
-    return Primary(rows, triad(a, b), midpoint, others, corner, gate, sigma, radius, area, reach_rad)
+    return Primary(
+        rows, triad(a, b), midpoint, others, corner, gate, sigma, radius, area, reach_rad
+    )
 
 
 @jit
@@ -142,7 +155,9 @@ def magnitude_cost(stars: SearchInput, observed: int, star: int) -> float:
 
 
 @jit
-def match_assumptions(stars: SearchInput, primary: Primary, pairs: NDArray) -> tuple[NDArray, Floats, Ints]:
+def match_assumptions(
+    stars: SearchInput, primary: Primary, pairs: NDArray
+) -> tuple[NDArray, Floats, Ints]:
     """Steps 3 to 7: every assumption from the catalog's (K, 2) pairs, in both orders.
 
     Returns for each assumption (N,) catalog rows of the observed stars (-1: none), the cost, and the number of matches
@@ -150,22 +165,28 @@ def match_assumptions(stars: SearchInput, primary: Primary, pairs: NDArray) -> t
     """
     a, b = primary.rows
     separation_rad = angle(stars.vectors_cam[a], stars.vectors_cam[b])
-    gate, count = gate_rad(stars.gates, separation_rad), 0
+    gate = gate_rad(stars.gates, separation_rad)
+    count = 0
     star = np.empty((2 * len(pairs), len(stars.vectors_cam)), np.int32)
-    cost, matches = np.empty(2 * len(pairs)), np.empty(2 * len(pairs), np.int64)
+    cost = np.empty(2 * len(pairs))
+    matches = np.empty(2 * len(pairs), np.int64)
     nearby = np.empty(len(stars.vectors), np.int64)
-    partner, partner_cost = np.empty(len(primary.others), np.int64), np.empty(len(primary.others))
+    partner = np.empty(len(primary.others), np.int64)
+    partner_cost = np.empty(len(primary.others))
     for p in range(len(pairs)):
         misfit = abs(angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad)
         if misfit > gate:
             continue
         for flip in range(2):
-            first, second = pairs[p, flip], pairs[p, 1 - flip]
-            cost_a, cost_b = magnitude_cost(stars, a, first), magnitude_cost(stars, b, second)
+            first = pairs[p, flip]
+            second = pairs[p, 1 - flip]
+            cost_a = magnitude_cost(stars, a, first)
+            cost_b = magnitude_cost(stars, b, second)
             if not np.isfinite(cost_a + cost_b):
                 continue
             star[count] = -1
-            star[count, a], star[count, b] = first, second
+            star[count, a] = first
+            star[count, b] = second
             total = (misfit / stars.gates.separation_rad) ** 2 + cost_a + cost_b
             _partners(stars, primary, first, second, nearby, partner, partner_cost)
             matches[count] = _remove_duplicates(partner, partner_cost)
@@ -207,22 +228,29 @@ def _partners(
         y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
         z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
         chord = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
-        partner[k], partner_cost[k] = -1, UNMATCHED_COST
+        partner[k] = -1
+        partner_cost[k] = UNMATCHED_COST
         least = np.inf
         for s in nearby[: within(stars.cells, stars.vectors, x, y, z, chord, nearby)]:
             if s in (first, second):
                 continue
             cost = magnitude_cost(stars, primary.others[k], s)
             misfit_a = abs(primary.corner_rad[0, k] - angle(stars.vectors[s], stars.vectors[first]))
-            misfit_b = abs(primary.corner_rad[1, k] - angle(stars.vectors[s], stars.vectors[second]))
+            misfit_b = abs(
+                primary.corner_rad[1, k] - angle(stars.vectors[s], stars.vectors[second])
+            )
             if misfit_a > primary.gate_rad[0, k] or misfit_b > primary.gate_rad[1, k]:
                 continue
             cost += (misfit_a**2 + misfit_b**2) / stars.gates.separation_rad**2
-            dx, dy, dz = stars.vectors[s, 0] - x, stars.vectors[s, 1] - y, stars.vectors[s, 2] - z
+            dx = stars.vectors[s, 0] - x
+            dy = stars.vectors[s, 1] - y
+            dz = stars.vectors[s, 2] - z
             # The position decides between several partners, but is not part of the assumption's cost.
             position_cost = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
             if cost + position_cost < least:
-                least, partner[k], partner_cost[k] = cost + position_cost, s, cost
+                least = cost + position_cost
+                partner[k] = s
+                partner_cost[k] = cost
 
 
 @jit
@@ -236,14 +264,17 @@ def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
         for m in range(k):
             if partner[m] == partner[k]:
                 loser = k if partner_cost[m] <= partner_cost[k] else m
-                partner[loser], partner_cost[loser] = -1, UNMATCHED_COST
+                partner[loser] = -1
+                partner_cost[loser] = UNMATCHED_COST
                 count -= 1
                 break
     return count
 
 
 @jit
-def add_contradictions(star: NDArray, cost: Floats, matches: NDArray, best: NDArray, contradictions: Floats) -> None:
+def add_contradictions(
+    star: NDArray, cost: Floats, matches: NDArray, best: NDArray, contradictions: Floats
+) -> None:
     """Accumulate the assumptions that identify an observed star differently from the best one.
 
     contradictions: (3,) their number, the sum of their matches and their least cost, updated in place

@@ -62,7 +62,9 @@ def angle_interval(angle_rad: float, cos_error: float) -> tuple[float, float]:
     return low, 2 * np.arcsin(np.sqrt(min(half + cos_error / 2, 1.0)))
 
 
-def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any) -> StarMatch | None:
+def shefex(
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+) -> StarMatch | None:
     """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
 
     vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
@@ -81,7 +83,9 @@ def shefex(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **option
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
-    parameters = SearchOptions(error, tolerance_rad, settings.max_triangles, settings.max_checks, base)
+    parameters = SearchOptions(
+        error, tolerance_rad, settings.max_triangles, settings.max_checks, base
+    )
     tried = np.zeros(3, np.int64)
     return to_star_match(search(np.ascontiguousarray(vectors_cam), index, parameters, tried))
 
@@ -102,11 +106,18 @@ def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArra
 
 
 @jit
-def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray) -> DirectMatch:
+def _triangle(
+    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+) -> DirectMatch:
     """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
     i, j, k = corners
-    ij, ik, jk = angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])
-    if min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad or max(ij, ik, jk) > index.max_angle_rad:
+    ij = angle(rays[i], rays[j])
+    ik = angle(rays[i], rays[k])
+    jk = angle(rays[j], rays[k])
+    if (
+        min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad
+        or max(ij, ik, jk) > index.max_angle_rad
+    ):
         return no_match()
     handedness = triple(rays[i], rays[j], rays[k])
     low, high = angle_interval(ij, options.cos_error)
@@ -121,7 +132,8 @@ def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchO
         if not low <= index.angle_rad[p] <= high:
             continue
         for flip in range(2):
-            a, b = index.pair[p, flip], index.pair[p, 1 - flip]
+            a = index.pair[p, flip]
+            b = index.pair[p, 1 - flip]
             place = first_neighbor(index, a, low_ik)
             while place < index.first[a + 1] and index.separation_rad[place] <= high_ik:
                 c = index.neighbor[place]
@@ -132,7 +144,9 @@ def _triangle(rays: Floats, index: PairIndex, corners: NDArray, options: SearchO
                 if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 tried[0] += 1
-                match = _match_others(rays, index, corners, np.array([a, b, c], np.int64), gates, options, tried)
+                match = _match_others(
+                    rays, index, corners, np.array([a, b, c], np.int64), gates, options, tried
+                )
                 if len(match.observed) and match.log10_chance <= options.accept:
                     return match
     return no_match()
@@ -144,7 +158,8 @@ def _angle_gates(rays: Floats, corners: NDArray, options: SearchOptions) -> Floa
 
     The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
     """
-    gates, side = np.zeros((len(rays), 10)), np.empty(3)
+    gates = np.zeros((len(rays), 10))
+    side = np.empty(3)
     for n in range(len(rays)):
         for m in range(3):
             side[m] = angle(rays[corners[m]], rays[n])
@@ -169,23 +184,29 @@ def _match_others(
 
     The second test rejects mirror images, which a slim base, or stars in line with it, cannot distinguish by angles.
     """
-    observed, star = np.empty(len(rays), np.int64), np.empty(len(rays), np.int64)
-    observed[:3], star[:3] = corners, stars
+    observed = np.empty(len(rays), np.int64)
+    star = np.empty(len(rays), np.int64)
+    observed[:3] = corners
+    star[:3] = stars
     count = 3
     for n in range(len(rays)):
         s = _partner(rays, index, corners, stars, n, gates[n], tried) if gates[n, 9] > 0 else -1
         if s >= 0 and not (star[:count] == s).any():
-            observed[count], star[count] = n, s
+            observed[count] = n
+            star[count] = s
             count += 1
     if count < MIN_MATCHES:
         return no_match()
-    observed, star = observed[:count], star[:count]
+    observed = observed[:count]
+    star = star[:count]
     R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
     is_near = np.empty(count, np.bool_)
     for n in range(count):
         predicted = R_cam_from_ref @ index.vectors[star[n]]
         is_near[n] = angle(predicted, rays[observed[n]]) <= 2 * options.tolerance_rad
-    observed, star, count = observed[is_near], star[is_near], is_near.sum()
+    observed = observed[is_near]
+    star = star[is_near]
+    count = is_near.sum()
     if count < MIN_MATCHES:
         return no_match()
     # Probability that a random direction falls into the gates of an observed star, from the local catalog density.
@@ -198,14 +219,21 @@ def _match_others(
 
 @jit
 def _partner(
-    rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, gate: Floats, tried: NDArray
+    rays: Floats,
+    index: PairIndex,
+    corners: NDArray,
+    stars: NDArray,
+    n: int,
+    gate: Floats,
+    tried: NDArray,
 ) -> int:
     """The catalog star whose three angles to the base fit those of observed star n, or -1.
 
     Of several, the one of the least sum of cosine differences. With a slim base three angles do not distinguish a
     position from its mirror image, so that the side of the base line is tested too.
     """
-    best, least = -1, np.inf
+    best = -1
+    least = np.inf
     place = first_neighbor(index, stars[0], gate[0])
     tried[1] += 3
     while place < index.first[stars[0] + 1] and index.separation_rad[place] <= gate[3]:
@@ -221,20 +249,27 @@ def _partner(
             fits = gate[m] <= side <= gate[3 + m]
             difference += abs(np.cos(side) - gate[6 + m])
         if fits and difference < least and _same_side(rays, index, corners, stars, n, d):
-            best, least = d, difference
+            best = d
+            least = difference
     return best
 
 
 @jit
-def _same_side(rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int) -> bool:
+def _same_side(
+    rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int
+) -> bool:
     """Whether observed star n and catalog star d are on the same side of the base line farthest from the star."""
-    best, product = 0.0, 1.0
+    best = 0.0
+    product = 1.0
     for m in range(3):
-        a, b = m, (m + 1) % 3
+        a = m
+        b = (m + 1) % 3
         volume = triple(rays[corners[a]], rays[corners[b]], rays[n])
         if abs(volume) > best:
             best = abs(volume)
-            product = volume * triple(index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d])
+            product = volume * triple(
+                index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d]
+            )
     return product > 0
 
 
@@ -247,7 +282,8 @@ def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floa
     """
     least = np.inf
     for m in range(3):
-        a, b = m, (m + 1) % 3
+        a = m
+        b = (m + 1) % 3
         volume = abs(triple(rays[corners[a]], rays[corners[b]], rays[n]))
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)

@@ -69,29 +69,49 @@ class FlatCentroids(NamedTuple):
 @jit
 def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float) -> Detections:
     """The detections of centroids. What the total error has above the noise is the same in all directions."""
-    count, (center_x, center_y), focal_px = len(lights.flux), sensor.center_px, sensor.focal_px
-    sigma, weight, mag = np.empty(count), np.empty((count, 3)), np.empty(count)
+    count = len(lights.flux)
+    focal_px = sensor.focal_px
+    (center_x, center_y) = sensor.center_px
+    sigma = np.empty(count)
+    weight = np.empty((count, 3))
+    mag = np.empty(count)
     for n in range(count):
         xx = yy = lights.sigma_px[n] ** 2
         xy = 0.0
         if len(lights.spread_px2):
             excess = xx - lights.own_px[n] ** 2
-            xx, yy = lights.spread_px2[n, 0, 0] + excess, lights.spread_px2[n, 1, 1] + excess
+            xx = lights.spread_px2[n, 0, 0] + excess
+            yy = lights.spread_px2[n, 1, 1] + excess
             xy = lights.spread_px2[n, 0, 1]
         # The greater eigenvalue of the covariance is the variance along the axis of the greatest error.
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
         scale = focal_px**2 / (xx * yy - xy * xy)
-        weight[n, 0], weight[n, 1], weight[n, 2] = yy * scale, xx * scale, -xy * scale
+        weight[n, 0] = yy * scale
+        weight[n, 1] = xx * scale
+        weight[n, 2] = -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
     tangent = undistorted(lights.xy_px, focal_px, center_x, center_y, sensor.distortion)
     limit_mag = mag[count // 2] if count else np.nan
-    return Detections(tangent, sigma, weight, mag, sensor.magnitude_sigma, sensor.field, focal_uncertainty, limit_mag)
+    return Detections(
+        tangent,
+        sigma,
+        weight,
+        mag,
+        sensor.magnitude_sigma,
+        sensor.field,
+        focal_uncertainty,
+        limit_mag,
+    )
 
 
 @jit
-def changed(detections: Detections, count: int, variance: float, focal_uncertainty: float) -> Detections:
+def changed(
+    detections: Detections, count: int, variance: float, focal_uncertainty: float
+) -> Detections:
     """The first `count` detections with their variances multiplied by a factor, and another focal uncertainty."""
-    sigma, weight, factor = np.empty(count), np.empty((count, 3)), sqrt(variance)
+    sigma = np.empty(count)
+    weight = np.empty((count, 3))
+    factor = sqrt(variance)
     for n in range(count):
         sigma[n] = detections.sigma[n] * factor
         for k in range(3):
@@ -125,7 +145,8 @@ def information_of(weight: Floats) -> Floats:
 @jit
 def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
     """Unit vector of detection n in camera axes, for a focal length `focal_ratio` times the assumed one."""
-    x, y = tangent[n, 0] / focal_ratio, tangent[n, 1] / focal_ratio
+    x = tangent[n, 0] / focal_ratio
+    y = tangent[n, 1] / focal_ratio
     inverse = 1 / sqrt(x * x + y * y + 1)
     return x * inverse, y * inverse, inverse
 

@@ -78,12 +78,15 @@ class Solution(NamedTuple):
 @jit
 def no_hypothesis() -> Hypothesis:
     """The empty hypothesis, with evidence -inf."""
-    R_cam_from_ref, info = np.zeros((3, 3)), np.zeros((4, 4))
+    R_cam_from_ref = np.zeros((3, 3))
+    info = np.zeros((4, 4))
     for n in range(4):
         info[n, n] = 1.0
         if n < 3:
             R_cam_from_ref[n, n] = 1.0
-    return Hypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_ref, 1.0, info, -np.inf)
+    return Hypothesis(
+        np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_ref, 1.0, info, -np.inf
+    )
 
 
 @jit
@@ -117,18 +120,24 @@ def evaluate(
     candidates before the full evaluation. A fit that has converged is not
     repeated, nor are its matches.
     """
-    R, info = R_cam_from_ref, np.zeros((4, 4))
-    max_sigma, fall = np.inf, np.inf
-    observed, star = np.empty(0, np.int64), np.empty(0, np.int64)
+    R = R_cam_from_ref
+    info = np.zeros((4, 4))
+    max_sigma = np.inf
+    fall = np.inf
+    observed = np.empty(0, np.int64)
+    star = np.empty(0, np.int64)
     for iteration in range(3):
         before = observed, star
         observed, star = _match(detections, sky, R, focal_ratio, gates, max_sigma)
-        gates, max_sigma = gates_of(detections, 1.0), GATE_SIGMA
+        gates = gates_of(detections, 1.0)
+        max_sigma = GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
         if iteration == 1 and min_dex > -np.inf:
             # `info` is that of the first fit; without the residuals the evidence is an upper bound.
-            upper_bound_dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, iteration > 1)
+            upper_bound_dex = _evidence(
+                detections, sky, R, focal_ratio, observed, star, info, iteration > 1
+            )
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
         if fall < CONVERGED_CHI2 and _equal(observed, before[0]) and _equal(star, before[1]):
@@ -139,7 +148,9 @@ def evaluate(
                 return no_hypothesis()
             if iteration == 1 and fall < CONVERGED_CHI2:
                 break
-    matched, with_residuals = len(observed), len(observed) > 0  # a literal True would be compiled as another type
+    # a literal True would be compiled as another type
+    matched = len(observed)
+    with_residuals = len(observed) > 0
     dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, with_residuals)
     if dex + counts_dex(matched, 0) < min_dex:
         return no_hypothesis()
@@ -158,17 +169,29 @@ def _equal(first: NDArray, second: NDArray) -> bool:
 
 @jit
 def _match(
-    detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, gates: Floats, max_sigma: float
+    detections: Detections,
+    sky: SkyIndex,
+    R: Floats,
+    focal_ratio: float,
+    gates: Floats,
+    max_sigma: float,
 ) -> tuple[NDArray, NDArray]:
     """Match each detection to its nearest star, within gates[n] rad and max_sigma standard deviations.
 
     If two detections match one star, the one with the smaller Mahalanobis distance keeps it. Returns the rows of the
     detections and of the stars.
     """
-    total, count = len(detections.sigma), 0
-    observed, star, distances2 = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total)
-    R_ref_from_cam, tangent, vectors_ref = R.T.copy(), detections.tangent, sky.vectors
-    cell_first, cell_star, side = sky.cell_first, sky.cell_star, sky.side
+    total = len(detections.sigma)
+    count = 0
+    observed = np.empty(total, np.int64)
+    star = np.empty(total, np.int64)
+    distances2 = np.empty(total)
+    R_ref_from_cam = R.T.copy()
+    tangent = detections.tangent
+    vectors_ref = sky.vectors
+    cell_first = sky.cell_first
+    cell_star = sky.cell_star
+    side = sky.side
     for n in range(total):
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
         s, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
@@ -184,16 +207,24 @@ def _match(
             count += 1
         elif distance2 >= distances2[slot]:
             continue
-        observed[slot], star[slot], distances2[slot] = n, s, distance2
+        observed[slot] = n
+        star[slot] = s
+        distances2[slot] = distance2
     return observed[:count], star[:count]
 
 
 @jit
 def count_near(
-    tangent: Floats, sky: SkyIndex, R_cam_from_ref: Floats, focal_ratio: float, observed: NDArray, gates: Floats
+    tangent: Floats,
+    sky: SkyIndex,
+    R_cam_from_ref: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    gates: Floats,
 ) -> int:
     """Number of detections beside those `observed` that have a star within their gate (N,), at most 0.05 rad."""
-    R_ref_from_cam, count = R_cam_from_ref.T.copy(), 0
+    R_ref_from_cam = R_cam_from_ref.T.copy()
+    count = 0
     matched = np.zeros(len(gates), np.bool_)
     for n in observed:
         matched[n] = True
@@ -201,7 +232,12 @@ def count_near(
         if matched[n]:
             continue
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        count += nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05))[0] >= 0
+        count += (
+            nearest(
+                sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05)
+            )[0]
+            >= 0
+        )
     return count
 
 
@@ -211,10 +247,15 @@ def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis
 
     The fall of chi-square by a step of the fit, and the posterior width of log focal_ratio over its prior width.
     """
-    info, R = np.zeros((4, 4)), hypothesis.R_cam_from_ref.copy()
-    _, fall = _fit(detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info)
+    info = np.zeros((4, 4))
+    R = hypothesis.R_cam_from_ref.copy()
+    _, fall = _fit(
+        detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info
+    )
     cholesky_solve(info, np.zeros(4))
-    return fall / 2 / log(10.0) + log10(sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty))
+    return fall / 2 / log(10.0) + log10(
+        sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty)
+    )
 
 
 @jit
@@ -257,16 +298,28 @@ def _fit(
     f = focal_ratio
     count = 4 if detections.focal_uncertainty > 0 else 3
     info[:] = 0.0
-    gradient, d_x, d_y = np.zeros(4), np.zeros(4), np.zeros(4)
-    tangent, weight, vectors_ref = detections.tangent, detections.weight, sky.vectors
+    gradient = np.zeros(4)
+    d_x = np.zeros(4)
+    d_y = np.zeros(4)
+    tangent = detections.tangent
+    weight = detections.weight
+    vectors_ref = sky.vectors
     for k in range(len(observed)):
         x, y, _ = project(vectors_ref, R, star[k])
-        d_x[0], d_x[1], d_x[2], d_x[3] = -f * x * y, f * (1 + x * x), -f * y, f * x
-        d_y[0], d_y[1], d_y[2], d_y[3] = -f * (1 + y * y), f * x * y, f * x, f * y
+        d_x[0] = -f * x * y
+        d_x[1] = f * (1 + x * x)
+        d_x[2] = -f * y
+        d_x[3] = f * x
+        d_y[0] = -f * (1 + y * y)
+        d_y[1] = f * x * y
+        d_y[2] = f * x
+        d_y[3] = f * y
         xx, yy, xy = vectors.row(weight, observed[k])
-        residual_x, residual_y = tangent[observed[k], 0] - f * x, tangent[observed[k], 1] - f * y
+        residual_x = tangent[observed[k], 0] - f * x
+        residual_y = tangent[observed[k], 1] - f * y
         for i in range(count):
-            weighted_x, weighted_y = d_x[i] * xx + d_y[i] * xy, d_x[i] * xy + d_y[i] * yy
+            weighted_x = d_x[i] * xx + d_y[i] * xy
+            weighted_y = d_x[i] * xy + d_y[i] * yy
             gradient[i] += weighted_x * residual_x + weighted_y * residual_y
             for j in range(i + 1):
                 info[i, j] += weighted_x * d_x[j] + weighted_y * d_y[j]
@@ -299,14 +352,17 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
 
 
 @jit
-def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray) -> int:
+def _count_missing(
+    detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray
+) -> int:
     """Number of missing stars: well inside the field, not matched, and bright enough to be detected.
 
     Bright enough are stars as bright as the faintest matched one, and those to `detections.limit_mag`, if it is known.
     """
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
-    matched, faintest = 0, np.int64(0)
+    matched = 0
+    faintest = np.int64(0)
     if np.isfinite(detections.limit_mag):
         faintest = first_from(sky.mag, 0, len(sky.mag), detections.limit_mag) - 1
     for s in star:
@@ -322,10 +378,15 @@ def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int
     left, right, top, bottom = field
     # Chord of the angle from the boresight to the farthest corner.
     corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
-    chord, (bx, by, bz) = sqrt(2 - 2 / sqrt(1 + corner2)), vectors.row(R, 2)
-    side, first, row = sky.cells.side, sky.cells.first, sky.cells.row
-    vectors_ref, inside = sky.vectors, 0
-    low, high = edge_cell(bz - chord, side), edge_cell(bz + chord, side) + 1
+    chord = sqrt(2 - 2 / sqrt(1 + corner2))
+    (bx, by, bz) = vectors.row(R, 2)
+    side = sky.cells.side
+    first = sky.cells.first
+    row = sky.cells.row
+    vectors_ref = sky.vectors
+    inside = 0
+    low = edge_cell(bz - chord, side)
+    high = edge_cell(bz + chord, side) + 1
     for i in range(edge_cell(bx - chord, side), edge_cell(bx + chord, side) + 1):
         for j in range(edge_cell(by - chord, side), edge_cell(by + chord, side) + 1):
             column = (i * side + j) * side
@@ -362,7 +423,8 @@ def _evidence(
     total = 0.5 * count * log10(2 * pi) - prior_volume_dex(detections)
     for i in range(count):  # the product of the Cholesky factor's diagonal is sqrt(det info)
         total -= log10(factor[i, i])
-    fraction_brighter, last = _fraction_brighter(sky, detections.mag), np.int64(0)
+    fraction_brighter = _fraction_brighter(sky, detections.mag)
+    last = np.int64(0)
     for k in range(len(observed)):
         # Every number of false detections is equally probable a priori, so that n of them against n - m contribute the
         # ratio n! / (n - m)!: the density drops by one detection per match.
@@ -401,7 +463,11 @@ def _magnitude_ratio(
     if not np.isfinite(difference):
         return 1.0
     relative_density = magnitude_density(sky, detections.mag[detection]) / fraction_brighter
-    likelihood = np.exp(-0.5 * (difference / detections.mag_sigma) ** 2) / detections.mag_sigma / sqrt(2 * pi)
+    likelihood = (
+        np.exp(-0.5 * (difference / detections.mag_sigma) ** 2)
+        / detections.mag_sigma
+        / sqrt(2 * pi)
+    )
     return MAG_OUTLIER_FRACTION + (1 - MAG_OUTLIER_FRACTION) * likelihood / relative_density
 
 
@@ -411,7 +477,10 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
 
     The covariance is marginalized over the focal ratio if the focal length is uncertain.
     """
-    covariance, total, chi2, count = np.zeros((3, 3)), 0.0, 0.0, 4 if detections.focal_uncertainty > 0 else 3
+    covariance = np.zeros((3, 3))
+    total = 0.0
+    chi2 = 0.0
+    count = 4 if detections.focal_uncertainty > 0 else 3
     for axis in range(3):
         unit = np.zeros(count)
         unit[axis] = 1.0
@@ -419,16 +488,25 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         for k in range(3):
             covariance[axis, k] = column[k]
     for k in range(len(hypothesis.star)):
-        observed, star = hypothesis.observed[k], hypothesis.star[k]
+        observed = hypothesis.observed[k]
+        star = hypothesis.star[k]
         chi2 += squared_mahalanobis(
             detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
         )
         x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, hypothesis.star[k])
-        tx, ty = detections.tangent[hypothesis.observed[k], 0], detections.tangent[hypothesis.observed[k], 1]
+        tx = detections.tangent[hypothesis.observed[k], 0]
+        ty = detections.tangent[hypothesis.observed[k], 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)
     xyzw = vectors.quaternion_xyzw(hypothesis.R_cam_from_ref)
     return Solution(
-        hypothesis.observed, hypothesis.star, xyzw, covariance, hypothesis.focal_ratio, rms, chi2, hypothesis.dex
+        hypothesis.observed,
+        hypothesis.star,
+        xyzw,
+        covariance,
+        hypothesis.focal_ratio,
+        rms,
+        chi2,
+        hypothesis.dex,
     )

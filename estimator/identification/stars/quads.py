@@ -43,18 +43,24 @@ def identify(
     searched = changed(detections, count, 1.0, detections.focal_uncertainty)
     best = _search(searched, quads, stars, max_checks)
     # The last argument matters for a calibrated camera only. A literal False would be compiled as another type.
-    return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX, calibrated, not calibrated)
+    return search.fit_to_all(
+        detections, stars, best, search.DECISIVE_DEX, calibrated, not calibrated
+    )
 
 
 @jit
 def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """The first hypothesis of the quads with DECISIVE_DEX, else the empty one."""
-    quad, checks = np.empty(4, np.int64), np.zeros(1, np.int64)
+    quad = np.empty(4, np.int64)
+    checks = np.zeros(1, np.int64)
     for d in range(3, min(len(detections.sigma), COMBINED)):
         for c in range(2, d):
             for b in range(1, c):
                 for a in range(b):
-                    quad[0], quad[1], quad[2], quad[3] = a, b, c, d
+                    quad[0] = a
+                    quad[1] = b
+                    quad[2] = c
+                    quad[3] = d
                     candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= search.DECISIVE_DEX:
                         return candidate
@@ -64,27 +70,31 @@ def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks:
 
 
 @jit
-def _test_quad(detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints) -> Hypothesis:
+def _test_quad(
+    detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
+) -> Hypothesis:
     """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
 
     checks : (1,) effort so far, increased in place
     """
     _longest_first(detections.tangent, quad)
-    a, b = quad[0], quad[1]
-    ray_a, ray_b = ray(detections.tangent, a, 1.0), ray(detections.tangent, b, 1.0)
+    a = quad[0]
+    b = quad[1]
+    ray_a = ray(detections.tangent, a, 1.0)
+    ray_b = ray(detections.tangent, b, 1.0)
     length = vectors.chord(ray_a, ray_b)
-    code, frame = np.empty(4), np.empty((3, 3))
+    code = np.empty(4)
+    frame = np.empty((3, 3))
     vectors.pair_frame(ray_a, ray_b, frame)
     code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
     code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
     quad_index.arrange(code, quad)
     gate = _code_gate(detections, quad, length)
-    low, high = np.empty(4, np.int64), np.empty(4, np.int64)
+    low = np.empty(4, np.int64)
+    high = np.empty(4, np.int64)
     for axis in range(4):
-        low[axis], high[axis] = (
-            quad_index.code_cell(code[axis] - gate, axis),
-            quad_index.code_cell(code[axis] + gate, axis),
-        )
+        low[axis] = quad_index.code_cell(code[axis] - gate, axis)
+        high[axis] = quad_index.code_cell(code[axis] + gate, axis)
     for i in range(low[0], high[0] + 1):
         for j in range(low[1], high[1] + 1):
             for k in range(low[2], high[2] + 1):
@@ -112,12 +122,16 @@ def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
 @jit
 def _longest_first(tangent: Floats, quad: Ints) -> None:
     """Reorder four detections in place, so that the first two are the ones farthest apart."""
-    longest, first, second = -1.0, 0, 1
+    longest = -1.0
+    first = 0
+    second = 1
     for m in range(4):
         for k in range(m):
             length = vectors.chord(ray(tangent, quad[k], 1.0), ray(tangent, quad[m], 1.0))
             if length > longest:
-                longest, first, second = length, k, m
+                longest = length
+                first = k
+                second = m
     quad[0], quad[first] = quad[first], quad[0]
     second = first if second == 0 else second
     quad[1], quad[second] = quad[second], quad[1]
@@ -131,7 +145,8 @@ def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
     is wrong by the fraction u changes small angles by (1 - u) (1 + 2 u sin^2 a) along the radius and by
     (1 - u) (1 + u sin^2 a) across it: ratios differ by up to 2 u sin^2 a of the outermost star.
     """
-    sigma, r2 = 0.0, 0.0
+    sigma = 0.0
+    r2 = 0.0
     for n in quad:
         sigma = max(sigma, detections.sigma[n])
         r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
@@ -144,12 +159,17 @@ def _test_match(
     detections: Detections, sky: SkyIndex, quad: Ints, star: Ints, length: float, checks: Ints
 ) -> Hypothesis:
     """The hypothesis that four detections are four stars, if a quick check and the evidence confirm it."""
-    tangent, a, b = detections.tangent, quad[0], quad[1]
-    star_a, star_b = vectors.row(sky.vectors, star[0]), vectors.row(sky.vectors, star[1])
+    tangent = detections.tangent
+    a = quad[0]
+    b = quad[1]
+    star_a = vectors.row(sky.vectors, star[0])
+    star_b = vectors.row(sky.vectors, star[1])
     ratio = search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
     if abs(ratio - 1) > detections.focal_uncertainty:
         return no_hypothesis()
-    in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    in_cam = np.empty((3, 3))
+    in_ref = np.empty((3, 3))
+    R_ref_from_cam = np.empty((3, 3))
     vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)

@@ -48,11 +48,16 @@ DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for ri
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
 NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
 # Extra effort for finding rivals of an accepted attitude: multiple of the effort so far, plus a number of look-ups.
-RIVAL_EFFORT, MIN_RIVAL_EFFORT = 2, 2000
+RIVAL_EFFORT = 2
+MIN_RIVAL_EFFORT = 2000
 MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
-EVALUATION_COST = 6  # of one evaluation in units of one star look-up, so that frames without a solution end
+EVALUATION_COST = (
+    6  # of one evaluation in units of one star look-up, so that frames without a solution end
+)
 FEW = 20  # number of detections of the first search
-SHORT_EFFORT, MANY_EFFORT = 1 / 16, 1 / 4  # fractions of the effort: of the first search at first, and of the second
+# fractions of the effort: of the first search at first, and of the second
+SHORT_EFFORT = 1 / 16
+MANY_EFFORT = 1 / 4
 WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that is found
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
 FREE_DEX = 1.0  # gain of a free focal length with the same matches below which the field is not matched with it
@@ -60,7 +65,9 @@ MAX_MISSES = 4  # detections without a star after which the first round drops a 
 
 
 @jit
-def lost_in_space(detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int) -> Solution:
+def lost_in_space(
+    detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int
+) -> Solution:
     """Identify the detections and solve the attitude.
 
     The search uses the FEW brightest detections and, if it fails, the `max_detections` brightest, with the pairs of
@@ -71,10 +78,13 @@ def lost_in_space(detections: Detections, stars: SkyIndex, max_detections: int, 
     chance, or if the full field keeps no more than half of its matches.
     max_checks : bound on the effort (see `search`)
     """
-    few, many = min(FEW, max_detections, len(detections.sigma)), min(max_detections, len(detections.sigma))
+    few = min(FEW, max_detections, len(detections.sigma))
+    many = min(max_detections, len(detections.sigma))
     if many == few:
         accept_dex = ACCEPT_DEX
-        candidate = search(changed(detections, few, 1.0, detections.focal_uncertainty), stars, max_checks)
+        candidate = search(
+            changed(detections, few, 1.0, detections.focal_uncertainty), stars, max_checks
+        )
     else:
         accept_dex = ACCEPT_DEX + log10(2.0)
         for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
@@ -83,13 +93,20 @@ def lost_in_space(detections: Detections, stars: SkyIndex, max_detections: int, 
             if candidate.dex >= accept_dex:
                 break
     calibrated = detections.focal_uncertainty == 0
-    free = changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL) if calibrated else detections
+    free = (
+        changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL) if calibrated else detections
+    )
     return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == len(detections.sigma))
 
 
 @jit
 def fit_to_all(
-    detections: Detections, stars: SkyIndex, candidate: Hypothesis, accept_dex: float, calibrated: bool, whole: bool
+    detections: Detections,
+    stars: SkyIndex,
+    candidate: Hypothesis,
+    accept_dex: float,
+    calibrated: bool,
+    whole: bool,
 ) -> Solution:
     """Fit a candidate of some detections to all of them and all stars.
 
@@ -100,9 +117,13 @@ def fit_to_all(
     detections : with the focal uncertainty of the free fit
     whole : whether the candidate is the calibrated fit to all detections already
     """
-    chosen, full, gates = detections, no_hypothesis(), gates_of(detections, 1.5)
-    R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
-    found, free = candidate.dex >= accept_dex, True
+    chosen = detections
+    full = no_hypothesis()
+    gates = gates_of(detections, 1.5)
+    R = candidate.R_cam_from_ref
+    ratio = candidate.focal_ratio
+    found = candidate.dex >= accept_dex
+    free = True
     if found and calibrated:
         chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
         full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
@@ -111,11 +132,14 @@ def fit_to_all(
     if found and free:
         fitted = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
         if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
-            chosen, full = detections, fitted
+            chosen = detections
+            full = fitted
     if not found or 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
         return build_solution(chosen, stars, no_hypothesis())
     dex = max(full.dex, candidate.dex)
-    best = Hypothesis(full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex)
+    best = Hypothesis(
+        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
+    )
     return build_solution(chosen, stars, best)
 
 
@@ -133,15 +157,21 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     """
     total = len(detections.sigma)
-    length, rarity = _pair_lengths(detections), _rarity(detections, sky)
-    best, rival_dex, checks, limit = no_hypothesis(), -np.inf, np.zeros(1, np.int64), max_checks
+    length = _pair_lengths(detections)
+    rarity = _rarity(detections, sky)
+    best = no_hypothesis()
+    rival_dex = -np.inf
+    checks = np.zeros(1, np.int64)
+    limit = max_checks
     for max_misses in (MAX_MISSES, total):
         tried = np.zeros((total, total), np.bool_)
         cost = rarity.copy()
         for attempt in range(total * (total - 1) // 2):
             a, b = _next_pair(length, tried, cost)
             tried[a, b] = True
-            candidate = _test_pair(detections, sky, a, b, attempt * MAX_MISSES, max_misses, best, checks)
+            candidate = _test_pair(
+                detections, sky, a, b, attempt * MAX_MISSES, max_misses, best, checks
+            )
             same = _same_attitude(candidate, best)
             if candidate.dex > best.dex:
                 # The previous best becomes a rival unless it is the same attitude.
@@ -159,7 +189,9 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
                 break
         if checks[0] > limit or total - 2 <= MAX_MISSES:
             break
-    return best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
+    return (
+        best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
+    )
 
 
 @jit
@@ -175,13 +207,18 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 @jit
 def _pair_lengths(detections: Detections) -> Floats:
     """(N, N) length in tangents of every pair a < b; pairs too short to determine the roll count as very long."""
-    total, field = len(detections.sigma), detections.field
+    total = len(detections.sigma)
+    field = detections.field
     min_length = SHORT_PAIR * sqrt((field[1] - field[0]) * (field[3] - field[2]))
     out = np.empty((total, total))
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
-            out[a, b] = length if length >= min_length else 1e3 * min_length * min_length / max(length, 1e-9)
+            out[a, b] = (
+                length
+                if length >= min_length
+                else 1e3 * min_length * min_length / max(length, 1e-9)
+            )
     return out
 
 
@@ -199,12 +236,16 @@ def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
 @jit
 def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int]:
     """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b]."""
-    best, best_a, best_b = np.inf, 0, 1
+    best = np.inf
+    best_a = 0
+    best_b = 1
     for a in range(len(weight)):
         for b in range(a + 1, len(weight)):
             cost = length[a, b] * weight[a] * weight[b]
             if cost < best and not tried[a, b]:
-                best, best_a, best_b = cost, a, b
+                best = cost
+                best_a = a
+                best_b = b
     return best_a, best_b
 
 
@@ -226,22 +267,32 @@ def _test_pair(
     checks : (1,) effort so far, increased in place
     """
     gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
-    in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    best, focal_ratio = no_hypothesis(), 1.0
+    in_cam = np.empty((3, 3))
+    in_ref = np.empty((3, 3))
+    R_ref_from_cam = np.empty((3, 3))
+    best = no_hypothesis()
+    focal_ratio = 1.0
     begin, end, chord, gate = _pair_range(detections, sky, a, b)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
-    tangent, focal_uncertainty = detections.tangent, detections.focal_uncertainty
-    pair, star, mag, grid = sky.pair, sky.vectors, sky.mag, (sky.cell_first, sky.cell_star, sky.side)
+    tangent = detections.tangent
+    focal_uncertainty = detections.focal_uncertainty
+    pair = sky.pair
+    star = sky.vectors
+    mag = sky.mag
+    grid = (sky.cell_first, sky.cell_star, sky.side)
     vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
-    mag_a, mag_b = detections.mag[a], detections.mag[b]
+    mag_a = detections.mag[a]
+    mag_b = detections.mag[b]
     mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
     for p in range(begin, end):
-        i, j = pair[p, 0], pair[p, 1]
+        i = pair[p, 0]
+        j = pair[p, 1]
         forward = _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
         backward = _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
         if not (forward or backward):
             continue
-        star_i, star_j = vectors.row(star, i), vectors.row(star, j)
+        star_i = vectors.row(star, i)
+        star_j = vectors.row(star, j)
         catalog_chord = vectors.chord(star_i, star_j)
         if focal_uncertainty > 0:
             focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
@@ -259,12 +310,22 @@ def _test_pair(
                 continue
             vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
             lookups, fits = quick_check(
-                tangent, star, *grid, R_ref_from_cam, focal_ratio, gates, order, required, max_misses
+                tangent,
+                star,
+                *grid,
+                R_ref_from_cam,
+                focal_ratio,
+                gates,
+                order,
+                required,
+                max_misses,
             )
             checks[0] += 1 + lookups
             if fits:
                 checks[0] += EVALUATION_COST
-                candidate = evaluate(detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX)
+                candidate = evaluate(
+                    detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX
+                )
                 if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
                     return candidate
                 best = candidate if candidate.dex > best.dex else best
@@ -272,14 +333,21 @@ def _test_pair(
 
 
 @jit
-def trial(detections: Detections, a: int, b: int, start: int, min_dex: float) -> tuple[Floats, NDArray[np.int64], int]:
+def trial(
+    detections: Detections, a: int, b: int, start: int, min_dex: float
+) -> tuple[Floats, NDArray[np.int64], int]:
     """What a quick check of an attitude by two detections takes: gates, the other detections, and matches required.
 
     start : the other detections are looked up from this one on;  min_dex : least evidence of interest
     """
-    gates, order = pair_gates(detections, a, b), other_detections(len(detections.sigma), a, b, start)
+    gates = pair_gates(detections, a, b)
+    order = other_detections(len(detections.sigma), a, b, start)
     pair_dex = attitude_dex(detections, a, b)
-    return gates, order, required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
+    return (
+        gates,
+        order,
+        required_matches(detections.sigma, field_area(detections), pair_dex, min_dex),
+    )
 
 
 @jit
@@ -289,7 +357,9 @@ def _alike(difference_a: float, difference_b: float, gate: float) -> bool:
 
 
 @jit
-def _pair_range(detections: Detections, sky: SkyIndex, a: int, b: int) -> tuple[int, int, float, float]:
+def _pair_range(
+    detections: Detections, sky: SkyIndex, a: int, b: int
+) -> tuple[int, int, float, float]:
     """Half-open range of catalog pairs that two detections may be; their chord, and the gate of their angle, rad."""
     chord = vectors.chord(ray(detections.tangent, a, 1.0), ray(detections.tangent, b, 1.0))
     gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
@@ -303,7 +373,8 @@ def _pair_range(detections: Detections, sky: SkyIndex, a: int, b: int) -> tuple[
 @jit
 def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
     """(N - 2,) all detections but a and b, from number `start` on and around."""
-    out, count = np.empty(total, np.int64), 0
+    out = np.empty(total, np.int64)
+    count = 0
     for step in range(total):
         n = (start + step) % total
         if n not in (a, b):
@@ -317,7 +388,9 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float
     """The focal ratio at which the chord between two detections is `target`, by two fixed-point iterations."""
     focal_ratio = chord / target
     for _ in range(2):
-        focal_ratio *= vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
+        focal_ratio *= (
+            vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
+        )
     return focal_ratio
 
 
@@ -335,7 +408,9 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     out = np.empty(len(detections.sigma))
     for n in range(len(out)):
         distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
-        out[n] = GATE_SIGMA * sqrt(detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2)
+        out[n] = GATE_SIGMA * sqrt(
+            detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
+        )
     return out
 
 
@@ -373,12 +448,15 @@ def quick_check(
     The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
     `max_misses` detections without any match.
     """
-    count, remaining = 2, len(order)
+    count = 2
+    remaining = len(order)
     for step in range(remaining):
         if count + remaining - step < required or (step >= max_misses and count == 2):
             return step, False
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, order[step], focal_ratio))
-        count += nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[order[step]])[0] >= 0
+        count += (
+            nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[order[step]])[0] >= 0
+        )
         if count >= required:
             return step + 1, True
     return remaining, False

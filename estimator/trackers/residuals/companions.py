@@ -35,14 +35,17 @@ def are_small(sigma_rad: Floats) -> bool:
     return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
 
 
-def with_companions(solution: Solution, detections: Detections, sky: SkyIndex) -> tuple[Solution, Detections]:
+def with_companions(
+    solution: Solution, detections: Detections, sky: SkyIndex
+) -> tuple[Solution, Detections]:
     """The solution and its detections, with the errors of the stars whose residuals tell of a companion.
 
     Unchanged where every centroid's own error is greater than any companion's.
     """
     if len(solution.star) < MIN_STARS or are_small(detections.sigma):
         return solution, detections
-    best, changed = solution, detections
+    best = solution
+    changed = detections
     for _ in range(ROUNDS):
         seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
         view = geometry(seen, seen)
@@ -51,21 +54,27 @@ def with_companions(solution: Solution, detections: Detections, sky: SkyIndex) -
         alone, spread = prediction_by_others(residual, view.jacobian, used)
         mean = mean_information(own, alone, spread)
         before = changed.weight[best.observed]
-        weight, sigma = detections.weight.copy(), detections.sigma.copy()
+        weight = detections.weight.copy()
+        sigma = detections.sigma.copy()
         weight[best.observed] = mean[:, [0, 1, 0], [0, 1, 1]]
         sigma[best.observed] = 1 / np.sqrt(np.linalg.eigvalsh(mean)[:, 0])
         if np.min(weight[best.observed][:, :2] / before[:, :2]) > CHANGED:
             break
         tried = detections._replace(weight=weight, sigma=sigma)
         R_cam_from_ref = Rotation.from_quat(best.cam_from_ref_xyzw).as_matrix()
-        found = evidence.evaluate(tried, sky, R_cam_from_ref, best.focal_ratio, GATE_SIGMA * sigma, -np.inf)
+        found = evidence.evaluate(
+            tried, sky, R_cam_from_ref, best.focal_ratio, GATE_SIGMA * sigma, -np.inf
+        )
         if len(found.star) < len(best.star):
             break
-        best, changed = evidence.build_solution(tried, sky, found), tried
+        best = evidence.build_solution(tried, sky, found)
+        changed = tried
     return best, changed
 
 
-def prediction_by_others(residual: Floats, jacobian: Floats, information: Floats) -> tuple[Floats, Floats]:
+def prediction_by_others(
+    residual: Floats, jacobian: Floats, information: Floats
+) -> tuple[Floats, Floats]:
     """(K, 2) residuals of stars from the attitude of all others, and (K, 2, 2) the covariances of what these predict.
 
     residual, jacobian, information : (K, 2), (K, 2, 3) and (K, 2, 2) of the attitude that fits them all
@@ -95,4 +104,6 @@ def mean_information(information: Floats, residual: Floats, spread: Floats) -> F
     log_density = np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)
-    return np.asarray(np.einsum("jk,jkim->kim", probability, np.linalg.inv(covariance)), dtype=float)
+    return np.asarray(
+        np.einsum("jk,jkim->kim", probability, np.linalg.inv(covariance)), dtype=float
+    )

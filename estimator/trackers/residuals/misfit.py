@@ -39,9 +39,13 @@ from estimator.identification.stars.evidence import Solution
 TELLING = 1.5  # variance factor above which matches and lens are tried anew
 DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried, also where every centroid is matched
 TRIED = 2.0 ** np.arange(7)  # factors of the variances
-PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))  # of each, beside the claimed errors
+PRIOR_WRONG_DEX = log10(
+    (1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1)
+)  # of each, beside the claimed errors
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
-FOCAL_PRIOR, CORNER_PRIOR = 0.01, 0.01  # standard deviations: relative focal length, distortion at the corner
+# standard deviations: relative focal length, distortion at the corner
+FOCAL_PRIOR = 0.01
+CORNER_PRIOR = 0.01
 LENS_ROUNDS = 4
 SHEAR_CHANCE = 1e-4  # probability of random residuals that look sheared
 
@@ -63,16 +67,28 @@ def widened(
     """
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
-    if evidence.count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates) == 0:
+    if (
+        evidence.count_near(
+            detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
+        )
+        == 0
+    ):
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
-    best, chosen, best_dex, dex = solution, 0, solution.dex, np.empty(len(TRIED))
+    best = solution
+    chosen = 0
+    best_dex = solution.dex
+    dex = np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
         wide = changed(detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty)
-        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf)
+        found = evidence.evaluate(
+            wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf
+        )
         dex[n] = found.dex + PRIOR_WRONG_DEX
         if dex[n] > best_dex:
-            best, chosen, best_dex = evidence.build_solution(wide, sky, found), n, dex[n]
+            best = evidence.build_solution(wide, sky, found)
+            chosen = n
+            best_dex = dex[n]
     variance = _mean_factor(dex, best_dex)
     return with_errors(best, variance / TRIED[chosen], best.chi2, best.dex), variance
 
@@ -95,10 +111,14 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     With n matches, p parameters and the variances times v, chi-square is divided by v, the density of each match by v,
     and the posterior's volume is multiplied by v^(p/2).
     """
-    count, dex, best = len(solution.star), np.empty(len(TRIED)), 0
+    count = len(solution.star)
+    dex = np.empty(len(TRIED))
+    best = 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
     for n in range(len(TRIED)):
-        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(TRIED[n])
+        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(
+            TRIED[n]
+        )
         dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
         best = n if dex[n] > dex[best] else best
     variance = _mean_factor(dex, dex[best])
@@ -191,7 +211,12 @@ def refit(
 
 
 def with_lens(
-    solution: Solution, detections: Detections, sky: SkyIndex, camera: Camera, xy_px: Floats, variance: float
+    solution: Solution,
+    detections: Detections,
+    sky: SkyIndex,
+    camera: Camera,
+    xy_px: Floats,
+    variance: float,
 ) -> Refit:
     """Fit attitude, focal length and the first radial distortion coefficient to the matches of a solution.
 
@@ -199,32 +224,42 @@ def with_lens(
     length, and by |t|^2 t with the coefficient. Both have normal priors about the calibration. Each round drops matches
     beyond GATE_SIGMA of the errors that the last one found. The covariance is that of the attitude, whatever the lens.
     """
-    cam_from_ref, keep = Rotation.from_quat(solution.cam_from_ref_xyzw), np.ones(len(solution.star), bool)
+    cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+    keep = np.ones(len(solution.star), bool)
     information = information_of(detections.weight[solution.observed])
     whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
-    vectors_ref, xy_px = sky.vectors[solution.star], xy_px[solution.observed]
+    vectors_ref = sky.vectors[solution.star]
+    xy_px = xy_px[solution.observed]
     corner2 = float(np.sum(np.square(detections.field[[0, 2]])))
     prior = np.diag([0.0, 0.0, 0.0, 1 / FOCAL_PRIOR**2, (corner2 / CORNER_PRIOR) ** 2])
-    lens, change = camera, np.zeros(5)
+    lens = camera
+    change = np.zeros(5)
     for _ in range(LENS_ROUNDS):
         seen = cam_from_ref.apply(vectors_ref)
         view = geometry(seen, seen)
         radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
-        slopes = whiten @ np.concatenate([view.jacobian, view.tangent[:, :, None], radial[:, :, None]], axis=2)
+        slopes = whiten @ np.concatenate(
+            [view.jacobian, view.tangent[:, :, None], radial[:, :, None]], axis=2
+        )
         residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
-        kept, count = slopes[keep].reshape(-1, 5), int(keep.sum())
+        kept = slopes[keep].reshape(-1, 5)
+        count = int(keep.sum())
         normal = kept.T @ kept / variance + prior
         step = np.linalg.solve(normal, kept.T @ residual[keep].ravel() / variance - prior @ change)
         change[3:] += step[3:]
-        cam_from_ref, lens = Rotation.from_rotvec(step[:3]) * cam_from_ref, _lens_of(camera, *change[3:])
+        cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
+        lens = _lens_of(camera, *change[3:])
         distance2 = np.sum((residual - slopes @ step) ** 2, axis=1)
         chi2 = float(distance2[keep].sum())
         found = variance_factor(chi2, 2 * count - 5)
         near = distance2 <= GATE_SIGMA**2 * found
         if near.sum() < LENS_MATCHES:
             break
-        keep, variance = near, found
-    sheared = _is_sheared(whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep])
+        keep = near
+        variance = found
+    sheared = _is_sheared(
+        whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep]
+    )
     left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
     fitted = solution._replace(
         observed=solution.observed[keep],

@@ -58,8 +58,12 @@ class FieldMatcher:
         focal_uncertainty: float,
         patterns: int,
     ) -> None:
-        self.camera, self.stars, self.sky, self.settings = camera, stars, sky, settings
-        self.focal_uncertainty, self.patterns = focal_uncertainty, patterns
+        self.camera = camera
+        self.stars = stars
+        self.sky = sky
+        self.settings = settings
+        self.focal_uncertainty = focal_uncertainty
+        self.patterns = patterns
         self.tree = cKDTree(stars.vectors)
 
     @property
@@ -79,12 +83,15 @@ class FieldMatcher:
             observed, star = self.nearest(centroids, camera, cam_from_ref, radius_px)
             if len(observed) < MIN_MATCHES:
                 return Attitude(NO_MATCH)
-            xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
+            xy = centroids.xy_px[observed]
+            vectors = self.stars.vectors[star]
             if fit_lens:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
             rays = camera.rays(xy)
             focal_rad = focal_error_px(camera, xy) / camera.focal_px
-            sigma_rad = np.hypot(direction_sigma_rad(centroids.take(observed), camera, self.settings), focal_rad)
+            sigma_rad = np.hypot(
+                direction_sigma_rad(centroids.take(observed), camera, self.settings), focal_rad
+            )
             try:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
             except ValueError as error:
@@ -106,19 +113,28 @@ class FieldMatcher:
         seen_cam = cam_from_ref.apply(vectors)
         residual_px = camera.pixels(seen_cam) - xy
         rms_px = float(np.sqrt(np.mean(residual_px**2)))
-        residual, parameters = residual_px / (camera.focal_px * sigma_rad)[:, None], 5 if fit_lens else 3
+        residual = residual_px / (camera.focal_px * sigma_rad)[:, None]
+        parameters = 5 if fit_lens else 3
         sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual, parameters))
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy, seen_cam, sigma_rad)
+        covariance_rad2, common_rad2 = with_focal_error(
+            covariance_rad2, camera, xy, seen_cam, sigma_rad
+        )
         match = StarMatch(observed, star, cam_from_ref, chance)
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Rows and pixels of the catalog stars on the sensor, brightest first."""
         boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        rows = np.array(self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int)
+        rows = np.array(
+            self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int
+        )
         rows.sort()
-        xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
+        xy = (
+            camera.pixels(cam_from_ref.apply(self.stars.vectors[rows]))
+            if len(rows)
+            else np.empty((0, 2))
+        )
         inside = camera.contains(xy, -2.0)
         return rows[inside], xy[inside]
 
@@ -143,16 +159,20 @@ class FieldMatcher:
         The residuals have their expected size, they have no part q = r^3 - c r by a radial distortion (c makes q
         orthogonal to r, which a focal length explains), and no more stars than by chance are near other detections.
         """
-        count, observed = len(solution.star), solution.observed
+        count = len(solution.star)
+        observed = solution.observed
         if solution.chi2 > 1 + 1 / np.sqrt(count):
             return False
-        camera, cam_from_ref = self.camera.zoomed(solution.focal_ratio), Rotation.from_quat(solution.cam_from_ref_xyzw)
+        camera = self.camera.zoomed(solution.focal_ratio)
+        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         xy_px = centroids.xy_px[observed]
         residual_px = xy_px - camera.pixels(cam_from_ref.apply(self.stars.vectors[solution.star]))
         offset = (xy_px - camera.center_px) / camera.focal_px
         r2 = np.sum(offset**2, axis=1)
         q = r2 - np.sum(r2**2) / np.sum(r2)  # over r
-        score = np.sum(q * np.sum(offset * residual_px, axis=1)) / np.sqrt(np.sum(q**2 * r2 * sigma_px[observed] ** 2))
+        score = np.sum(q * np.sum(offset * residual_px, axis=1)) / np.sqrt(
+            np.sum(q**2 * r2 * sigma_px[observed] ** 2)
+        )
         if abs(score) > MAX_DISTORTION_SIGMA:
             return False
         near, by_chance = self.near_misses(solution, centroids)
@@ -173,10 +193,15 @@ class FieldMatcher:
     def near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
         """Number of unmatched detections beside a star, and how many are expected by chance."""
         gate_rad = min(self.lens_radii_px[0] / self.camera.focal_px, 0.05)
-        tangent, gates = self.camera.tangents(centroids.xy_px), np.full(len(centroids), gate_rad)
+        tangent = self.camera.tangents(centroids.xy_px)
+        gates = np.full(len(centroids), gate_rad)
         R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = evidence.count_near(tangent, self.sky, R, solution.focal_ratio, solution.observed, gates)
-        return near, (len(centroids) - len(solution.star)) * min(len(self.stars) * gate_rad**2 / 4, 1.0)
+        near = evidence.count_near(
+            tangent, self.sky, R, solution.focal_ratio, solution.observed, gates
+        )
+        return near, (len(centroids) - len(solution.star)) * min(
+            len(self.stars) * gate_rad**2 / 4, 1.0
+        )
 
 
 def log10_chance(
@@ -191,7 +216,9 @@ def log10_chance(
     """
     p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
     counts = [count for count in (15, 30, 60) if count < blobs] + [blobs]
-    tails = [log10_tail(max(count - 2, 0), int((observed < count).sum()) - 2, p) for count in counts]
+    tails = [
+        log10_tail(max(count - 2, 0), int((observed < count).sum()) - 2, p) for count in counts
+    ]
     return float(min(tails) + np.log10(len(counts)) + np.log10(patterns))
 
 
@@ -208,12 +235,15 @@ def mutual_nearest(
     return match, rows[nearest[match]]
 
 
-def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats) -> tuple[Camera, Rotation]:
+def fit_camera(
+    camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
+) -> tuple[Camera, Rotation]:
     """Fit attitude, focal length and (with 12 stars or more) the first radial distortion coefficient to the pixels.
 
     Robust least squares (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
     """
-    count, k1 = (5 if len(xy_px) >= 12 else 4), camera.distortion[0]
+    count = 5 if len(xy_px) >= 12 else 4
+    k1 = camera.distortion[0]
     start = np.zeros(count)
     start[4:] = k1
     R_cam_from_ref = cam_from_ref.as_matrix()
@@ -229,5 +259,9 @@ def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_re
     scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[:count]
     found = fit_soft_l1(residual, start, scale, CONVERGED_FALL)
     k1 = float(found[4]) if count == 5 else k1
-    lens = replace(camera, focal_px=camera.focal_px * float(np.exp(found[3])), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    lens = replace(
+        camera,
+        focal_px=camera.focal_px * float(np.exp(found[3])),
+        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
+    )
     return lens, Rotation.from_rotvec(found[:3]) * cam_from_ref

@@ -5,13 +5,20 @@ from __future__ import annotations
 import typer
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
-    "": ("skysim run shefex2 --frames 5", "skysim check afit_simsat", "skysim study run led_count --set replicates=3"),
+    "": (
+        "skysim run shefex2 --frames 5",
+        "skysim check afit_simsat",
+        "skysim study run led_count --set replicates=3",
+    ),
     "run": (
         "skysim run shefex2 --frames 5 --open",
         'skysim run afit_simsat --frames 2 --set exposure.time="5 ms" --out out/short',
         "skysim run simsat_slew --frames 2 --scene-3d",
     ),
-    "check": ("skysim check afit_simsat", 'skysim check afit_simsat --set light.led.intensity="60 mcd"'),
+    "check": (
+        "skysim check afit_simsat",
+        'skysim check afit_simsat --set light.led.intensity="60 mcd"',
+    ),
     "availability": (
         "skysim availability orbit.yaml --law zenith --off-deg 30",
         "skysim availability orbit.yaml --span year --picture out/year.png",
@@ -33,7 +40,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim solve night.png --time 2012-06-22T21:00:00",
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
-    "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
+    "datasheet": (
+        "skysim datasheet shefex2 --quick",
+        "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet",
+    ),
     "dataset": (
         "skysim dataset shefex2 --frames 1000 --out out/frames",
         "skysim dataset shefex2 --frames 64 --vary night.yaml --out s3://bucket/night",
@@ -55,21 +65,35 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim camera new --out my.yaml",
         'skysim camera new --pixels 1936x1216 --pitch "5.86 um" --out my.yaml',
     ),
-    "reproduce": ("skysim reproduce", "skysim reproduce afit-table-1 --quick", "skysim reproduce all --report --open"),
+    "reproduce": (
+        "skysim reproduce",
+        "skysim reproduce afit-table-1 --quick",
+        "skysim reproduce all --report --open",
+    ),
     "gui": ("skysim gui", "skysim gui afit_simsat --port 8090 --no-open"),
-    "validate": ("skysim validate mine.yaml", "skysim validate shefex2 led_count", "skysim validate --schema scene"),
+    "validate": (
+        "skysim validate mine.yaml",
+        "skysim validate shefex2 led_count",
+        "skysim validate --schema scene",
+    ),
     "export": (
         "skysim export out/shefex2 --to aem --to tiff",
         "skysim export out/shefex2 --to video --out out/exported",
     ),
     "scenes": ("skysim scenes", "skysim scenes show shefex2", "skysim scenes export simsat_cmg"),
-    "scenes show": ("skysim scenes show shefex2", 'skysim scenes show mine.yaml --set camera.focal_length="16 mm"'),
+    "scenes show": (
+        "skysim scenes show shefex2",
+        'skysim scenes show mine.yaml --set camera.focal_length="16 mm"',
+    ),
     "scenes parts": (
         "skysim scenes parts coded_spiral",
         "skysim scenes parts afit_simsat --out out/parts.csv",
     ),
     "scenes export": ("skysim scenes export simsat_cmg --out out/simsat.xml",),
-    "catalog": ("skysim catalog info", "skysim catalog build --source gaia --limit 9 --out deep.ecsv"),
+    "catalog": (
+        "skysim catalog info",
+        "skysim catalog build --source gaia --limit 9 --out deep.ecsv",
+    ),
     "catalog build": ("skysim catalog build --source gaia --limit 9 --out deep.ecsv",),
     "catalog info": ("skysim catalog info hipparcos_hp6.5",),
     "study": ("skysim study", "skysim study run led_count --set replicates=3 --open"),

@@ -18,9 +18,17 @@ from skysim.scene.sections.camera import CameraConfig
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
 EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
-    Scene.__name__: {"base": {"type": "string", "description": "another scene: its name, or a file beside this one"}},
+    Scene.__name__: {
+        "base": {
+            "type": "string",
+            "description": "another scene: its name, or a file beside this one",
+        }
+    },
     CameraConfig.__name__: {
-        "preset": {"type": "string", "description": "a file of data/cameras that supplies the missing keys"},
+        "preset": {
+            "type": "string",
+            "description": "a file of data/cameras that supplies the missing keys",
+        },
         "calibration": {
             "type": "string",
             "description": "an OpenCV calibration file: focal length, center, distortion",
@@ -29,7 +37,12 @@ EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves be
 }
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DROPPED_KEYWORDS = ("required", "discriminator", "default")
-BOUND_KEYWORDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+BOUND_KEYWORDS = {
+    "ge": "minimum",
+    "gt": "exclusiveMinimum",
+    "le": "maximum",
+    "lt": "exclusiveMaximum",
+}
 
 
 def json_schema(kind: str) -> dict[str, Any]:
@@ -53,12 +66,22 @@ def relaxed(node: Any, name: str = "") -> Any:
     relaxed_node: dict[str, Any] = {}
     for key, value in node.items():
         if key == "properties":
-            properties = {key_name: relaxed(child) for key_name, child in value.items() if key_name != NAME_ALIAS}
+            properties = {
+                key_name: relaxed(child)
+                for key_name, child in value.items()
+                if key_name != NAME_ALIAS
+            }
             relaxed_node[key] = properties | EXTRA_KEYS.get(name, {})
         elif key == "$defs":
-            relaxed_node[key] = {key_name: relaxed(child, key_name) for key_name, child in value.items()}
-        elif key in BOUND_KEYWORDS:  # pydantic's keyword remains where a validator precedes the bound
-            relaxed_node |= {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+            relaxed_node[key] = {
+                key_name: relaxed(child, key_name) for key_name, child in value.items()
+            }
+        elif (
+            key in BOUND_KEYWORDS
+        ):  # pydantic's keyword remains where a validator precedes the bound
+            relaxed_node |= (
+                {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+            )
         elif key not in DROPPED_KEYWORDS and (key != "title" or name):
             relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
     return relaxed_node

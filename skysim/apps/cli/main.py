@@ -75,7 +75,12 @@ def version(requested: bool) -> None:
 def options(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=version, is_eager=True, help="Print the versions to state in a bug report."),
+        typer.Option(
+            "--version",
+            callback=version,
+            is_eager=True,
+            help="Print the versions to state in a bug report.",
+        ),
     ] = False,
 ) -> None:
     """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""
@@ -84,7 +89,11 @@ def options(
 def listing_hint(text: str, context: typer.Context | None) -> str:
     """For an unknown command of a group that lists its items without one, such as `skysim study list`: what lists."""
     group = getattr(context, "command", None)
-    if context is None or not text.startswith("No such command") or not getattr(group, "invoke_without_command", False):
+    if (
+        context is None
+        or not text.startswith("No such command")
+        or not getattr(group, "invoke_without_command", False)
+    ):
         return ""
     return f" Allowed: {', '.join(getattr(group, 'commands', {}))}; `{context.command_path}` alone lists."
 
@@ -92,8 +101,12 @@ def listing_hint(text: str, context: typer.Context | None) -> str:
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.running_as_command = True
-    gc.set_threshold(50_000)  # importing creates a hundred thousand objects: 5 % of the time of a short command
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # clean up after SIGTERM as after Ctrl-C
+    gc.set_threshold(
+        50_000
+    )  # importing creates a hundred thousand objects: 5 % of the time of a short command
+    signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # clean up after SIGTERM as after Ctrl-C
     try:
         code = app(standalone_mode=False)
     except InputError as error:
@@ -103,7 +116,9 @@ def main() -> None:
     except OSError as error:
         code = print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (MemoryError, OverflowError) as error:
-        code = print_error(f"a value of the scene is too large for this machine: {' '.join(str(error).split())}")
+        code = print_error(
+            f"a value of the scene is too large for this machine: {' '.join(str(error).split())}"
+        )
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:

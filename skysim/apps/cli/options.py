@@ -39,14 +39,20 @@ def complete_study(incomplete: str) -> list[str]:
 def complete_yaml(folder: Path, incomplete: str) -> list[str]:
     names = [path.stem for path in folder.glob("*.yaml")]
     found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob("*")
-    files = [f"{path}/" if path.is_dir() else str(path) for path in found if path.is_dir() or path.suffix == ".yaml"]
+    files = [
+        f"{path}/" if path.is_dir() else str(path)
+        for path in found
+        if path.is_dir() or path.suffix == ".yaml"
+    ]
     return sorted(name for name in names + files if name.startswith(incomplete))
 
 
 SceneArg = Annotated[
     str,
     typer.Argument(
-        metavar="SCENE", help="Scene file (.yaml), or name of a scene in scenes/.", autocompletion=complete_scene
+        metavar="SCENE",
+        help="Scene file (.yaml), or name of a scene in scenes/.",
+        autocompletion=complete_scene,
     ),
 ]
 Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
@@ -54,7 +60,11 @@ Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; defa
 Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the file: exposure.rate_hz=10; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a key of the file: exposure.rate_hz=10; repeatable.",
+    ),
 ]
 Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. local.")]
 Centroider = Annotated[str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")]
@@ -63,14 +73,22 @@ SolverName = Annotated[str | None, typer.Option("--solver", help="Attitude algor
 TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
-    typer.Option("--program", metavar="NAME=COMMAND", help="External tracker or controller: a program; repeatable."),
+    typer.Option(
+        "--program",
+        metavar="NAME=COMMAND",
+        help="External tracker or controller: a program; repeatable.",
+    ),
 ]
 OpenReport = Annotated[bool, typer.Option("--open", help="Open the report when it is written.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
 def load(
-    name: str, frames: int | None, seed: int | None, overrides: list[str] | None, trackers: list[str] | None = None
+    name: str,
+    frames: int | None,
+    seed: int | None,
+    overrides: list[str] | None,
+    trackers: list[str] | None = None,
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.
 
@@ -96,7 +114,9 @@ def load(
     scene = load_scene(name, values, refuses_unused=not trackers)
     if trackers:
         each = [scene.tracker.model_copy(update={"name": tracker}) for tracker in trackers]
-        unused.check_overrides([scene.model_copy(update={"tracker": tracker}) for tracker in each], values)
+        unused.check_overrides(
+            [scene.model_copy(update={"tracker": tracker}) for tracker in each], values
+        )
     return scene
 
 
@@ -104,11 +124,14 @@ def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dic
     """The commands of --program by name. Raises InputError for a name that is not among those used."""
     from skysim.tracking.external import process
 
-    programs, used = process.program_commands(options), set(names)
+    programs = process.program_commands(options)
+    used = set(names)
     for name in programs:
         if name not in used:
             problem = "has no effect: nothing has this name"
-            raise InputError(f"programs.{name}", problem, "that of --tracker, tracker.name or motion.control.law")
+            raise InputError(
+                f"programs.{name}", problem, "that of --tracker, tracker.name or motion.control.law"
+            )
     return programs
 
 
@@ -125,7 +148,13 @@ def study_names(plan: Plan) -> set[str | None]:
     def texts(value: Any) -> Iterator[str]:
         if isinstance(value, str):
             yield value
-        for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+        for inner in (
+            value.values()
+            if isinstance(value, dict)
+            else value
+            if isinstance(value, list | tuple)
+            else ()
+        ):
             yield from texts(inner)
 
     scene, _ = resolve_point(plan.spec, {})

@@ -15,8 +15,16 @@ if TYPE_CHECKING:
     from skysim.experiments.study.plan import Plan
 
 REPLAYED = (
-    *("trial", "point", "replicate", "seed", "status", "x_arcsec", "y_arcsec", "roll_arcsec"),
-    *("stars", "matched"),
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "status",
+    "x_arcsec",
+    "y_arcsec",
+    "roll_arcsec",
+    "stars",
+    "matched",
 )
 
 
@@ -43,7 +51,11 @@ def print_study_status(status: dict[str, Any]) -> None:
 
 
 def print_worst(
-    response: str, found: Sequence[WorstTrial], levels: Sequence[Mapping[str, Any]], repeat: str, instead: str
+    response: str,
+    found: Sequence[WorstTrial],
+    levels: Sequence[Mapping[str, Any]],
+    repeat: str,
+    instead: str,
 ) -> None:
     """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
 
@@ -53,7 +65,9 @@ def print_worst(
         print(f"no trial counts for {response}; rank them by an error: {instead}")
     for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
         at = ", ".join(f"{name} = {value}" for name, value in level.items())
-        print(f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})")
+        print(
+            f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})"
+        )
         if one.start:
             print(f"   {one.start}")
         print(f"   {repeat} {one.trial}")
@@ -64,7 +78,9 @@ def print_replay(replay: dict[str, Any]) -> None:
     for name in REPLAYED:
         print(f"{name:12s} {replay[name]}")
     if replay["changed"]:
-        print_error(f"differs from the store in {', '.join(replay['changed'])}: another code version")
+        print_error(
+            f"differs from the store in {', '.join(replay['changed'])}: another code version"
+        )
     if replay["error"]:
         print(replay["error"])
     for path in replay["pictures"][:10]:

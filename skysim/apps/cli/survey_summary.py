@@ -19,14 +19,25 @@ def print_plan(plan: dict[str, Any]) -> None:
         print(f"... {len(plan['attitudes'])} attitudes in all, in {plan['plan']}")
     print()
     heads = ("LED place mm", "lever mm", "focal length px")
-    columns = [Column("frames"), Column("LEDs measured"), *(Column(head, format=".3g") for head in heads)]
+    columns = [
+        Column("frames"),
+        Column("LEDs measured"),
+        *(Column(head, format=".3g") for head in heads),
+    ]
     keys = ("frames", "measured", "led_mm", "lever_mm", "focal_px")
     table = Table(columns, [[row[key] for key in keys] for row in plan["predicted"]])
-    print_table(table, f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px")
+    print_table(
+        table,
+        f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px",
+    )
 
 
 def print_comparison(result: dict[str, Any]) -> None:
-    columns = [Column("what", kind="text"), Column("predicted", format=".3g"), Column("simulated", format=".3g")]
+    columns = [
+        Column("what", kind="text"),
+        Column("predicted", format=".3g"),
+        Column("simulated", format=".3g"),
+    ]
     rows = [
         [
             row["what"],
@@ -45,4 +56,7 @@ def print_comparison(result: dict[str, Any]) -> None:
         print_wrapped(f"one more survey failed: {failure}")
 
 
-PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {"plan": print_plan, "repeat": print_comparison}
+PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "plan": print_plan,
+    "repeat": print_comparison,
+}

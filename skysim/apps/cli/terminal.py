@@ -45,12 +45,20 @@ def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> 
 def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     """A transient progress bar on stderr: description, then columns. Disabled if stderr is no terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
+    return Progress(
+        what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    )
 
 
 @contextmanager
@@ -62,7 +70,9 @@ def progress_callback(what: str, quiet: bool = False) -> Iterator[Callable[[floa
 
 
 @contextmanager
-def trial_progress(what: str, total: int, unit: str = "trials") -> Iterator[Callable[[Progress], None]]:
+def trial_progress(
+    what: str, total: int, unit: str = "trials"
+) -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
     If stderr is no terminal, print a line after every tenth of the trials instead.
@@ -70,7 +80,8 @@ def trial_progress(what: str, total: int, unit: str = "trials") -> Iterator[Call
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
-    console, what = Console(stderr=True), printable(what)
+    console = Console(stderr=True)
+    what = printable(what)
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
     tenth = 0
     with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
@@ -96,7 +107,12 @@ def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
 
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
-    columns = [Column("tracker", kind="text"), Column("frames"), Column("right", "%", ".1f"), Column("(95 %)")]
+    columns = [
+        Column("tracker", kind="text"),
+        Column("frames"),
+        Column("right", "%", ".1f"),
+        Column("(95 %)"),
+    ]
     columns += [Column("wrong"), Column("refused"), Column("failed")]
     columns += [Column(head, "″", ".3g") for head in ("cross", "worst", "roll", "worst")]
     columns += [Column("ms", format=".3g"), Column("95 % ms", format=".3g")]
@@ -104,8 +120,21 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     for line in lines:
         interval = f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}"
         wrong = Cell(str(line.wrong), "bad" if line.wrong else "")
-        outcomes = [line.tracker, line.frames, 100 * line.right.value, interval, wrong, line.refused, line.failed]
-        errors = [line.cross_arcsec_median, line.cross_arcsec_worst, line.roll_arcsec_median, line.roll_arcsec_worst]
+        outcomes = [
+            line.tracker,
+            line.frames,
+            100 * line.right.value,
+            interval,
+            wrong,
+            line.refused,
+            line.failed,
+        ]
+        errors = [
+            line.cross_arcsec_median,
+            line.cross_arcsec_worst,
+            line.roll_arcsec_median,
+            line.roll_arcsec_worst,
+        ]
         rows.append([*outcomes, *errors, line.time_ms_median, line.time_ms_p95])
     left_out = ((12,), (11,), (3,), (10,), (8,))  # the times, the interval, the worst errors
     print_table(Table(columns, rows, optional=left_out))
@@ -122,7 +151,11 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
     keys = ("ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec", "time_ms")
     statuses = [one["status"] if one["time_ms"] is not None else "bad input" for one in solutions]
     found = zip(solutions, statuses, strict=True)
-    print_table(Table(columns, [[one["file"], status, *(one[key] for key in keys)] for one, status in found]))
+    print_table(
+        Table(
+            columns, [[one["file"], status, *(one[key] for key in keys)] for one, status in found]
+        )
+    )
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")
@@ -134,7 +167,9 @@ def print_remarks(solution: dict[str, Any]) -> None:
         return
     print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
     if solution["ra_deg"] is None:
-        fields = " and ".join(f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"])
+        fields = " and ".join(
+            f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"]
+        )
         print(
             f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
             f" the background {solution['background_dn']:g} DN\n"
@@ -149,7 +184,9 @@ def print_json(data: Any) -> None:
     print(to_json(data))
 
 
-def print_list(entries: list[dict[str, Any]], json: bool, line: Callable[[dict[str, Any]], str]) -> None:
+def print_list(
+    entries: list[dict[str, Any]], json: bool, line: Callable[[dict[str, Any]], str]
+) -> None:
     """Print entries as JSON or, one per line, as text."""
     if json:
         print_json(entries)
@@ -163,7 +200,9 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
         print_json(catalog)
         return
     sources = ", ".join(f"{count} {name}" for name, count in catalog["sources"].items())
-    print(f"{catalog['path']}: {catalog['stars']} stars ({sources}), epoch J{catalog['meta']['epoch_jyear']}")
+    print(
+        f"{catalog['path']}: {catalog['stars']} stars ({sources}), epoch J{catalog['meta']['epoch_jyear']}"
+    )
     print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
     for key, value in catalog["meta"].items():
         print(f"  {key}: {printable(value)}")
@@ -173,7 +212,10 @@ def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
     from skysim.core.paths import title_of
 
-    listed = [{"name": path.stem, "title": title_of(path), "file": str(path)} for path in sorted(folder.glob("*.yaml"))]
+    listed = [
+        {"name": path.stem, "title": title_of(path), "file": str(path)}
+        for path in sorted(folder.glob("*.yaml"))
+    ]
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")
 
 
@@ -191,8 +233,10 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     from skysim.core.io import files
     from skysim.dynamics.multibody.view import picture
 
-    mjcf, joints = lab.export_mjcf(), log.joints
-    image_path, animation_path = folder / "scene_3d.png", folder / "scene_3d.gif"
+    mjcf = lab.export_mjcf()
+    joints = log.joints
+    image_path = folder / "scene_3d.png"
+    animation_path = folder / "scene_3d.gif"
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:

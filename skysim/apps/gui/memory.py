@@ -9,7 +9,11 @@ import time
 
 from skysim.apps.gui.views.served import FRAMES
 
-THRESHOLDS = 2_000, 10, 1_000  # new objects until a collection, and collections until one of older objects
+THRESHOLDS = (
+    2_000,
+    10,
+    1_000,
+)  # new objects until a collection, and collections until one of older objects
 QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
 PATIENCE_S = 60.0  # after which they are collected although frames follow one another
 

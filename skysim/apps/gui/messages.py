@@ -15,7 +15,12 @@ from skysim.results import stretch
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
-LIMITS = ("automatic", "zscale", "min to max", "manual")  # of the display; the last are set in the browser
+LIMITS = (
+    "automatic",
+    "zscale",
+    "min to max",
+    "manual",
+)  # of the display; the last are set in the browser
 
 
 class Display(NamedTuple):

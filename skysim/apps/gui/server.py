@@ -18,7 +18,13 @@ from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import HTTPConnection, Request
-from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response, StreamingResponse
+from starlette.responses import (
+    FileResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+    StreamingResponse,
+)
 from starlette.routing import Route, Router
 
 from skysim.apps.gui import memory
@@ -38,9 +44,14 @@ PAGE_POLICY = (
     " form-action 'self'; frame-ancestors 'none'"
 )
 REPORT_POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "frame-ancestors 'none'"
 )
-SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+SECURITY_HEADERS = {
+    "x-frame-options": "DENY",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+}
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
 FILES = f"/_nicegui/{nicegui.__version__}"
@@ -62,7 +73,11 @@ async def frame(request: Request) -> Response:
     frames = FRAMES.get(request.path_params["tab"])
     served = frames and frames.newest.get(request.path_params["number"])
     display = display_of(request.query_params)
-    data = await served.response(display, "whole" in request.query_params) if served and display else None
+    data = (
+        await served.response(display, "whole" in request.query_params)
+        if served and display
+        else None
+    )
     if data is None:
         return Response(status_code=404)
     return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
@@ -74,11 +89,15 @@ async def stream(request: Request) -> Response:
     display = display_of(request.query_params)
     if not frames or not display:
         return Response(status_code=404)
-    return StreamingResponse(frames.stream(display), media_type="application/octet-stream", headers=FRAME_HEADERS)
+    return StreamingResponse(
+        frames.stream(display), media_type="application/octet-stream", headers=FRAME_HEADERS
+    )
 
 
 # Frames pass by the application's own layers, each of which takes a tenth of the time that a frame may take.
-FRAME_ROUTES = Router([Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)])
+FRAME_ROUTES = Router(
+    [Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)]
+)
 
 
 class KeptFiles:
@@ -161,7 +180,9 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if token_matches(request.query_params.get("token", ""), self.token):  # the address does not keep it
+        if token_matches(
+            request.query_params.get("token", ""), self.token
+        ):  # the address does not keep it
             response = RedirectResponse("/", 303)
             response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
@@ -169,7 +190,9 @@ class Guard:
             return response
         if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None
-        return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
+        return PlainTextResponse(
+            "token missing or wrong; open the address that the server printed: /?token=...", 401
+        )
 
 
 def token_matches(candidate: str, token: str) -> bool:
@@ -260,7 +283,9 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         path = report_path(out, name, user_of(request.cookies))
         if path is None:
             return Response(status_code=404)
-        return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
+        return FileResponse(
+            path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY}
+        )
 
     # NiceGUI allows three seconds for building a page, which many that are built at once exceed.
     @ui.page("/", title="skysim gui", dark=True, response_timeout=CONNECT_TIMEOUT_S)
@@ -273,7 +298,9 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
-        session = await pool.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
+        session = await pool.wait(
+            lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED)
+        )
         if session is None:  # the tab was closed while it waited
             return
         await tab.start(session, pool.take)
@@ -316,5 +343,7 @@ def serve(
         uvicorn_logging_level="critical",
         storage_secret=None,
         # To this machine nothing is compressed; to others by the quickest level.
-        gzip_middleware_factory=None if host in LOOPBACK else partial(GZipMiddleware, compresslevel=1),
+        gzip_middleware_factory=None
+        if host in LOOPBACK
+        else partial(GZipMiddleware, compresslevel=1),
     )

@@ -24,7 +24,9 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 
 FACTORS = (8, 4, 2)  # sides of the squares: the most reduced picture is the fastest
 MIN_SIDE_PX = 200  # of a binned picture
-BRIGHTEST, MIN_AREA_PX = 12, 30  # of so many lights of the binned picture the median area; a sharp star has 10
+# of so many lights of the binned picture the median area; a sharp star has 10
+BRIGHTEST = 12
+MIN_AREA_PX = 30
 MAX_SIGMA_PX = 20.0  # that `Centroids.check_values` allows
 
 
@@ -35,12 +37,17 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
             continue
         small = bin_pixels(image, factor)
         try:
-            found = DETECTORS[settings.detector](small, settings.threshold_sigma, settings.min_area_px)
+            found = DETECTORS[settings.detector](
+                small, settings.threshold_sigma, settings.min_area_px
+            )
             area_px = found.area_px[found.flag & NO_STAR == 0][:BRIGHTEST]
             if not len(area_px) or np.median(area_px) < MIN_AREA_PX:
                 continue
             camera = camera_of(small)
-            yield factor, enlarged(detect_and_centroid(small, camera, settings, Clock()), factor, settings)
+            yield (
+                factor,
+                enlarged(detect_and_centroid(small, camera, settings, Clock()), factor, settings),
+            )
         except ImageError:  # nothing is left, or there are thousands of lights
             continue
 
@@ -50,7 +57,8 @@ def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
     height, width = (side // factor for side in image.shape)
     light = image[: height * factor, : width * factor].astype(np.float32)
     small = cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA)
-    low, high = float(small.min()), float(small.max())
+    low = float(small.min())
+    high = float(small.max())
     return np.rint((small - low) * (65535 / max(high - low, 1e-30))).astype(np.uint16)
 
 

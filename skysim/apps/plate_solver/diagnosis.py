@@ -23,14 +23,25 @@ from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
 from skysim.apps.plate_solver.solver import FIELD_SEARCH, Solver, best_attitude, solve_centroids
 
-MIN_CATALOG_STARS, ENOUGH_CATALOG_STARS = 6.0, 15.0  # expected in a field: hardly solvable below, safe above
+# expected in a field: hardly solvable below, safe above
+MIN_CATALOG_STARS = 6.0
+ENOUGH_CATALOG_STARS = 15.0
 # Stars of the Gaia catalogs of `skysim catalog build`: 45,709 to V 8, 130,337 to V 9, 357,037 to V 10, their limit.
-GAIA_STARS, GAIA_DEX_PER_MAG, GAIA_LIMITS_MAG = 45_709, 0.45, (8, 9, 10)
+GAIA_STARS = 45_709
+GAIA_DEX_PER_MAG = 0.45
+GAIA_LIMITS_MAG = (8, 9, 10)
 OVEREXPOSED_SHARE = 0.3  # of pixels at the greatest value
-SHAPED_BLOBS, MIN_BLOBS, SAME_SHARE = 6, 3, 0.5  # of the brightest blobs, so many and this share have one shape
-BLUR_PX, SAME_SIZE = 14.0, 0.3  # least diameter of defocused stars (of sharp ones 4 to 10 px), and its relative spread
+# of the brightest blobs, so many and this share have one shape
+SHAPED_BLOBS = 6
+MIN_BLOBS = 3
+SAME_SHARE = 0.5
+# least diameter of defocused stars (of sharp ones 4 to 10 px), and its relative spread
+BLUR_PX = 14.0
+SAME_SIZE = 0.3
 FILLED = 0.6  # least share of its box that a defocused star fills; a disk fills 0.79
-TRAIL_PX, THIN = 20.0, 6.0  # least length of a trail, and least ratio of its square to the area; of a disk it is 2.5
+# least length of a trail, and least ratio of its square to the area; of a disk it is 2.5
+TRAIL_PX = 20.0
+THIN = 6.0
 SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel trails
 TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
 FEW_LIGHTS = 10
@@ -66,7 +77,9 @@ class Refusal:
         settings = self.solvers[0].settings
         detect = DETECTORS[settings.detector]
         priors = FramePriors(None, settings.saturation)
-        return detect(self.image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors)
+        return detect(
+            self.image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
+        )
 
 
 def likely_cause(refusal: Refusal) -> str:
@@ -97,10 +110,15 @@ def sphere_share(size_px: tuple[int, int], fov_deg: float) -> float:
 
 def deeper_catalog(solver: Solver, share: float) -> str:
     """The remedy for a field that is this share of the sphere: the shallowest Gaia catalog with enough stars."""
-    first, last = GAIA_LIMITS_MAG[0], GAIA_LIMITS_MAG[-1]
+    first = GAIA_LIMITS_MAG[0]
+    last = GAIA_LIMITS_MAG[-1]
     for limit in (limit for limit in GAIA_LIMITS_MAG if limit > solver.stars.v_mag[-1]):
         if GAIA_STARS * 10 ** (GAIA_DEX_PER_MAG * (limit - first)) * share >= ENOUGH_CATALOG_STARS:
-            build = "" if limit == first else f", after `skysim catalog build --source gaia --limit {limit}`"
+            build = (
+                ""
+                if limit == first
+                else f", after `skysim catalog build --source gaia --limit {limit}`"
+            )
             return f"the catalog gaia_v{limit}.0{build}"
     return f"a wider picture: the deepest catalog, to V {last}, has too few as well"
 
@@ -111,7 +129,9 @@ def mirrored(refusal: Refusal) -> str:
         return ""
     flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
     for solver in refusal.solvers:
-        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, refusal.date_utc, Clock(), EFFORTS)
+        attitude, _ = solve_centroids(
+            flipped, solver, refusal.size_px, refusal.date_utc, Clock(), EFFORTS
+        )
         if attitude.solved:
             return "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
     return ""
@@ -156,7 +176,8 @@ def trailed(refusal: Refusal) -> str:
         trails_px = streaks_px(blobs, refusal.image.shape, blobs.streak_px)
         return TRAILS.format(np.median(np.hypot(*trails_px.T)))
     sides_px, area_px = brightest_shapes(blobs)
-    lengths_px, angle_rad = np.hypot(*sides_px.T), np.arctan2(*sides_px.T)
+    lengths_px = np.hypot(*sides_px.T)
+    angle_rad = np.arctan2(*sides_px.T)
     lines = (lengths_px >= TRAIL_PX) & (lengths_px**2 >= THIN * area_px)
     if not lines.any():
         return ""
@@ -198,7 +219,9 @@ def few_lights(refusal: Refusal) -> str:
 def unknown_cause(refusal: Refusal) -> str:
     """No cause was found: what is left."""
     solver = refusal.solvers[0]
-    unknown = replace(solver, fov_deg=None, camera=None, opencv_calibration=None)  # `other_field` tried it
+    unknown = replace(
+        solver, fov_deg=None, camera=None, opencv_calibration=None
+    )  # `other_field` tried it
     narrow_deg = min(one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers))
     text = (
         f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
@@ -208,11 +231,21 @@ def unknown_cause(refusal: Refusal) -> str:
     if len(solver.stars) * share >= ENOUGH_CATALOG_STARS:
         return text
     enough_deg = narrow_deg * math.sqrt(ENOUGH_CATALOG_STARS / (len(solver.stars) * share))
-    field = "or take " if solver.field_is_known else f"if the field is below {enough_deg:.1g}°, give it and take "
+    field = (
+        "or take "
+        if solver.field_is_known
+        else f"if the field is below {enough_deg:.1g}°, give it and take "
+    )
     return f"{text}; {field}{deeper_catalog(solver, share)}"
 
 
 CAUSES: tuple[Callable[[Refusal], str], ...] = (
-    *(shallow_catalog, mirrored, other_field),
-    *(overexposed, trailed, out_of_focus, few_lights, unknown_cause),
+    shallow_catalog,
+    mirrored,
+    other_field,
+    overexposed,
+    trailed,
+    out_of_focus,
+    few_lights,
+    unknown_cause,
 )

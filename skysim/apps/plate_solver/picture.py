@@ -77,7 +77,10 @@ def solve(
     """
     if camera or catalog:
         solver = make_solver(
-            fov_deg, Path(camera) if camera else None, time_utc, catalog=str(catalog) if catalog else None
+            fov_deg,
+            Path(camera) if camera else None,
+            time_utc,
+            catalog=str(catalog) if catalog else None,
         )
     else:
         solver = kept_solver(fov_deg, time_utc)
@@ -96,7 +99,9 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
             found.append(path)
             continue
         names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
-        names = [child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)]
+        names = [
+            child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)
+        ]
         if not names:
             raise InputError(path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES))
         found += names
@@ -109,9 +114,15 @@ def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
     If two pictures differ in suffix only, the suffix stays in the name; if they have one name, a number is appended.
     """
     stems = [stem_of(path) for path in paths]
-    names = [path.name if stems.count(stem) > 1 else stem for path, stem in zip(paths, stems, strict=True)]
+    names = [
+        path.name if stems.count(stem) > 1 else stem
+        for path, stem in zip(paths, stems, strict=True)
+    ]
     repeats = [names[:n].count(name) for n, name in enumerate(names)]
-    return [folder / f"{name}{f'-{n + 1}' if n else ''}{ANNOTATED}" for name, n in zip(names, repeats, strict=True)]
+    return [
+        folder / f"{name}{f'-{n + 1}' if n else ''}{ANNOTATED}"
+        for name, n in zip(names, repeats, strict=True)
+    ]
 
 
 def stem_of(path: Path) -> str:
@@ -154,7 +165,9 @@ def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[s
     result["time_ms"] = 1e3 * (time.perf_counter() - begin)
     result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
     if annotated:
-        files.write_image(annotated, annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker))
+        files.write_image(
+            annotated, annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
+        )
     return result
 
 
@@ -174,20 +187,30 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """
     camera = solver.camera
     if camera and image.ndim != 2:
-        raise InputError(path, f"a color image of shape {image.shape}; this camera's are monochrome")
+        raise InputError(
+            path, f"a color image of shape {image.shape}; this camera's are monochrome"
+        )
     if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
         bits = camera.detector.bits
-        raise InputError(path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
+        raise InputError(
+            path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF"
+        )
     sensor = camera or solver.opencv_calibration
     if sensor and image.shape[:2] != (sensor.height_px, sensor.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(path, f"{size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}")
+        raise InputError(
+            path, f"{size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}"
+        )
 
 
-def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None) -> Outcome:
+def solve_picture(
+    picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None
+) -> Outcome:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
-    outcomes, centroids = [], dict[int, Centroids]()  # those of a reading serve all fields of view
+    # those of a reading serve all fields of view
+    outcomes = []
+    centroids = dict[int, Centroids]()
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading))
@@ -209,10 +232,14 @@ def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> O
             for one in (one.hypothesis for one in readings):
                 tries = one.solver.hypotheses * retries.EXTRA_TRIES
                 solver = replace(one.solver, hypotheses=tries, upper_half=retry.upper_half)
-                report, tracker = solve_array(pixels, solver, date_utc, retry.centroids, retry.efforts)
+                report, tracker = solve_array(
+                    pixels, solver, date_utc, retry.centroids, retry.efforts
+                )
                 if report.attitude.solved:
                     notes = [one.assumption] * bool(one.assumption) + [retry.note]
-                    return Outcome(one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried)
+                    return Outcome(
+                        one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried
+                    )
     return None
 
 
@@ -222,21 +249,29 @@ def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
     A field or a camera of the user's takes precedence over EXIF.
     """
     height_px, width_px = picture.pixels.shape
-    solvers, readings = [solver], [(picture.pixels, "")]
+    solvers = [solver]
+    readings = [(picture.pixels, "")]
     if picture.focal_35mm and not solver.field_is_known:
         focal_px = picture.focal_35mm / DIAGONAL_35MM * math.hypot(width_px, height_px)
         fov_deg = math.degrees(2 * math.atan((width_px - 1) / 2 / focal_px))
         if FOV_LIMITS_DEG[0] <= fov_deg <= FOV_LIMITS_DEG[1]:
-            solvers.insert(0, replace(solver, fov_deg=fov_deg, fov_uncertainty=FOCAL_35MM_UNCERTAINTY))
+            solvers.insert(
+                0, replace(solver, fov_deg=fov_deg, fov_uncertainty=FOCAL_35MM_UNCERTAINTY)
+            )
     if not picture.row_order_known:
         readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
     count = len(solvers) * len(readings)
-    return [Hypothesis(pixels, replace(one, hypotheses=count), text) for one in solvers for pixels, text in readings]
+    return [
+        Hypothesis(pixels, replace(one, hypotheses=count), text)
+        for one in solvers
+        for pixels, text in readings
+    ]
 
 
 def outcome_fields(outcome: Outcome, date_utc: datetime.datetime | None) -> dict[str, Any]:
     """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
-    (pixels, solver, assumption), report = outcome.hypothesis, outcome.report
+    report = outcome.report
+    (pixels, solver, assumption) = outcome.hypothesis
     height_px, width_px = pixels.shape
     solvers = {one.solver.fov_deg: one.solver for one in outcome.tried}.values()
     seen = {

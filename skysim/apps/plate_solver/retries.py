@@ -27,11 +27,18 @@ from skysim.apps.plate_solver import binned
 
 EXTRA_TRIES = 1000
 MIN_LIGHTS = 10  # in a half: fewer were searched in all combinations with the others
-EFFORTS, MORE_EFFORTS = 1, 2  # searches of a half; of the upper one, the likeliest, and of other centroids
+# searches of a half; of the upper one, the likeliest, and of other centroids
+EFFORTS = 1
+MORE_EFFORTS = 2
 UNEVEN = 2.0  # least ratio of the 90 % to the 10 % quantile of the noise of the background's tiles
 TOPHAT_PX = 15  # wider than a sharp star
-TRAIL_FACTORS, MIN_TRAIL_PX = (3, 2, 4), 10.0  # sides of the squares; shorter trails are seen as one
-ROUND = (0.0, 0.0)  # streak of sharp stars: what is left of the edges of trees is parallel, as streaks are
+# sides of the squares; shorter trails are seen as one
+TRAIL_FACTORS = (3, 2, 4)
+MIN_TRAIL_PX = 10.0
+ROUND = (
+    0.0,
+    0.0,
+)  # streak of sharp stars: what is left of the edges of trees is parallel, as streaks are
 FLAT_SIGMA_PX = 0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
 FLAT = "its stars were found without its clouds"
 HALF = "its stars were found in its {} half alone"
@@ -67,7 +74,8 @@ def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
     right, low = (centroids.xy_px > middle).T
     for side, inside in (("upper", ~low), ("lower", low), ("left", ~right), ("right", right)):
         if MIN_LIGHTS <= np.count_nonzero(inside) < len(centroids):
-            efforts, part = MORE_EFFORTS if side == "upper" else EFFORTS, centroids.take(inside)
+            efforts = MORE_EFFORTS if side == "upper" else EFFORTS
+            part = centroids.take(inside)
             yield Retry(note + HALF.format(side), efforts, part)
             if side == "upper":
                 yield Retry(note + HALF.format(side), efforts, part, upper_half=True)
@@ -83,7 +91,9 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
     camera = binned.camera_of(pixels)
     for factor in TRAIL_FACTORS:
         try:
-            blobs = DETECTORS[settings.detector](binned.bin_pixels(pixels, factor), settings.threshold_sigma)
+            blobs = DETECTORS[settings.detector](
+                binned.bin_pixels(pixels, factor), settings.threshold_sigma
+            )
             x, y = factor * np.array(blobs.streak_px or ROUND)
             if hypot(x, y) >= MIN_TRAIL_PX:
                 yield detect_and_centroid(pixels, camera, settings, Clock(), (x, y))

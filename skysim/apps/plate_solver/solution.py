@@ -79,7 +79,8 @@ def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDA
     """The image annotated with detections, matched stars and their numbers."""
     from skysim.results.annotate import annotate
 
-    match, detected_px = report.attitude.match, report.centroids.xy_px
+    match = report.attitude.match
+    detected_px = report.centroids.xy_px
     if match is None:
         return annotate(image, detected_px, np.empty((0, 2)))
     names = [star_name(int(tracker.stars.id[star])) for star in match.star]

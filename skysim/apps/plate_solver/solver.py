@@ -87,7 +87,9 @@ class FieldSearch:
     def cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
         """The cameras to try, each with its relative focal-length uncertainty, from the typical field outward."""
         out = []
-        narrowest, tangent = (math.tan(math.radians(deg) / 2) for deg in (self.narrowest_deg, self.widest_deg))
+        narrowest, tangent = (
+            math.tan(math.radians(deg) / 2) for deg in (self.narrowest_deg, self.widest_deg)
+        )
         diagonal2 = 1 + (height_px / width_px) ** 2  # of half the image, in units of half its width
         while tangent > narrowest:  # of the half field at the lower end of a range
             corner2 = diagonal2 * tangent**2
@@ -128,7 +130,9 @@ class Solver:
     search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
     upper_half: bool = False
-    tracker_cache: dict[Any, dict[Any, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
+    tracker_cache: dict[Any, dict[Any, StarTracker]] = field(
+        default_factory=dict, compare=False, repr=False
+    )
 
     @property
     def field_is_known(self) -> bool:
@@ -139,16 +143,26 @@ class Solver:
         """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
         if self.upper_half:
             whole = replace(self, upper_half=False).candidate_cameras(width_px, height_px)
-            return [(replace(camera, height_px=height_px // 2), uncertainty) for camera, uncertainty in whole]
+            return [
+                (replace(camera, height_px=height_px // 2), uncertainty)
+                for camera, uncertainty in whole
+            ]
         if self.camera:
             from skysim.tracking.onboard_model import calibration
 
             return [(calibration(self.camera), 0.0)]
         if lens := self.opencv_calibration:
-            camera = Camera(lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion)
+            camera = Camera(
+                lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion
+            )
             return [(camera, CALIBRATED_UNCERTAINTY)]
         if self.fov_deg:
-            return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), self.fov_uncertainty)]
+            return [
+                (
+                    Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)),
+                    self.fov_uncertainty,
+                )
+            ]
         cameras = self.search.cameras(width_px, height_px)
         return [one for one in cameras if self.mean_stars(one[0]) >= self.search.least_stars]
 
@@ -159,7 +173,9 @@ class Solver:
         wide_rad = max(camera.zoomed(1 - uncertainty).fov_rad for camera, uncertainty in cameras)
         return round(math.degrees(narrow_rad), 2), round(math.degrees(wide_rad), 2)
 
-    def trackers(self, width_px: int, height_px: int, date_utc: datetime.datetime | None) -> Iterator[StarTracker]:
+    def trackers(
+        self, width_px: int, height_px: int, date_utc: datetime.datetime | None
+    ) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
 
         Trackers are built when first needed and cached until an image of another size or date comes.
@@ -177,7 +193,13 @@ class Solver:
 
     def mean_stars(self, camera: Camera) -> float:
         """Mean number of catalog stars in the field of a camera."""
-        return len(self.stars) * camera.width_px * camera.height_px / camera.focal_px**2 / (4 * math.pi)
+        return (
+            len(self.stars)
+            * camera.width_px
+            * camera.height_px
+            / camera.focal_px**2
+            / (4 * math.pi)
+        )
 
     def vectors(self, date_utc: datetime.datetime | None) -> Floats:
         """(N, 3) directions of the stars as seen from the Earth at a date, or at the default epoch."""
@@ -189,9 +211,13 @@ class Solver:
         """A tracker with the brightest stars of the catalog, as many as its narrowest field needs."""
         narrowest = camera.zoomed(1 + uncertainty)
         field_sr = camera.width_px * camera.height_px / narrowest.focal_px**2
-        bright = self.stars.v_mag <= star_catalog.limit_for_density(self.stars, field_sr, self.search.stars)
+        bright = self.stars.v_mag <= star_catalog.limit_for_density(
+            self.stars, field_sr, self.search.stars
+        )
         searches = () if self.field_is_known else QUAD_SEARCHES
-        return StarTracker(camera, self.stars.take(bright), vectors[bright], self.settings, uncertainty, searches)
+        return StarTracker(
+            camera, self.stars.take(bright), vectors[bright], self.settings, uncertainty, searches
+        )
 
 
 def make_solver(
@@ -210,7 +236,11 @@ def make_solver(
     if fov_deg is not None and camera_file is not None:
         raise InputError("solve.fov_deg", "conflicts with a camera", "one of the two")
     if fov_deg is not None and not low <= fov_deg <= high:
-        raise InputError("solve.fov_deg", f"{fov_deg:g}", f"the horizontal field of view, {low:g} to {high:g} degrees")
+        raise InputError(
+            "solve.fov_deg",
+            f"{fov_deg:g}",
+            f"the horizontal field of view, {low:g} to {high:g} degrees",
+        )
     time_utc, warning = validated_date(time_utc)
     if warning:
         raise InputError("solve.time_utc", warning)
@@ -223,7 +253,9 @@ def make_solver(
 
 @functools.lru_cache(maxsize=1)
 def kept_solver(
-    fov_deg: float | None, time_utc: datetime.datetime | None = None, stages: tuple[tuple[str, str], ...] = ()
+    fov_deg: float | None,
+    time_utc: datetime.datetime | None = None,
+    stages: tuple[tuple[str, str], ...] = (),
 ) -> Solver:
     """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
 
@@ -255,7 +287,11 @@ def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Se
         return None, opencv.read(path), Settings()
     is_file = path.suffix or path.exists()  # else the name of a shipped scene
     camera = loader.load_camera(path if is_file else loader.find(str(path)))
-    return camera, None, Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
+    return (
+        camera,
+        None,
+        Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector)),
+    )
 
 
 def read_catalog(name: str | None) -> star_catalog.StarCatalog:
@@ -294,9 +330,13 @@ def solve_array(
     clock = Clock()
     if centroids is None:  # of the camera only the size is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
-    attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock, efforts)
+    attitude, tracker = solve_centroids(
+        centroids, solver, (width_px, height_px), date_utc, clock, efforts
+    )
     if attitude.camera:
-        attitude = replace(attitude, camera=replace(attitude.camera, height_px=height_px))  # the picture's, of a half
+        attitude = replace(
+            attitude, camera=replace(attitude.camera, height_px=height_px)
+        )  # the picture's, of a half
     return Report(attitude, centroids, clock.seconds), tracker
 
 
@@ -320,7 +360,9 @@ def solve_centroids(
             if attitude.solved:
                 break
         allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
-        return (Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude), first
+        return (
+            Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude
+        ), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in made:  # try all fields of view quickly before trying any thoroughly
         trackers = solver.trackers(*size_px, date_utc)
@@ -355,7 +397,9 @@ def best_attitude(
     # The same attitude from neighboring trackers, whose ranges overlap, is no rival.
     rivals = [log10_chance(other) for other, _ in solutions if not same_attitude(other, best)]
     threshold = ACCEPT_LOG10_CHANCE - math.log10(tries)  # Bonferroni correction
-    significant = log10_chance(best) <= min(threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex)
+    significant = log10_chance(best) <= min(
+        threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex
+    )
     return (best if significant else Attitude(NO_MATCH)), best_tracker
 
 
@@ -386,4 +430,7 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
     """Return True if two solved attitudes differ by less than `same_attitude_rad`."""
     assert first.cam_from_ref is not None
     assert second.cam_from_ref is not None
-    return bool((first.cam_from_ref * second.cam_from_ref.inv()).magnitude() < FIELD_SEARCH.same_attitude_rad)
+    return bool(
+        (first.cam_from_ref * second.cam_from_ref.inv()).magnitude()
+        < FIELD_SEARCH.same_attitude_rad
+    )

@@ -68,7 +68,11 @@ class FrameHub:
             if len(self.disconnected) > KEPT_DISCONNECTED:
                 old = self.disconnected.popleft()
                 self.clients.remove(old)
-                for name, increment in (("clients", 1), ("sent", old.sent), ("dropped", old.dropped)):
+                for name, increment in (
+                    ("clients", 1),
+                    ("sent", old.sent),
+                    ("dropped", old.dropped),
+                ):
                     self.earlier[name] += increment
 
     def counters(self) -> dict[str, Any]:
@@ -87,7 +91,9 @@ class FrameHub:
         with self.changed:
             self.ended = True
             self.changed.notify_all()
-            self.changed.wait_for(lambda: len(self.clients) == len(self.disconnected), FINISH_TIMEOUT_S)
+            self.changed.wait_for(
+                lambda: len(self.clients) == len(self.disconnected), FINISH_TIMEOUT_S
+            )
 
     def wait_newer(self, number: int) -> Packet | None:
         """Wait for a packet newer than `number` and return it; None if the stream has ended without one."""
@@ -111,12 +117,16 @@ class Handler(BaseHTTPRequestHandler):
         if path == "/":
             self.respond(INDEX, "text/html")
         elif path == "/status.json":
-            self.respond(files.to_json(self.hub.sender_status() | self.hub.counters()).encode(), "application/json")
+            self.respond(
+                files.to_json(self.hub.sender_status() | self.hub.counters()).encode(),
+                "application/json",
+            )
         elif path in ("/stream.mjpg", "/stream.raw"):
             self.stream(path.endswith("raw"))
         elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
             self.send_error(
-                404, "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json"
+                404,
+                "allowed: /, /stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json",
             )
         elif newest is None:
             self.send_error(503, "no frame has been rendered yet")
@@ -125,7 +135,9 @@ class Handler(BaseHTTPRequestHandler):
         elif path == "/frame.raw":
             self.respond(newest.pack(), "application/octet-stream", newest.header)
         else:
-            self.respond(files.to_json({**newest.header, "truth": newest.truth}).encode(), "application/json")
+            self.respond(
+                files.to_json({**newest.header, "truth": newest.truth}).encode(), "application/json"
+            )
 
     do_HEAD = do_GET  # the same without a body
 
@@ -143,13 +155,16 @@ class Handler(BaseHTTPRequestHandler):
     def stream(self, raw: bool) -> None:
         """Send frames until the stream ends: packets if `raw`, else multipart JPEG with numbers from the header."""
         self.send_response(200)
-        content_type = "application/octet-stream" if raw else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+        content_type = (
+            "application/octet-stream" if raw else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+        )
         self.send_header("Content-Type", content_type)
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         if self.command == "HEAD":
             return
-        client, number = self.hub.connect(), -1
+        client = self.hub.connect()
+        number = -1
         try:
             while packet := self.hub.wait_newer(number):
                 # Packet numbers are consecutive, so a gap counts the packets that this client missed.
@@ -176,7 +191,9 @@ def mjpeg_part(packet: Packet) -> bytes:
     """One part of a multipart/x-mixed-replace response: a JPEG with header fields of the packet."""
     data = jpeg(to_8bit(packet.pixels, "square root"))
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
-    head += "".join(f"X-{name}: {packet.header[name]}\r\n" for name in ("index", "t_s", "due_unix_s", "dropped"))
+    head += "".join(
+        f"X-{name}: {packet.header[name]}\r\n" for name in ("index", "t_s", "due_unix_s", "dropped")
+    )
     return head.encode() + b"\r\n" + data + b"\r\n"
 
 
@@ -186,7 +203,9 @@ def start_server(hub: FrameHub, host: str, port: int) -> ThreadingHTTPServer:
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except OSError as error:
-        raise InputError(f"--http {port}", f"cannot listen on {host}:{port}: {error.strerror}") from None
+        raise InputError(
+            f"--http {port}", f"cannot listen on {host}:{port}: {error.strerror}"
+        ) from None
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, name="http", daemon=True).start()
     return server

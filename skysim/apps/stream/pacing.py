@@ -13,7 +13,8 @@ class Pace:
     """
 
     def __init__(self, speed: float, rate_hz: float) -> None:
-        self.speed, self.rate_hz = speed, rate_hz
+        self.speed = speed
+        self.rate_hz = rate_hz
         self.zero_s: float | None = None  # monotonic time at which scene time is 0
         self.offset_s = time.time() - time.monotonic()  # from monotonic to Unix time
 
@@ -33,7 +34,11 @@ class Pace:
 
     def is_on_time(self, _: int, t_s: float) -> bool:
         """Return True if a frame whose exposure ends at t_s is less than one frame period late, so worth rendering."""
-        return self.zero_s is None or not self.speed or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
+        return (
+            self.zero_s is None
+            or not self.speed
+            or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
+        )
 
     def wait(self, t_s: float) -> None:
         remaining_s = -self.late_s(t_s)

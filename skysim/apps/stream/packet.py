@@ -13,7 +13,9 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.simulation.flight import Shot
 
-MAX_HEADER_BYTES, MAX_PIXELS = 1 << 16, 1 << 28  # limits for the reader
+# limits for the reader
+MAX_HEADER_BYTES = 1 << 16
+MAX_PIXELS = 1 << 28
 
 
 class Packet(NamedTuple):
@@ -47,13 +49,21 @@ class Packet(NamedTuple):
 
 def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
     """Make the packet of a shot. Times: due and made, Unix seconds;  dropped : frames dropped before it."""
-    frame, truth = shot.frame, shot.truth
+    frame = shot.frame
+    truth = shot.truth
     pixels = np.ascontiguousarray(frame.image_dn, frame.image_dn.dtype.newbyteorder("<"))
     height, width = pixels.shape
     header = {
-        **{"index": frame.index, "t_s": frame.t_mid_s, "exposure_s": frame.exposure_s},
-        **{"width": width, "height": height, "dtype": pixels.dtype.str, "bytes": pixels.nbytes},
-        **{"due_unix_s": due_unix_s, "made_unix_s": made_unix_s, "dropped": dropped},
+        "index": frame.index,
+        "t_s": frame.t_mid_s,
+        "exposure_s": frame.exposure_s,
+        "width": width,
+        "height": height,
+        "dtype": pixels.dtype.str,
+        "bytes": pixels.nbytes,
+        "due_unix_s": due_unix_s,
+        "made_unix_s": made_unix_s,
+        "dropped": dropped,
     }
     truth_values = {
         "cam_from_ref_xyzw": np.roll(quaternion.from_rotation(truth.cam_from_lab), -1).tolist(),
@@ -72,14 +82,18 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
         return None
     try:
         header = json.loads(line)
-        shape, dtype_name = (int(header["height"]), int(header["width"])), header["dtype"]
+        shape = (int(header["height"]), int(header["width"]))
+        dtype_name = header["dtype"]
         if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", dtype_name):
             raise ValueError(dtype_name)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError("", f"not a packet of skysim stream: {line[:40]!r}") from error
-    count, dtype = shape[0] * shape[1], np.dtype(dtype_name)
+    count = shape[0] * shape[1]
+    dtype = np.dtype(dtype_name)
     if min(shape) < 1 or count > MAX_PIXELS:
-        raise InputError("", f"not a packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}")
+        raise InputError(
+            "", f"not a packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}"
+        )
     pixels = stream.read(count * dtype.itemsize)
     if len(pixels) < count * dtype.itemsize:
         raise InputError("", f"the stream ended within frame {header.get('index')}")

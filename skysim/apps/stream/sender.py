@@ -33,7 +33,8 @@ class SenderStats:
 
     def record(self, late_ms: float, dropped: int) -> None:
         """Record a rendered frame; dropped : number of frames dropped so far."""
-        self.rendered, self.dropped = self.rendered + 1, dropped
+        self.rendered = self.rendered + 1
+        self.dropped = dropped
         if self.rendered > 1:  # the first frame starts the clock, so it has no delay
             self.late_ms.append(late_ms)
 
@@ -46,12 +47,19 @@ class SenderStats:
             "late_ms_median": float(np.quantile(late, 0.5)),
             "late_ms_p99": float(np.quantile(late, 0.99)),
             "late_ms_worst": float(late.max()),
-            "sinks": {sink.name: {"sent": sink.sent, "dropped": sink.dropped, "fault": sink.fault} for sink in sinks},
+            "sinks": {
+                sink.name: {"sent": sink.sent, "dropped": sink.dropped, "fault": sink.fault}
+                for sink in sinks
+            },
         }
 
 
 def send(
-    flight: Flight, pace: Pace, sinks: list[Sink], stats: SenderStats, publish: Callable[[Packet], None] | None = None
+    flight: Flight,
+    pace: Pace,
+    sinks: list[Sink],
+    stats: SenderStats,
+    publish: Callable[[Packet], None] | None = None,
 ) -> None:
     """Fly and send each frame of the main camera when it is due, until the last one or until all sinks have failed.
 
@@ -60,14 +68,17 @@ def send(
     """
     scene = flight.lab.scene
     may_drop = scene.filter is None
-    for shot in flight.shots(cameras=[0], solves=False, selects=pace.is_on_time if may_drop else None):
+    for shot in flight.shots(
+        cameras=[0], solves=False, selects=pace.is_on_time if may_drop else None
+    ):
         frame = shot.frame
         window = exposure_window(scene, frame.index, frame.exposure_s)
         end_s = window.close_s(scene.camera.height_px)  # with a rolling shutter, of the last row
         if pace.zero_s is None:
             pace.start(end_s)  # so that the first frame has no delay
         pace.wait(end_s)
-        due_s, now_s = pace.due_s(end_s), time.monotonic()
+        due_s = pace.due_s(end_s)
+        now_s = time.monotonic()
         dropped = frame.index - stats.rendered
         packet = build_packet(shot, due_s + pace.offset_s, now_s + pace.offset_s, dropped)
         for sink in sinks:

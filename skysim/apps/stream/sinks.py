@@ -32,7 +32,8 @@ class Sink:
     """
 
     def __init__(self, name: str, write: Callable[[Packet], None]) -> None:
-        self.name, self.write = name, write
+        self.name = name
+        self.write = write
         self.sent = self.dropped = 0
         self.busy = False  # writing a packet that is counted neither as sent nor as dropped yet
         self.fault = ""
@@ -51,7 +52,9 @@ class Sink:
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
-            except Exception as error:  # a dead thread without `fault` would block a patient offer() for ever
+            except (
+                Exception
+            ) as error:  # a dead thread without `fault` would block a patient offer() for ever
                 self.fault = printable(f"{type(error).__name__}: {error}")
             if self.fault:
                 self.dropped += 1
@@ -63,7 +66,9 @@ class Sink:
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Queue a packet. If the queue is full, wait if `patient`, else drop the packet."""
-        packet = packet.plus_dropped(self.dropped)  # the header's count includes frames dropped by this sink
+        packet = packet.plus_dropped(
+            self.dropped
+        )  # the header's count includes frames dropped by this sink
         while not self.fault:
             try:
                 self.packets.put(packet, timeout=0.1 if patient else 0.0001)
@@ -103,7 +108,9 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
             files.write_bytes(stem.with_suffix(".png"), encode_png(packet))
         else:
             files.write_bytes(stem.with_suffix(".raw"), packet.pixels.tobytes())
-        files.write_text(stem.with_suffix(".json"), files.to_json({**packet.header, "truth": packet.truth}))
+        files.write_text(
+            stem.with_suffix(".json"), files.to_json({**packet.header, "truth": packet.truth})
+        )
 
     return write
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SMEAR, PARTICLES = "smear", "cosmic_ray"
+SMEAR = "smear"
+PARTICLES = "cosmic_ray"
 
 
 class AddedCharge:
@@ -19,7 +20,8 @@ class AddedCharge:
     """
 
     def __init__(self, threshold_e: float) -> None:
-        self.threshold_e, self.masks = threshold_e, dict[str, NDArray[np.bool_]]()
+        self.threshold_e = threshold_e
+        self.masks = dict[str, NDArray[np.bool_]]()
 
     @contextmanager
     def watch(self, name: str, electrons: NDArray[Any]) -> Iterator[None]:

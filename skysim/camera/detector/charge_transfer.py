@@ -35,22 +35,27 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
 
 
 @jit(parallel=True)
-def _bloom(electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float) -> None:
+def _bloom(
+    electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float
+) -> None:
     height = electrons.shape[0]
     for k in numba.prange(len(columns)):
         x = columns[k]
         headroom = np.empty(height)  # remaining capacity; negative: excess
-        first, last = height, -1
+        first = height
+        last = -1
         for y in range(height):
             headroom[y] = full_well_e - electrons[y, x]
             if headroom[y] < 0:
                 # The drain takes its fraction of the excess before the rest spreads.
                 headroom[y] *= 1 - anti_blooming
-                first, last = min(first, y), max(last, y)
+                first = min(first, y)
+                last = max(last, y)
         for y in range(height):
             if headroom[y] < 0:
                 a, b = _settle(headroom, y)
-                first, last = min(first, a), max(last, b)
+                first = min(first, a)
+                last = max(last, b)
         for y in range(max(first, 0), min(last, height - 1) + 1):
             # Back from remaining capacity to charge, only where something changed.
             electrons[y, x] = full_well_e - headroom[y]
@@ -66,19 +71,24 @@ def _settle(headroom: Floats, y: int) -> tuple[int, int]:
     joins the charge to spread. Beyond the column's ends any amount fits, and is lost.
     """
     height = len(headroom)
-    excess, moment = -headroom[y], 0.0  # moment about y
+    # moment about y
+    excess = -headroom[y]
+    moment = 0.0
     headroom[y] = 0.0
-    a, b = y - 1, y + 1
+    a = y - 1
+    b = y + 1
     while True:
         # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
         to_b = (moment + excess * (y - a)) / (b - a)
         to_a = excess - to_b
         if a >= 0 and to_a > headroom[a]:
-            excess, moment = excess - headroom[a], moment - headroom[a] * (a - y)
+            excess = excess - headroom[a]
+            moment = moment - headroom[a] * (a - y)
             headroom[a] = 0.0
             a -= 1
         elif b < height and to_b > headroom[b]:
-            excess, moment = excess - headroom[b], moment - headroom[b] * (b - y)
+            excess = excess - headroom[b]
+            moment = moment - headroom[b] * (b - y)
             headroom[b] = 0.0
             b += 1
         else:
@@ -129,13 +139,15 @@ def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
     """Apply the parallel loss from the last row to the first: each row gathers from rows that are not yet changed."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
-        first, last = block * BLOCK, min((block + 1) * BLOCK, width)
+        first = block * BLOCK
+        last = min((block + 1) * BLOCK, width)
         gathered = np.empty(last - first, electrons.dtype)
         # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
         for y in range(height - 1, -1, -1):
             gathered[:] = 0
             for k in range(min(len(fraction), y + 1)):
-                weight, packets = electrons.dtype.type(fraction[k, y - k]), electrons[y - k, first:last]
+                weight = electrons.dtype.type(fraction[k, y - k])
+                packets = electrons[y - k, first:last]
                 for x in range(len(gathered)):
                     gathered[x] += weight * packets[x]
             electrons[y, first:last] = gathered
@@ -146,9 +158,11 @@ def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
     """Apply the serial loss. fraction : of the electrons' type"""
     height, width = electrons.shape
     for y in numba.prange(height):
-        row, gathered = electrons[y], np.zeros(width, electrons.dtype)
+        row = electrons[y]
+        gathered = np.zeros(width, electrons.dtype)
         for k in range(min(len(fraction), width)):
-            weight, late = fraction[k], gathered[k:]
+            weight = fraction[k]
+            late = gathered[k:]
             for x in range(len(late)):
                 late[x] += weight[x] * row[x]
         row[:] = gathered
@@ -167,7 +181,9 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
     _smear(light_e, row_time_s / exposure_s)
 
 
-def interline_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float) -> None:
+def interline_smear(
+    light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float
+) -> None:
     """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
 
     light_e : light of the exposure; the smear is added in place. The register is clocked all the time, so
@@ -181,12 +197,16 @@ def _smear(light_e: NDArray[Any], fraction: float) -> None:
     """Add to every pixel a fraction of the sum of the other pixels in its column."""
     height, width = light_e.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
-        first, last = block * BLOCK, min((block + 1) * BLOCK, width)
+        first = block * BLOCK
+        last = min((block + 1) * BLOCK, width)
         total = np.zeros(last - first)
         for y in range(height):
             total += light_e[y, first:last]
-        smear, own = (fraction * total).astype(light_e.dtype), light_e.dtype.type(1 - fraction)
+        smear = (fraction * total).astype(light_e.dtype)
+        own = light_e.dtype.type(1 - fraction)
         for y in range(height):
-            row = light_e[y, first:last]  # contiguous for the compiler, which rows of a block of columns are not
+            row = light_e[
+                y, first:last
+            ]  # contiguous for the compiler, which rows of a block of columns are not
             for x in range(len(row)):
                 row[x] = own * row[x] + smear[x]

@@ -20,7 +20,9 @@ STEP_PX = 0.25
 # Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometer, 4.9 electrons of 3.65 eV, over
 # 80 most probable ones (`assumed`, for a fast singly charged particle). Layers of a few micrometers straggle more.
 MOYAL_WIDTH = 0.06
-MAX_TANGENT = 100.0  # tangent of the largest angle from the normal; 1e-4 of an isotropic flux is beyond
+MAX_TANGENT = (
+    100.0  # tangent of the largest angle from the normal; 1e-4 of an isotropic flux is beyond
+)
 MAX_TRACKS = 1_000_000
 
 TRACK = np.dtype(
@@ -49,10 +51,16 @@ def add_particles(
     front and exit at the back (pixels, also outside of the frame), path length through the layer, charge released,
     and the charge that fell on the frame.
     """
-    tracks = [draw_tracks(config, electrons.shape, exposure_s, pixel_m, rng) for config in particles]
+    tracks = [
+        draw_tracks(config, electrons.shape, exposure_s, pixel_m, rng) for config in particles
+    ]
     for config, track in zip(particles, tracks, strict=True):
-        ends_px = np.column_stack([track["x_px"], track["y_px"], track["end_x_px"], track["end_y_px"]])
-        track["deposited_e"] = deposit(electrons, ends_px, track["electrons"], max(config.diffusion_px, 1e-3))
+        ends_px = np.column_stack(
+            [track["x_px"], track["y_px"], track["end_x_px"], track["end_y_px"]]
+        )
+        track["deposited_e"] = deposit(
+            electrons, ends_px, track["electrons"], max(config.diffusion_px, 1e-3)
+        )
     all_tracks = np.concatenate(tracks) if tracks else np.empty(0, TRACK)
     return all_tracks[all_tracks["deposited_e"] > 0]
 
@@ -80,7 +88,9 @@ def draw_tracks(
     expected = config.per_cm2_s * area_cm2 * exposure_s
     if expected > MAX_TRACKS:
         raise InputError(
-            "camera.detector.particles", f"{expected:.3g} tracks come near the chip in an exposure", f"{MAX_TRACKS:,}"
+            "camera.detector.particles",
+            f"{expected:.3g} tracks come near the chip in an exposure",
+            f"{MAX_TRACKS:,}",
         )
     count = rng.poisson(expected)
     tracks = np.zeros(count, TRACK)
@@ -113,8 +123,10 @@ def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: f
         x, y, end_x, end_y = ends_px[n]
         steps = int(np.ceil(sqrt((end_x - x) ** 2 + (end_y - y) ** 2) / STEP_PX)) + 1
         for k in range(steps):
-            along, charge = (k + 0.5) / steps, electrons[n] / steps
-            center_x, center_y = x + along * (end_x - x), y + along * (end_y - y)
+            along = (k + 0.5) / steps
+            charge = electrons[n] / steps
+            center_x = x + along * (end_x - x)
+            center_y = y + along * (end_y - y)
             add_gaussian(image, 0, height, center_x, center_y, charge, sigma_px)
             inside_x = _fraction_inside(center_x, width, sigma_px)
             deposited[n] += charge * inside_x * _fraction_inside(center_y, height, sigma_px)

@@ -22,7 +22,13 @@ from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.types import SourceTruth
-from skysim.scene.sections.camera import CameraConfig, DetectorConfig, FrameTransferConfig, InterlineConfig, Shutter
+from skysim.scene.sections.camera import (
+    CameraConfig,
+    DetectorConfig,
+    FrameTransferConfig,
+    InterlineConfig,
+    Shutter,
+)
 from skysim.sources.photometry import snr
 
 ROWS = 16  # that share memory for their random numbers
@@ -47,7 +53,8 @@ class Detector:
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Detector:
         """Draw the fixed pattern."""
-        config, shape = camera.detector, (camera.height_px, camera.width_px)
+        config = camera.detector
+        shape = (camera.height_px, camera.width_px)
         prnu, dark, column = (random_stream(config.hardware_seed, key) for key in range(3))
         return cls(
             config,
@@ -59,7 +66,9 @@ class Detector:
         )
 
 
-def sensitivity(config: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
+def sensitivity(
+    config: DetectorConfig, shape: tuple[int, int], rng: Generator
+) -> NDArray[np.float32]:
     """Photo-response non-uniformity (PRNU): Gaussian about 1, independent in each pixel, not below 0."""
     if config.prnu == 0:
         return np.ones(shape, np.float32)
@@ -69,7 +78,9 @@ def sensitivity(config: DetectorConfig, shape: tuple[int, int], rng: Generator) 
     return np.maximum(prnu, 0, out=prnu)
 
 
-def dark_current_e_s(config: DetectorConfig, shape: tuple[int, int], rng: Generator) -> NDArray[np.float32]:
+def dark_current_e_s(
+    config: DetectorConfig, shape: tuple[int, int], rng: Generator
+) -> NDArray[np.float32]:
     """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal over the pixels.
 
     A lognormal of mean 1 and standard deviation dsnu has s^2 = ln(1 + dsnu^2) and median exp(-s^2 / 2). Hot pixels
@@ -88,7 +99,11 @@ def dark_current_e_s(config: DetectorConfig, shape: tuple[int, int], rng: Genera
 
 
 def expose(
-    light_e: NDArray[Any], exposure_s: float, detector: Detector, rng: Generator, added: AddedCharge | None = None
+    light_e: NDArray[Any],
+    exposure_s: float,
+    detector: Detector,
+    rng: Generator,
+    added: AddedCharge | None = None,
 ) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
@@ -100,12 +115,26 @@ def expose(
     config = detector.config
     if not config.noise:
         return expectation(light_e, exposure_s, detector)
-    count_seeds, read_seeds = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
-    constants, guide = readout_constants(config, exposure_s), noise.guide()
-    pattern, frame = (detector.sensitivity, detector.dark_e_s), np.empty(light_e.shape, np.uint16)
+    count_seeds = noise.seeds(rng, len(light_e))
+    read_seeds = noise.seeds(rng, len(light_e))
+    constants = readout_constants(config, exposure_s)
+    guide = noise.guide()
+    pattern = (detector.sensitivity, detector.dark_e_s)
+    frame = np.empty(light_e.shape, np.uint16)
     # With no step between counting and read-out, one fused loop does both, with the same numbers.
-    if not (config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial):
-        _count_and_read(light_e, *pattern, detector.column_offset_e, constants, count_seeds, read_seeds, guide, frame)
+    if not (
+        config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial
+    ):
+        _count_and_read(
+            light_e,
+            *pattern,
+            detector.column_offset_e,
+            constants,
+            count_seeds,
+            read_seeds,
+            guide,
+            frame,
+        )
         return frame
     _count(light_e, *pattern, constants, count_seeds, guide)
     if config.particles:
@@ -129,7 +158,9 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
     return (mean_e + detector.column_offset_e) / config.gain_e_dn + config.offset_dn
 
 
-def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None) -> None:
+def smear(
+    light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None
+) -> None:
     """Add the smear of a frame-transfer or interline shutter to the light (in place). Other shutters add none.
 
     Rolling shutters are part of the time integral in render.py. added : gets the mask of the pixels
@@ -191,7 +222,12 @@ def _count_row(
 
 @jit
 def _read_row(
-    row: Any, offset_e: Any, constants: ReadoutConstants, seed: Any, memory: noise.Scratch, dn_row: Any
+    row: Any,
+    offset_e: Any,
+    constants: ReadoutConstants,
+    seed: Any,
+    memory: noise.Scratch,
+    dn_row: Any,
 ) -> None:
     """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
 
@@ -202,12 +238,22 @@ def _read_row(
     noise.normal(noise_row, seed, memory)
     for x in range(row.size):
         e = min(row[x], constants.well_e) + offset_e[x] + constants.noise_e * noise_row[x]
-        dn = e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e + constants.offset_dn
+        dn = (
+            e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e
+            + constants.offset_dn
+        )
         dn_row[x] = np.uint16(int32(min(max(dn, float32(0)), constants.top_dn)))
 
 
 @jit(parallel=True)
-def _count(light_e: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutConstants, seeds: Any, guide: Any) -> None:
+def _count(
+    light_e: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    constants: ReadoutConstants,
+    seeds: Any,
+    guide: Any,
+) -> None:
     """Light to electrons, in place; see `_count_row`."""
     height, width = light_e.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
@@ -217,7 +263,9 @@ def _count(light_e: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutCons
 
 
 @jit(parallel=True)
-def _read_out(electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any) -> None:
+def _read_out(
+    electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any
+) -> None:
     """Electrons to digital numbers; see `_read_row`."""
     height, width = electrons.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
@@ -243,7 +291,9 @@ def _count_and_read(
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
         for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory)
+            _count_row(
+                light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory
+            )
             _read_row(light_e[y], offset_e, constants, read_seeds[y], memory, frame[y])
 
 
@@ -252,7 +302,10 @@ def saturation_dn(config: DetectorConfig) -> float:
     or the converter's maximum.
     """
     well_e = config.full_well_e - 3 * hypot(config.read_noise_e, config.reset_noise_e)
-    well_dn = well_e * (1 - config.nonlinearity * well_e / config.full_well_e) / config.gain_e_dn + config.offset_dn
+    well_dn = (
+        well_e * (1 - config.nonlinearity * well_e / config.full_well_e) / config.gain_e_dn
+        + config.offset_dn
+    )
     return float(min(max(well_dn, 0.0), 2**config.bits - 1))
 
 

@@ -29,12 +29,15 @@ GUIDES_PER_E = 128  # guide tables per electron of mean
 INVERSION_MAX_E = 16.0  # means above it use the PD algorithm
 # Entries of the guide table for buckets that more than one count shares, and for means above INVERSION_MAX_E. They have
 # the highest bit, which counts below LARGE_BIT do not have.
-AMBIGUOUS, LARGE, LARGE_BIT = 255, 254, 128
+AMBIGUOUS = 255
+LARGE = 254
+LARGE_BIT = 128
 EIGHT_BITS = 0x8080808080808080  # the highest bits of eight entries
 RARE = 128  # a radius of Box & Muller below RARE of 2^31 gets more bits
 
 GAMMA = 0x9E3779B97F4A7C15
-MIX1, MIX2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+MIX1 = 0xBF58476D1CE4E5B9
+MIX2 = 0x94D049BB133111EB
 ROOT_HALF_BITS = 0x3F3504F3  # the single-precision number sqrt(1/2)
 
 
@@ -97,15 +100,22 @@ def _guide() -> Any:
     rows = int(INVERSION_MAX_E * GUIDES_PER_E)
     guide = np.full((rows + 1, BUCKETS), np.uint8(LARGE))
     for k in range(rows):
-        low, high = k / GUIDES_PER_E, (k + 1) / GUIDES_PER_E
-        p_low, p_high, n, below = exp(-low), exp(-high), 0, 0.0
-        f_low, f_high = p_low, p_high
+        low = k / GUIDES_PER_E
+        high = (k + 1) / GUIDES_PER_E
+        p_low = exp(-low)
+        p_high = exp(-high)
+        n = 0
+        below = 0.0
+        f_low = p_low
+        f_high = p_high
         for b in range(BUCKETS):
             while b / BUCKETS >= f_low and n < LARGE_BIT - 1:
                 n += 1
                 below = f_low
-                p_low, p_high = p_low * low / n, p_high * high / n
-                f_low, f_high = f_low + p_low, f_high + p_high
+                p_low = p_low * low / n
+                p_high = p_high * high / n
+                f_low = f_low + p_low
+                f_high = f_high + p_high
             guide[k, b] = n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else AMBIGUOUS
     return guide
 
@@ -141,8 +151,12 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
     bits are drawn and the law is summed at the exact mean. Large means use Ahrens & Dieter's PD (1982), see
     `_count_large`.
     """
-    cell, late, found = memory.cell, memory.late, memory.found
-    width, bits, least = row.size, memory.bits[: (row.size + 3) // 4], float32(INVERSION_MAX_E)
+    cell = memory.cell
+    late = memory.late
+    found = memory.found
+    width = row.size
+    bits = memory.bits[: (row.size + 3) // 4]
+    least = float32(INVERSION_MAX_E)
     for x in range(width):
         least = min(least, row[x])
     if least == float32(INVERSION_MAX_E):
@@ -150,12 +164,15 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
             late[x] = x
         return _count_large(row, late[:width], state, memory)
     state = _draws(bits, state)
-    words, table = bits.view(np.uint16), guide.reshape(-1)
+    words = bits.view(np.uint16)
+    table = guide.reshape(-1)
     for x in range(width):
         k = int32(min(row[x] * float32(GUIDES_PER_E), float32(INVERSION_MAX_E * GUIDES_PER_E)))
         cell[x] = int32(int32(k * int32(BUCKETS)) + int32(words[x] >> uint16(6)))
     for x in range(width):
-        found[x] = table[uint64(uint32(cell[x]))]  # unsigned: saves numba's check for negative indices
+        found[x] = table[
+            uint64(uint32(cell[x]))
+        ]  # unsigned: saves numba's check for negative indices
     large = 0
     for n in range(_marked(found, late)):
         x = late[n]
@@ -164,7 +181,9 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
             large += 1
         else:
             more, state = _uniform(state)
-            found[x] = uint8(_invert(float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS))
+            found[x] = uint8(
+                _invert(float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS)
+            )
     if large == 0:
         for x in range(width):
             row[x] = float32(found[x])
@@ -177,7 +196,8 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
 @jit
 def _marked(found: Any, late: Any) -> int:
     """Write the places of the entries with the highest bit to `late`, in order; return their number."""
-    eights, count = found.view(np.uint64), 0
+    eights = found.view(np.uint64)
+    count = 0
     for n in range(eights.size):
         if eights[n] & uint64(EIGHT_BITS):
             for x in range(8 * n, 8 * n + 8):
@@ -190,7 +210,8 @@ def _marked(found: Any, late: Any) -> int:
 @jit
 def _invert(mean: Any, u: Any) -> Any:
     """The least n with F(n) > u, by summing the Poisson law."""
-    n, p = 0.0, exp(-mean)
+    n = 0.0
+    p = exp(-mean)
     total = p
     while u >= total and n < LARGE_BIT - 1:
         n += 1.0
@@ -207,8 +228,11 @@ def _count_large(row: Any, pixels: Any, state: Any, memory: Scratch) -> Any:
     mean^-1/2. A squeeze accepts most numbers without computing the law: u >= (mean - k)^3 / (6 mean^2). The rest go
     to `_correct`, which accepts or replaces them so that the law is exact.
     """
-    count, found = pixels.size, memory.found
-    counts, means, bits = memory.normals[:count], memory.means[:count], memory.bits[: (count + 1) // 2]
+    count = pixels.size
+    found = memory.found
+    counts = memory.normals[:count]
+    means = memory.means[:count]
+    bits = memory.bits[: (count + 1) // 2]
     state = _draws(bits, normal(counts, state, memory))
     words = bits.view(np.int32)
     found[:] = 0
@@ -225,7 +249,9 @@ def _count_large(row: Any, pixels: Any, state: Any, memory: Scratch) -> Any:
     for n in range(_marked(found, memory.cell)):
         which = memory.cell[n]
         mean = float64(means[which])
-        counts[which], state = _correct(mean, sqrt(mean), float64(counts[which]), _fraction(words[which]), state)
+        counts[which], state = _correct(
+            mean, sqrt(mean), float64(counts[which]), _fraction(words[which]), state
+        )
     for n in range(count):
         row[pixels[n]] = counts[n]
     return state
@@ -265,7 +291,8 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
     k >= 10 by Stirling's series: px = k (log(1 + v) - v) - 1/(12 k) + ..., v = (mean - k) / k.
     """
     if k < 10:
-        px, py = -mean, 1.0
+        px = -mean
+        py = 1.0
         for i in range(int(k)):
             py *= mean / (i + 1)
     else:
@@ -294,10 +321,14 @@ def normal(row: Any, state: Any, memory: Scratch) -> Any:
     Of v two bits choose the quadrant, and 30 the place in it. Sine and cosine are the polynomials of Cephes, the
     logarithm is that of FreeBSD's logf: both are within two units of the last place of single precision.
     """
-    half, radius, exponent = (row.size + 1) // 2, memory.radius, memory.exponent
+    half = (row.size + 1) // 2
+    radius = memory.radius
+    exponent = memory.exponent
     bits = memory.bits[:half]
     state = _draws(bits, state)
-    words, mantissa, rare = bits.view(np.int32), radius.view(np.int32), 0
+    words = bits.view(np.int32)
+    mantissa = radius.view(np.int32)
+    rare = 0
     for n in range(half):
         steps = int32(words[n] & int32(0x7FFFFFFF))
         rare += steps < RARE
@@ -314,7 +345,8 @@ def normal(row: Any, state: Any, memory: Scratch) -> Any:
     second = row[half:]
     for n in range(row.size - half):
         x, y = _direction(words[half + n])
-        row[n], second[n] = radius[n] * x, radius[n] * y
+        row[n] = radius[n] * x
+        second[n] = radius[n] * y
     if row.size < 2 * half:
         row[half - 1] = radius[half - 1] * _direction(words[2 * half - 1])[0]
     return state
@@ -330,7 +362,9 @@ def _log(mantissa: Any, exponent: Any) -> Any:
     odd = z * (float32(0.66666662693) + w * float32(0.28498786688))
     even = w * (float32(0.40000972152) + w * float32(0.24279078841))
     square = float32(0.5) * f * f
-    low, high = exponent * float32(9.0580006145e-06), exponent * float32(6.9313812256e-01)  # ln 2 in two parts
+    # ln 2 in two parts
+    low = exponent * float32(9.0580006145e-06)
+    high = exponent * float32(6.9313812256e-01)
     return s * (square + (even + odd)) + low - square + f + high
 
 
@@ -340,10 +374,14 @@ def _direction(word: Any) -> Any:
     steps = int32(int32(word << int32(2)) >> int32(2))
     angle = (float32(steps) + float32(0.5)) * float32(pi / 2**31)
     z = angle * angle
-    x = (float32(2.443315711809948e-5) * z - float32(1.388731625493765e-3)) * z + float32(4.166664568298827e-2)
+    x = (float32(2.443315711809948e-5) * z - float32(1.388731625493765e-3)) * z + float32(
+        4.166664568298827e-2
+    )
     y = (float32(-1.9515295891e-4) * z + float32(8.3321608736e-3)) * z - float32(1.6666654611e-1)
-    x, y = x * z * z - float32(0.5) * z + float32(1), y * z * angle + angle
-    turned, sign = int32(word & int32(1 << 30)) != 0, float32(1) if word < 0 else float32(-1)
+    x = x * z * z - float32(0.5) * z + float32(1)
+    y = y * z * angle + angle
+    turned = int32(word & int32(1 << 30)) != 0
+    sign = float32(1) if word < 0 else float32(-1)
     return sign * (-y if turned else x), sign * (x if turned else y)
 
 

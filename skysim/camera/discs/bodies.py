@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.camera.discs.disc_image import DiscImage, Exposed, Hidden, disc_image, disc_on_chip, points_of
+from skysim.camera.discs.disc_image import (
+    DiscImage,
+    Exposed,
+    Hidden,
+    disc_image,
+    disc_on_chip,
+    points_of,
+)
 from skysim.camera.render import OcclusionTest, in_view, poses, render
 from skysim.core.types import Floats, Sources, SourceTruth
 from skysim.sources.solar_system.bodies import BodyLight
@@ -23,26 +30,39 @@ FEW = 9  # poses in an exposure at which a body is looked for in the field
 
 
 def render_bodies(
-    image: NDArray[Any], bodies: Sequence[BodyLight], exposed: Exposed, occluded: OcclusionTest | None = None
+    image: NDArray[Any],
+    bodies: Sequence[BodyLight],
+    exposed: Exposed,
+    occluded: OcclusionTest | None = None,
 ) -> list[SourceTruth]:
     """Add the light of the bodies, farthest first, to the (H, W) image, in place; return the truth of each in view.
 
     Lens, motion and shutter act on a disc as on a star (see disc_image.py). What is behind a nearer body is left out.
     """
     window = exposed.window
-    few_poses = poses(exposed.trajectory, exposed.mount, np.linspace(window.open_s, window.close_s(len(image)), FEW))
+    few_poses = poses(
+        exposed.trajectory,
+        exposed.mount,
+        np.linspace(window.open_s, window.close_s(len(image)), FEW),
+    )
     truths = []
     for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
         body = bodies[n]
         disc = disc_on_chip(body, exposed)
-        diameter_px = 2 * float(np.linalg.norm(disc.px_from_radius, 2)) if np.isfinite(disc.center_px).all() else 0.0
+        diameter_px = (
+            2 * float(np.linalg.norm(disc.px_from_radius, 2))
+            if np.isfinite(disc.center_px).all()
+            else 0.0
+        )
         nearer = bodies[n + 1 :]
         if diameter_px > SMALL_PX:
             drawn = disc_image(body, disc, exposed, hidden_points(body, nearer, occluded))
             truths += add_disc(image, drawn, body, disc.center_px)
         else:
             hidden = behind(nearer, occluded)
-            truths += render_points(image, body, diameter_px > POINT_PX, exposed, hidden, disc.center_px)
+            truths += render_points(
+                image, body, diameter_px > POINT_PX, exposed, hidden, disc.center_px
+            )
     return truths
 
 
@@ -75,10 +95,14 @@ def render_points(
     return [whole(own, np.zeros(2, np.int64), body, center_px, *streak)]
 
 
-def add_disc(image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats) -> list[SourceTruth]:
+def add_disc(
+    image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats
+) -> list[SourceTruth]:
     """Add a disc's image to the chip's; return its truth, none if it misses the chip."""
-    size, limit = np.array(disc.electrons.shape[::-1]), np.array(image.shape[::-1])
-    low, high = np.clip(disc.corner_px, 0, limit), np.clip(disc.corner_px + size, 0, limit)
+    size = np.array(disc.electrons.shape[::-1])
+    limit = np.array(image.shape[::-1])
+    low = np.clip(disc.corner_px, 0, limit)
+    high = np.clip(disc.corner_px + size, 0, limit)
     (x0, y0), (x1, y1) = low - disc.corner_px, high - disc.corner_px
     own = disc.electrons[y0:y1, x0:x1]
     if not own.size or own.max() <= 0:
@@ -98,7 +122,8 @@ def whole(
     """The truth of one body, a row, from its own light in a part of the image that begins at a corner (x, y)."""
     electrons = own_e.sum(dtype=float)
     y, x = np.unravel_index(np.argmax(own_e), own_e.shape)
-    columns, rows = own_e.sum(axis=0, dtype=float), own_e.sum(axis=1, dtype=float)
+    columns = own_e.sum(axis=0, dtype=float)
+    rows = own_e.sum(axis=1, dtype=float)
     center = np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
     return SourceTruth(
         id=np.array([body.id]),
@@ -125,7 +150,9 @@ def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> Occlu
     return hidden if bodies else occluded
 
 
-def hidden_points(body: BodyLight, nearer: Sequence[BodyLight], occluded: OcclusionTest | None) -> Hidden | None:
+def hidden_points(
+    body: BodyLight, nearer: Sequence[BodyLight], occluded: OcclusionTest | None
+) -> Hidden | None:
     """The test for points (M, 2) of a disc that nearer bodies or the vehicle hide; None if nothing does.
 
     The vehicle is tested at COARSE places across the disc.
@@ -133,12 +160,20 @@ def hidden_points(body: BodyLight, nearer: Sequence[BodyLight], occluded: Occlus
     overlapping = [other for other in nearer if body.overlaps(other)]
     axis = (np.arange(COARSE) + 0.5) * (2 / COARSE) - 1
     coarse = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    by_vehicle = occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
+    by_vehicle = (
+        occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
+    )
 
     def hidden(xy: Floats) -> NDArray[np.bool_]:
         column, row = np.clip(((xy + 1) * (COARSE / 2)).astype(int), 0, COARSE - 1).T
         directions = body.directions(xy)
-        return np.any([by_vehicle[row * COARSE + column], *(other.hides(directions) for other in overlapping)], axis=0)
+        return np.any(
+            [
+                by_vehicle[row * COARSE + column],
+                *(other.hides(directions) for other in overlapping),
+            ],
+            axis=0,
+        )
 
     return hidden if overlapping or by_vehicle.any() else None
 
@@ -148,4 +183,6 @@ def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
     if len(truths) == 1:
         return truths[0]
     names = [field.name for field in fields(SourceTruth)]
-    return SourceTruth(**{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names})
+    return SourceTruth(
+        **{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names}
+    )

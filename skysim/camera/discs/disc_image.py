@@ -25,9 +25,13 @@ from skysim.sources.dome.led import Emitter
 from skysim.sources.solar_system.bodies import BodyLight
 from skysim.sources.stars import steady_points
 
-LATTICE = 0.7  # largest spacing of the lattice, in units of the star image's sharpest feature (sigma)
+LATTICE = (
+    0.7  # largest spacing of the lattice, in units of the star image's sharpest feature (sigma)
+)
 SUBSAMPLES = 2  # least number of samples across a point of the lattice
-MIN_SAMPLES, MAX_SAMPLES = 160, 480  # across a disc
+# across a disc
+MIN_SAMPLES = 160
+MAX_SAMPLES = 480
 CRESCENT_SAMPLES = 4  # wanted across a crescent
 ON_DISC = 1.2  # square of the radius within which a sample can have light
 SMALL = 1e-3  # of the radius: the step by which the disc's scale on the chip is found
@@ -58,7 +62,8 @@ Hidden = Callable[[Floats], NDArray[np.bool_]]  # which of (M, 2) points of a di
 
 def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
     """Project the disc's center and two points near it. Center and scale are NaN behind the camera."""
-    window, rows = exposed.window, exposed.optics.camera.height_px
+    window = exposed.window
+    rows = exposed.optics.camera.height_px
     xy = SMALL * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     middle = poses(exposed.trajectory, exposed.mount, np.array([window.middle_s(rows)]))
     center, x, y = project(points_of(body, xy), exposed.optics, middle)[0][0]
@@ -68,7 +73,8 @@ def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
 def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
     """Points (M, 2) of a body's disc as Sources with (M,) shares of its light, all of it each if left out."""
     share = np.ones(len(xy)) if share is None else share
-    ids, magnitude = np.full(len(xy), body.id, np.int64), np.full(len(xy), body.magnitude)
+    ids = np.full(len(xy), body.id, np.int64)
+    magnitude = np.full(len(xy), body.magnitude)
     colors = None if body.chromatic is None else np.tile(body.chromatic, (len(xy), 1))
     return steady_points(ids, body.directions(xy), share * body.flux_e_s_m2, magnitude, colors)
 
@@ -90,26 +96,45 @@ class StarImages(NamedTuple):
 
 def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImages:
     """Draw a point with all of the body's light at the disc's center and at s^2 sub-pixel phases from it."""
-    optics, camera = exposed.optics, exposed.optics.camera
-    t_s = sample_times(exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory)
+    optics = exposed.optics
+    camera = exposed.optics.camera
+    t_s = sample_times(
+        exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory
+    )
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
     star = star_kernel(optics, disc.center_px, body.chromatic)
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
-    phase_px = np.stack(np.meshgrid(*2 * (np.arange(steps) / steps,)), axis=-1).reshape(-1, 2)  # x fastest
+    phase_px = np.stack(np.meshgrid(*2 * (np.arange(steps) / steps,)), axis=-1).reshape(
+        -1, 2
+    )  # x fastest
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
     tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
-    xy_px, middle = tracks.xy_px, len(t_s) // 2
-    is_led, blur_px = np.zeros(len(points), bool), optics.blur_px
+    xy_px = tracks.xy_px
+    middle = len(t_s) // 2
+    is_led = np.zeros(len(points), bool)
+    blur_px = optics.blur_px
     kernels = source_kernels(
-        camera, xy_px[middle], points.radius_m, is_led, distance_m, cos_in, None, blur_px, points.chromatic
+        camera,
+        xy_px[middle],
+        points.radius_m,
+        is_led,
+        distance_m,
+        cos_in,
+        None,
+        blur_px,
+        points.chromatic,
     )
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
-    width, height = (np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1).tolist()
+    width, height = (
+        np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1
+    ).tolist()
     # Side by side in one strip, each in a patch of its own.
     strip = np.zeros((height, len(points) * width))
     moved = xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
-    window = exposed.window._replace(open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s)
+    window = exposed.window._replace(
+        open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
+    )
     drawn = draw(strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window)
     patches = strip.reshape(height, steps, steps, width).transpose(1, 2, 0, 3)
     speed = (xy_px[middle + 1, 0] - xy_px[middle - 1, 0]) / (2 * tracks.step_s)
@@ -121,7 +146,9 @@ def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kern
     one = np.ones(1)
     is_led = np.zeros(1, bool)
     colors = None if chromatic is None else chromatic[None]
-    return source_kernels(optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors)
+    return source_kernels(
+        optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors
+    )
 
 
 class DiscImage(NamedTuple):
@@ -135,7 +162,9 @@ class DiscImage(NamedTuple):
     streak_xy_px: Floats
 
 
-def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None) -> DiscImage:
+def disc_image(
+    body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
+) -> DiscImage:
     """The mean photo-electrons of a disc, also those beyond the chip.
 
     In a rolling shutter a point d below the center is exposed d rows later, and the image has moved by v row_time d
@@ -148,7 +177,8 @@ def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidd
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
     light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
-    corner_px, streak_xy_px = star.corner_px - reach_px, star.speed_px_s * exposed.window.exposure_s
+    corner_px = star.corner_px - reach_px
+    streak_xy_px = star.speed_px_s * exposed.window.exposure_s
     return DiscImage(convolved(light, star.patches), corner_px, star.streak_px, streak_xy_px)
 
 

@@ -16,20 +16,38 @@ REACH = 3  # points to either side among which a sample's light is shared
 
 
 def lattice_light(
-    surface: Surface, count: int, subsamples: int, axis_px: Floats, radius_from_px: Floats, shown: Any
+    surface: Surface,
+    count: int,
+    subsamples: int,
+    axis_px: Floats,
+    radius_from_px: Floats,
+    shown: Any,
 ) -> Floats:
     """(count, count) shares of the disc's light at the points of a lattice, [y, x], which zeros must surround.
 
     axis_px : (count * subsamples,) even coordinates of the samples in both directions
     shown   : (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where all are seen
     """
-    fine, weights = len(axis_px), sharing_weights(subsamples)
+    fine = len(axis_px)
+    weights = sharing_weights(subsamples)
     step = float(axis_px[1] - axis_px[0]) * math.sqrt(abs(float(np.linalg.det(radius_from_px))))
-    matrix, has_earthshine = np.ascontiguousarray(radius_from_px), surface.earthshine > 0
+    matrix = np.ascontiguousarray(radius_from_px)
+    has_earthshine = surface.earthshine > 0
     sunlit = np.empty((fine, count))
     earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
     totals = np.empty((fine, 2))
-    _light_rows(sunlit, earthlit, totals, surface.law, surface.phase_rad, axis_px, matrix, step, weights, shown)
+    _light_rows(
+        sunlit,
+        earthlit,
+        totals,
+        surface.law,
+        surface.phase_rad,
+        axis_px,
+        matrix,
+        step,
+        weights,
+        shown,
+    )
     of_sun, of_earth = totals.sum(axis=0)
     light = np.empty((count, count))
     of_all = 1 + surface.earthshine
@@ -72,11 +90,17 @@ def _light_rows(
 
     totals : (fine, 2) sums of the rows with what is hidden
     """
-    count, subsamples = sunlit.shape[1], len(weights)
-    sine, cosine, inner = math.sin(phase_rad), math.cos(phase_rad), inner_radius2(step)
-    with_earth, masked = len(earthlit) > 0, len(shown) > 0
+    count = sunlit.shape[1]
+    subsamples = len(weights)
+    sine = math.sin(phase_rad)
+    cosine = math.cos(phase_rad)
+    inner = inner_radius2(step)
+    with_earth = len(earthlit) > 0
+    masked = len(shown) > 0
     for j in numba.prange(len(axis_px)):
-        own = np.zeros((2, subsamples, count + 2 * REACH))  # with a margin, so that no point has an edge
+        own = np.zeros(
+            (2, subsamples, count + 2 * REACH)
+        )  # with a margin, so that no point has an edge
         of_sun = of_earth = 0.0
         for k in range(count):
             for m in range(subsamples):
@@ -87,8 +111,10 @@ def _light_rows(
                 of_sun += from_sun
                 of_earth += from_earth
                 part = shown[j, i] if masked else 1.0
-                own[0, m, k + REACH], own[1, m, k + REACH] = part * from_sun, part * from_earth
-        totals[j, 0], totals[j, 1] = of_sun, of_earth
+                own[0, m, k + REACH] = part * from_sun
+                own[1, m, k + REACH] = part * from_earth
+        totals[j, 0] = of_sun
+        totals[j, 1] = of_earth
         _share(sunlit[j], own[0], weights)
         if with_earth:
             _share(earthlit[j], own[1], weights)
@@ -109,13 +135,15 @@ def _share(points: Any, samples: Floats, weights: Floats) -> None:
 @jit(parallel=True)
 def _light_columns(light: Any, rows: Floats, weights: Floats, scale: float, add: bool) -> None:
     """Rows of samples shared among the lattice's rows, scaled, in place of `light` or in addition to it."""
-    count, subsamples = light.shape[1], len(weights)
+    count = light.shape[1]
+    subsamples = len(weights)
     for k in numba.prange(count):
         if not add:
             for i in range(count):
                 light[k, i] = 0.0
         for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
             for m in range(subsamples):
-                weight, j = scale * weights[m, d], (k + REACH - d) * subsamples + m
+                weight = scale * weights[m, d]
+                j = (k + REACH - d) * subsamples + m
                 for i in range(count):
                     light[k, i] += weight * rows[j, i]

@@ -30,7 +30,8 @@ NEAREST_DEG = 0.25  # to the Sun: the scattering functions are those at its limb
 def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
     """(M,) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
     zenith_rad = math.pi / 2 - sky.altitude_rad(view.toward_lab)
-    extinction_mag, above = sky.air.config.extinction_mag, ~sky.below_horizon(view.toward_lab)
+    extinction_mag = sky.air.config.extinction_mag
+    above = ~sky.below_horizon(view.toward_lab)
     nanolamberts = airglow_nl(config.dark_mag_arcsec2, zenith_rad, extinction_mag)
     if config.moonlight:
         nanolamberts = nanolamberts + moonlight(sky, view.toward_lab, zenith_rad)
@@ -86,7 +87,9 @@ def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
     )
 
 
-def sunlight_nl(from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Floats, extinction_mag: float) -> Floats:
+def sunlight_nl(
+    from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Floats, extinction_mag: float
+) -> Floats:
     """Sunlight scattered by the air, in twilight or by day, whichever is less: Schaefer (1998), Sky & Telescope 95, 57.
 
     Twilight: B = 10^(-0.4 (m - m0 + 32.5 - h - Z / (360 k))) (100 / rho) (1 - 10^(-0.4 k)), a magnitude for each degree
@@ -94,10 +97,15 @@ def sunlight_nl(from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Float
     with the scattering function f of moonlight, t = 10^(-0.4 k X(sun)) and all angles in degrees.
     """
     off_deg = np.maximum(from_sun_deg, NEAREST_DEG)
-    k, bright_mag = max(extinction_mag, 1e-3), SUN_V_MAG - V_ZERO_MAG
+    k = max(extinction_mag, 1e-3)
+    bright_mag = SUN_V_MAG - V_ZERO_MAG
     twilight = 10 ** (-0.4 * (bright_mag + 32.5 - sun_altitude_deg - zenith_deg / (360 * k)))
     twilight = twilight * (100 / off_deg) * (1 - 10 ** (-0.4 * k))
     passed = 10 ** (-0.4 * k * float(air_mass(np.radians(sun_altitude_deg))))
     scattered = 1 - 10 ** (-0.4 * k * air_mass(np.radians(90 - zenith_deg)))
-    day = 10 ** (-0.4 * (bright_mag + 43.27)) * scattered * (scattering(off_deg) * passed + 440_000 * (1 - passed))
+    day = (
+        10 ** (-0.4 * (bright_mag + 43.27))
+        * scattered
+        * (scattering(off_deg) * passed + 440_000 * (1 - passed))
+    )
     return np.asarray(np.minimum(twilight, day) / ERG_NL)

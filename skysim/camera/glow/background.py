@@ -17,7 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.faint_stars import S10_MAG_ARCSEC2, faint_starlight_s10, galactic_latitude_deg
+from skysim.camera.glow.faint_stars import (
+    S10_MAG_ARCSEC2,
+    faint_starlight_s10,
+    galactic_latitude_deg,
+)
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
@@ -64,7 +68,11 @@ class ViewingGeometry:
         1/cos, squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
         Distortion changes the solid angle of the pixels, which pixel_sr includes.
         """
-        return self.optics.collecting_m2 * self.optics.throughput(np.cos(self.field_rad)) * self.pixel_sr
+        return (
+            self.optics.collecting_m2
+            * self.optics.throughput(np.cos(self.field_rad))
+            * self.pixel_sr
+        )
 
 
 def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
@@ -151,13 +159,21 @@ def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     The transmittance is that of lens and baffle together: irradiance on the chip over irradiance before the lens at
     the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
-    angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], direction(config.ra_deg, config.dec_deg))[0])
+    angle_deg = float(
+        angular_separation_deg(
+            view.boresight_lab[None, :], direction(config.ra_deg, config.dec_deg)
+        )[0]
+    )
     irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
     point_source_transmittance = float(transmittance(angle_deg, config.angle_deg, config.pst))
-    return np.full(len(view.field_rad), irradiance * point_source_transmittance * view.optics.camera.pixel_m**2)
+    return np.full(
+        len(view.field_rad), irradiance * point_source_transmittance * view.optics.camera.pixel_m**2
+    )
 
 
-def transmittance(angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]) -> Floats:
+def transmittance(
+    angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]
+) -> Floats:
     """Interpolate the logarithm of a table linearly; constant beyond its ends. Shape of angle_deg."""
     return np.asarray(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
 
@@ -180,13 +196,16 @@ BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
 
 def direction(ra_deg: float, dec_deg: float) -> Floats:
     """(3,) unit vector of a right ascension and declination."""
-    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    ra = math.radians(ra_deg)
+    dec = math.radians(dec_deg)
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     """(M,) angles between (M, 3) unit vectors and one, accurate for small angles too (atan2)."""
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector))
+    return np.degrees(
+        np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector)
+    )
 
 
 def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
@@ -197,7 +216,8 @@ def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band
     One node is enough where no light depends on the position, or there is none.
     """
     if all(glow.kind in ("uniform", "stray") for glow in glows):
-        (toward, pixel_sr), shape = pixel_directions(np.array([optics.camera.center_px]), optics), (1, 1)
+        shape = (1, 1)
+        (toward, pixel_sr) = pixel_directions(np.array([optics.camera.center_px]), optics)
     else:
         toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
@@ -218,7 +238,9 @@ def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
     """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
     spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
     w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
-    x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h))
+    x, y = np.meshgrid(
+        np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h)
+    )
     return np.column_stack([x.ravel(), y.ravel()]), (h, w)
 
 
@@ -227,7 +249,10 @@ def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
 
     The solid angle is spanned by central differences of the directions one pixel to either side: error 1e-6.
     """
-    across, down = ((unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2 for step in np.eye(2))
+    across, down = (
+        (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2
+        for step in np.eye(2)
+    )
     return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
 
 
@@ -258,12 +283,16 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
     if any(camera.distortion):
         r = np.linspace(0, min(optics.fold_r, 1.1 * math.tan(optics.field_rad) + 1e-3), 4001)
         image_r = r * radial(camera.distortion, r**2)
-        measured, decentering = plane, np.zeros_like(plane)
+        measured = plane
+        decentering = np.zeros_like(plane)
         for _ in range(10 if any(camera.distortion[2:4]) else 1):
             # Remove the last estimate of the tangential part, then invert the radial part by the table.
             centered = measured - decentering
             distorted_r = np.hypot(*centered.T)
-            plane = centered * (np.interp(distorted_r, image_r, r) / np.maximum(distorted_r, 1e-300))[:, None]
+            plane = (
+                centered
+                * (np.interp(distorted_r, image_r, r) / np.maximum(distorted_r, 1e-300))[:, None]
+            )
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     toward = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
@@ -313,6 +342,7 @@ def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
         for i in range(w - 1):
             left = coarse[j, i] + fraction * (coarse[j + 1, i] - coarse[j, i])
             right = coarse[j, i + 1] + fraction * (coarse[j + 1, i + 1] - coarse[j, i + 1])
-            start, rise = image.dtype.type(left), image.dtype.type(right - left)
+            start = image.dtype.type(left)
+            rise = image.dtype.type(right - left)
             for x in range(begin[i], begin[i + 1]):
                 row[x] = start + rise * offset[x]

@@ -22,25 +22,36 @@ from skysim.sources.dome.shell.surface import perpendicular
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.bodies import BodyLight
 
-GROUND_RINGS, AIR_RINGS, SPOKES = 64, 10, 128  # directions over the Earth's disc and the air around it
+# directions over the Earth's disc and the air around it
+GROUND_RINGS = 64
+AIR_RINGS = 10
+SPOKES = 128
 
 
 def pst(baffle: BaffleConfig, directions: Floats, boresight: Floats) -> Floats:
     """(M,) point source transmittance for light from directions (M, 3)."""
-    return transmittance(angular_separation_deg(directions, boresight), baffle.angle_deg, baffle.pst)
+    return transmittance(
+        angular_separation_deg(directions, boresight), baffle.angle_deg, baffle.pst
+    )
 
 
-def stray_of_bodies_e_s_m2(baffle: BaffleConfig, bodies: Sequence[BodyLight], boresight: Floats) -> dict[str, float]:
+def stray_of_bodies_e_s_m2(
+    baffle: BaffleConfig, bodies: Sequence[BodyLight], boresight: Floats
+) -> dict[str, float]:
     """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
 
     boresight : (3,)
     """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
-    return {body.title: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)}
+    return {
+        body.title: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)
+    }
 
 
-def earth_around(config: EarthConfig, observer_m: Floats, sun_m: Floats, band: Band) -> tuple[Floats, Floats]:
+def earth_around(
+    config: EarthConfig, observer_m: Floats, sun_m: Floats, band: Band
+) -> tuple[Floats, Floats]:
     """(M, 3) directions to the Earth and (M,) irradiances, photo-electrons s^-1 m^-2, of its parts around them.
 
     A sum over them is an integral over the cone about the nadir that holds the disc and the air around it, by
@@ -48,7 +59,10 @@ def earth_around(config: EarthConfig, observer_m: Floats, sun_m: Floats, band: B
     it. The radiance is that of `earth_radiance`.
     """
     distance_m = float(np.linalg.norm(observer_m))
-    edges = [math.sqrt(max(1 - (radius * EARTH_RADIUS_M / distance_m) ** 2, 0.0)) for radius in (1.0, LAYER[1])]
+    edges = [
+        math.sqrt(max(1 - (radius * EARTH_RADIUS_M / distance_m) ** 2, 0.0))
+        for radius in (1.0, LAYER[1])
+    ]
     in_cone, weights_sr = cone_rule(*edges)
     directions = in_cone @ axes_about(-observer_m / distance_m)
     return directions, weights_sr * earth_radiance(config, observer_m, directions, sun_m, band)
@@ -66,8 +80,13 @@ def cone_rule(ground: float, top: float) -> tuple[Floats, Floats]:
     """(M, 3) directions about z and their weights in sr: to the ground's edge at this cosine, then to the air's top."""
     rules = [interval_rule(ground, 1.0, GROUND_RINGS), interval_rule(top, ground, AIR_RINGS)]
     cosine, weight = (np.concatenate(column) for column in zip(*rules, strict=True))
-    sine, around = np.sqrt(1 - cosine**2), (np.arange(SPOKES) + 0.5) * 2 * np.pi / SPOKES
-    columns = np.outer(sine, np.cos(around)), np.outer(sine, np.sin(around)), np.outer(cosine, np.ones(SPOKES))
+    sine = np.sqrt(1 - cosine**2)
+    around = (np.arange(SPOKES) + 0.5) * 2 * np.pi / SPOKES
+    columns = (
+        np.outer(sine, np.cos(around)),
+        np.outer(sine, np.sin(around)),
+        np.outer(cosine, np.ones(SPOKES)),
+    )
     weights_sr = np.repeat(weight * 2 * np.pi / SPOKES, SPOKES)
     return np.stack([column.ravel() for column in columns], axis=1), weights_sr
 

@@ -11,7 +11,11 @@ from skysim.camera.glow.background import fill, pixel_directions, viewing_geomet
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
-from skysim.sources.dome.displays.display import black_transmission, panel_strength_e_s_sr, panel_surface
+from skysim.sources.dome.displays.display import (
+    black_transmission,
+    panel_strength_e_s_sr,
+    panel_surface,
+)
 from skysim.sources.dome.displays.projector import white_wall_per_m2
 from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.shell.surface import build_surface
@@ -58,11 +62,16 @@ def projector_glow(
     """
     assert isinstance(config.layout, layouts.ProjectorConfig)
     camera = optics.camera
-    x, y = (np.linspace(0, size - 1, size // NODE_SPACING_PX + 2) for size in (camera.width_px, camera.height_px))
+    x, y = (
+        np.linspace(0, size - 1, size // NODE_SPACING_PX + 2)
+        for size in (camera.width_px, camera.height_px)
+    )
     nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     view = viewing_geometry(*pixel_directions(nodes, optics), optics, cam_from_lab, band)
     white = projected_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
-    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(len(y), len(x))
+    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(
+        len(y), len(x)
+    )
     out = np.empty((camera.height_px, camera.width_px))
     fill(out, glow, 1.0)
     return out
@@ -75,7 +84,9 @@ def chip_directions(optics: Optics) -> tuple[Floats, Floats]:
     return pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics)
 
 
-def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band) -> Floats:
+def panel_radiance_e_s_m2_sr(
+    config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band
+) -> Floats:
     """(N,) radiance of a white panel, mean over a frame, towards the camera: L = I(theta) / (p^2 cos theta).
 
     0 for directions (N, 3) that miss it. p is the pitch, I a white pixel's intensity from the LED's lobe.
@@ -84,10 +95,14 @@ def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camer
     panel = panel_surface(config.layout, build_surface(config.surface))
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
-    return np.asarray(hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2)
+    return np.asarray(
+        hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2
+    )
 
 
-def projected_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band) -> Floats:
+def projected_radiance_e_s_m2_sr(
+    config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band
+) -> Floats:
     """(N,) radiance of the wall in a projector's white picture, mean over a frame, towards the camera.
 
     As of a panel, with the area of the wall that a pixel lights in place of p^2, and the pixel's own light.
@@ -97,7 +112,8 @@ def projected_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, c
     place_m = surface.meet(camera_m, toward_lab)
     hits_wall = np.isfinite(place_m[:, 0])
     radiance = np.zeros(len(toward_lab))
-    place_m, toward = place_m[hits_wall], toward_lab[hits_wall]
+    place_m = place_m[hits_wall]
+    toward = toward_lab[hits_wall]
     normal = surface.inward(place_m)
     emitted = white_radiance(config.led, -np.sum(toward * normal, axis=1), band)
     radiance[hits_wall] = emitted * white_wall_per_m2(config.layout, place_m, normal)
@@ -107,10 +123,17 @@ def projected_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, c
 def white_radiance(led: leds.LedConfig, cos_emission: Floats, band: Band) -> Floats:
     """(N,) radiance of white pixels times the area of one, e s^-1 sr^-1, at these cosines from the normal."""
     duty = led.drive.duty if isinstance(led.drive, leds.RefreshConfig) else 1.0
-    return LOBES[led.lobe.kind](led.lobe, cos_emission) / cos_emission * duty * panel_strength_e_s_sr(led, band)
+    return (
+        LOBES[led.lobe.kind](led.lobe, cos_emission)
+        / cos_emission
+        * duty
+        * panel_strength_e_s_sr(led, band)
+    )
 
 
-def collimated_radiance_e_s_m2_sr(config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band) -> Floats:
+def collimated_radiance_e_s_m2_sr(
+    config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band
+) -> Floats:
     """(N,) radiance behind the collimator of a white display; each pixel spans (p / f)^2 cos^3 steradian.
 
     0 for directions (N, 3) that miss it.
@@ -118,5 +141,9 @@ def collimated_radiance_e_s_m2_sr(config: light.CollimatedDisplayConfig, toward_
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band)) / config.block**2
     cos_field = np.maximum(toward_lab[:, 2], 1e-9)
     half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m
-    on_display = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1) & (toward_lab[:, 2] > 0)
-    return np.asarray(on_display * white_e_s_m2 / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3))
+    on_display = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1) & (
+        toward_lab[:, 2] > 0
+    )
+    return np.asarray(
+        on_display * white_e_s_m2 / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)
+    )

@@ -18,10 +18,15 @@ from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_fl
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
 AIR_M = 8e3  # scale height of the air
-LAYER = 1 + 85e3 / EARTH_RADIUS_M, 1 + 95e3 / EARTH_RADIUS_M  # bottom and top of the airglow, in radii of the Earth
+LAYER = (
+    1 + 85e3 / EARTH_RADIUS_M,
+    1 + 95e3 / EARTH_RADIUS_M,
+)  # bottom and top of the airglow, in radii of the Earth
 
 
-def earth_radiance(config: EarthConfig, observer_m: Floats, toward: Floats, sun_m: Floats, band: Band) -> Floats:
+def earth_radiance(
+    config: EarthConfig, observer_m: Floats, toward: Floats, sun_m: Floats, band: Band
+) -> Floats:
     """(M,) photo-electrons s^-1 m^-2 sr^-1 in directions (M, 3), GCRS axes; the ellipsoid is stretched to a sphere.
 
     Ground: Lambert's law, albedo E mu0 / pi, with the Sun's irradiance E and the cosine mu0 of its zenith distance.
@@ -30,23 +35,40 @@ def earth_radiance(config: EarthConfig, observer_m: Floats, toward: Floats, sun_
     sqrt(top^2 - b^2) - sqrt(bottom^2 - b^2), twice where the line misses the ground (van Rhijn 1921), over the
     layer's thickness. It is brightest at b = bottom, 72 times as bright as from above. Clouds and seas are left out.
     """
-    place, along = observer_m * TO_SPHERE, toward * TO_SPHERE
+    place = observer_m * TO_SPHERE
+    along = toward * TO_SPHERE
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
-    ground, down = (impact < 1) & (inward > 0), inward > 0
-    path = inward - np.sqrt(np.maximum(1 - impact**2, 0.0))  # to the ground, or to the tangent point
-    mu0 = (place + path[:, None] * along) @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
+    ground = (impact < 1) & (inward > 0)
+    down = inward > 0
+    path = inward - np.sqrt(
+        np.maximum(1 - impact**2, 0.0)
+    )  # to the ground, or to the tangent point
+    mu0 = (
+        (place + path[:, None] * along) @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
+    )
     irradiance = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, band))
     height_m = np.maximum(impact - 1, 0.0) * EARTH_RADIUS_M
-    day = down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0) * np.exp(-height_m / AIR_M)
+    day = (
+        down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0) * np.exp(-height_m / AIR_M)
+    )
     half_chords = [np.sqrt(np.maximum(radius**2 - impact**2, 0.0)) for radius in LAYER]
-    layers = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0]) * np.where(ground, 1, 2) * down
-    return np.asarray(day + layers * float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band)))
+    layers = (
+        (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0]) * np.where(ground, 1, 2) * down
+    )
+    return np.asarray(
+        day + layers * float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band))
+    )
 
 
 def earth_light(
-    config: EarthConfig, observer_m: Floats, sun_m: Floats, optics: Optics, cam_from_lab: Rotation, band: Band
+    config: EarthConfig,
+    observer_m: Floats,
+    sun_m: Floats,
+    optics: Optics,
+    cam_from_lab: Rotation,
+    band: Band,
 ) -> Floats | None:
     """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None where it is not in the field."""
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
@@ -64,6 +86,12 @@ def earth_light(
 @lru_cache(maxsize=4)
 def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
     """Viewing directions and solid angles of pixels at nodes, NODE_PX apart, and their (h, w)."""
-    w, h = (math.ceil((size - 1) / NODE_PX) + 1 for size in (optics.camera.width_px, optics.camera.height_px))
-    x, y = np.meshgrid(np.linspace(0, optics.camera.width_px - 1, w), np.linspace(0, optics.camera.height_px - 1, h))
+    w, h = (
+        math.ceil((size - 1) / NODE_PX) + 1
+        for size in (optics.camera.width_px, optics.camera.height_px)
+    )
+    x, y = np.meshgrid(
+        np.linspace(0, optics.camera.width_px - 1, w),
+        np.linspace(0, optics.camera.height_px - 1, h),
+    )
     return *pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics), (h, w)

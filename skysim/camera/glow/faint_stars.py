@@ -7,7 +7,9 @@ from scipy.special import erfc
 
 from skysim.core.types import Floats
 
-GALACTIC_POLE_ICRS = np.array([-0.86766615, -0.19807637, 0.45598378])  # RA 192.85948, Dec 27.12825 deg (IAU 1958)
+GALACTIC_POLE_ICRS = np.array(
+    [-0.86766615, -0.19807637, 0.45598378]
+)  # RA 192.85948, Dec 27.12825 deg (IAU 1958)
 DEG2_ARCSEC2 = 3600.0**2
 S10_MAG_ARCSEC2 = 10 + 2.5 * np.log10(DEG2_ARCSEC2)  # of one star of V 10 in a square degree: 27.78
 # Zones of galactic latitude: their middles, ln of the light per magnitude at V 10 (S10 a magnitude), and its slope.
@@ -34,7 +36,9 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
     ln_light, slope = (np.interp(latitude, LATITUDE_DEG, column) for column in (LN_LIGHT, SLOPE))
     peak = slope / (2 * CURVATURE)
     beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
-    return np.asarray(np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE)) * beyond)
+    return np.asarray(
+        np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE)) * beyond
+    )
 
 
 def galactic_latitude_deg(direction_icrs: Floats) -> Floats:

@@ -36,7 +36,11 @@ POINT_LIKE = 1.7
 ACCURACY = {True: (2e-5, 8), False: (2e-4, 4)}
 PAD = 1  # empty pixels about a table, for the four points
 ENTRIES = 64  # of the Bessel table, per unit of its argument
-COARSE_HALF_PX = ((100, 16), (24, 4), (0, 1))  # (from this half width, boxes in steps of so many pixels)
+COARSE_HALF_PX = (
+    (100, 16),
+    (24, 4),
+    (0, 1),
+)  # (from this half width, boxes in steps of so many pixels)
 
 
 class EllipseBox(NamedTuple):
@@ -62,7 +66,9 @@ def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> A
 
 def box_half_px(reach: Any) -> Any:
     """Half widths of the boxes that hold images of this reach: whole pixels, coarser for larger ones."""
-    step = np.select([reach > size for size, _ in COARSE_HALF_PX], [step for _, step in COARSE_HALF_PX])
+    step = np.select(
+        [reach > size for size, _ in COARSE_HALF_PX], [step for _, step in COARSE_HALF_PX]
+    )
     return (np.ceil(reach / step) * step).astype(np.int64)
 
 
@@ -78,11 +84,16 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
     # fy > 0 stands for -fy too; fx = 0 is in both halves.
     weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
     weight *= np.outer(np.sinc(f), np.sinc(f))
-    spectra = [weight * lens.otf(fx, f[None, :], softening_sigma_px(passed, f[-1])) for fx in (f[:, None], -f[:, None])]
+    spectra = [
+        weight * lens.otf(fx, f[None, :], softening_sigma_px(passed, f[-1]))
+        for fx in (f[:, None], -f[:, None])
+    ]
     x = (np.arange(half + 1) + np.arange(samples)[:, None] / samples).ravel()
     phase = 2 * np.pi * np.outer(f, x)
     parts = [f, *map(np.real, spectra), *map(np.imag, spectra), np.cos(phase), np.sin(phase)]
-    return EllipseBox(waves, samples, np.concatenate([part.ravel() for part in parts]).astype(np.float32))
+    return EllipseBox(
+        waves, samples, np.concatenate([part.ravel() for part in parts]).astype(np.float32)
+    )
 
 
 @lru_cache(maxsize=1)
@@ -139,30 +150,40 @@ def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> S
 
     The transform of a disk of density 1 + q e is J + i (A q f) 2 pi J' / w, J = 2 J1(w) / w.
     """
-    waves, turn = lens.shape[1], np.float32(2 * np.pi)
+    waves = lens.shape[1]
+    turn = np.float32(2 * np.pi)
     out = np.zeros((4, waves, waves), np.float32)
     gauss = np.exp(np.float32(-2 * (np.pi * disk.sigma) ** 2) * f * f)
-    radius, xx, xy, yy = np.float32(disk.blur), np.float32(disk.xx), np.float32(disk.xy), np.float32(disk.yy)
+    radius = np.float32(disk.blur)
+    xx = np.float32(disk.xx)
+    xy = np.float32(disk.xy)
+    yy = np.float32(disk.yy)
     for i in range(waves):
         for j in range(waves):
             common = gauss[i] * gauss[j]
             if radius > 0:
                 common *= jinc(bessel, turn * radius * np.sqrt(f[i] * f[i] + f[j] * f[j]))[0]
-            squares, cross = xx * f[i] * f[i] + yy * f[j] * f[j], np.float32(2) * xy * f[i] * f[j]
-            w, v = turn * np.sqrt(max(squares + cross, 0)), turn * np.sqrt(max(squares - cross, 0))
+            squares = xx * f[i] * f[i] + yy * f[j] * f[j]
+            cross = np.float32(2) * xy * f[i] * f[j]
+            w = turn * np.sqrt(max(squares + cross, 0))
+            v = turn * np.sqrt(max(squares - cross, 0))
             (p, p_slope), (q, q_slope) = jinc(bessel, w), jinc(bessel, v)
             if disk.odd == 0:
-                a, b = common * lens[0, i, j] * p, common * lens[1, i, j] * q
+                a = common * lens[0, i, j] * p
+                b = common * lens[1, i, j] * q
             else:
-                along, aside = disk.gradient_x * f[i], disk.gradient_y * f[j]
+                along = disk.gradient_x * f[i]
+                aside = disk.gradient_y * f[j]
                 tilt_p = turn * (aside + along) * p_slope / max(w, np.float32(1e-9))
                 tilt_q = turn * (aside - along) * q_slope / max(v, np.float32(1e-9))
                 a = common * (lens[0, i, j] * p - lens[2, i, j] * tilt_p)
                 b = common * (lens[1, i, j] * q - lens[3, i, j] * tilt_q)
                 c = common * (lens[0, i, j] * tilt_p + lens[2, i, j] * p)
                 d = common * (lens[1, i, j] * tilt_q + lens[3, i, j] * q)
-                out[2, i, j], out[3, i, j] = c + d, c - d
-            out[0, i, j], out[1, i, j] = a + b, a - b
+                out[2, i, j] = c + d
+                out[3, i, j] = c - d
+            out[0, i, j] = a + b
+            out[1, i, j] = a - b
     return out
 
 
@@ -174,7 +195,10 @@ def product(a: Singles, b: Singles) -> Singles:
     for r in range(len(out)):
         row = out[r]
         for k in range(0, whole, 4):
-            w0, w1, w2, w3 = a[k, r], a[k + 1, r], a[k + 2, r], a[k + 3, r]
+            w0 = a[k, r]
+            w1 = a[k + 1, r]
+            w2 = a[k + 2, r]
+            w3 = a[k + 3, r]
             for i in range(row.size):
                 row[i] += w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
         for k in range(whole, len(a)):
@@ -213,15 +237,23 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
 
     Pixel (half + PAD, half + PAD) is at the image's center. The disk's slope is applied, the negative ringing is cut.
     """
-    size, count, middle, none = 2 * (half + PAD) + 1, half + 1, half + PAD, np.float32(0)
-    out, slope = np.zeros((samples, size, samples * size), np.float32), np.float32(disk.slope_x)
+    size = 2 * (half + PAD) + 1
+    count = half + 1
+    middle = half + PAD
+    none = np.float32(0)
+    out = np.zeros((samples, size, samples * size), np.float32)
+    slope = np.float32(disk.slope_x)
     for q in range(samples):
         for j in range(-half, half + 1):
             r, up = mirrored(j, q, samples, count)
-            even0, even1, odd0, odd1 = parts[0, r], parts[1, r], parts[2, r], parts[3, r]
+            even0 = parts[0, r]
+            even1 = parts[1, r]
+            odd0 = parts[2, r]
+            odd1 = parts[3, r]
             for p in range(samples):
                 row = out[q, middle + j, p * size : (p + 1) * size]
-                right, left = p * count, mirrored(-1, p, samples, count)[0]
+                right = p * count
+                left = mirrored(-1, p, samples, count)[0]
                 for i in range(half + 1):
                     row[middle + i] = even0[right + i] - up * even1[right + i]
                 for i in range(half):
@@ -231,7 +263,9 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
                         row[middle + i] -= odd0[right + i] + up * odd1[right + i]
                     for i in range(half):
                         row[middle - 1 - i] += odd0[left + i] - up * odd1[left + i]
-                light = np.float32(1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples))
+                light = np.float32(
+                    1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples)
+                )
                 for i in range(size):
                     row[i] = max(row[i] * (light + slope * np.float32(i)), none)
     return out
@@ -240,7 +274,8 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
 @jit(fastmath=True)
 def fade(table: Singles, reach_px: float) -> None:
     """Fade wings to zero over FADE_PX, since a sharp end would alias with the pixel grid, and scale the light to 1."""
-    samples, size = table.shape[0], table.shape[1]
+    samples = table.shape[0]
+    size = table.shape[1]
     total = 0.0
     for q in range(samples):
         for j in range(size):
@@ -257,23 +292,31 @@ def fade(table: Singles, reach_px: float) -> None:
 @jit(fastmath=True)
 def sharpest_px(table: Singles) -> float:
     """Half the peak over the steepest slope, as `kernel_cache.sharpness_px`."""
-    samples, size = table.shape[0], table.shape[1]
-    peak, slope2 = np.float32(0), np.float32(0)
+    samples = table.shape[0]
+    size = table.shape[1]
+    peak = np.float32(0)
+    slope2 = np.float32(0)
     for q in range(samples - 1):
         for j in range(size):
-            row, below = table[q, j], table[q + 1, j]
+            row = table[q, j]
+            below = table[q + 1, j]
             for i in range(size):
-                x, y = row[i + size] - row[i], below[i] - row[i]
+                x = row[i + size] - row[i]
+                y = below[i] - row[i]
                 slope2 = max(slope2, x * x + y * y)
                 peak = max(peak, row[i])
     return peak / (2 * samples * sqrt(slope2))
 
 
 @jit
-def ellipse_table(disk: EllipseDisk, box: Singles, waves: int, samples: int, bessel: Singles) -> Singles:
+def ellipse_table(
+    disk: EllipseDisk, box: Singles, waves: int, samples: int, bessel: Singles
+) -> Singles:
     """The image of a disk for `add_ellipse`, from the tables of its box; its light is 1."""
-    square, count = waves * waves, (box.size - waves - 4 * waves * waves) // (2 * waves)
-    f, lens = box[:waves], box[waves : waves + 4 * square].reshape(4, waves, waves)
+    square = waves * waves
+    count = (box.size - waves - 4 * waves * waves) // (2 * waves)
+    f = box[:waves]
+    lens = box[waves : waves + 4 * square].reshape(4, waves, waves)
     wave = box[waves + 4 * square :].reshape(2, waves, count)
     parts = quadrants(spectrum(disk, f, lens, bessel), wave[0], wave[1], disk.odd)
     table = unfold(parts, samples, count // samples - 1, disk)
@@ -283,32 +326,54 @@ def ellipse_table(disk: EllipseDisk, box: Singles, waves: int, samples: int, bes
 
 
 @jit(fastmath=True)
-def add_ellipse(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, table: Singles) -> None:
+def add_ellipse(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, table: Singles
+) -> None:
     """Add an image from its samples, see `unfold`: Lagrange's cubic through 4 x 4 of them, along y first."""
     height, width = patch.shape
-    samples, size = table.shape[0], table.shape[1]
+    samples = table.shape[0]
+    size = table.shape[1]
     half = size // 2 - PAD
-    center_x, center_y = floor(x + 0.5), floor(y + 0.5)
-    left, right = max(center_x - half, 0), min(center_x + half + 1, width)
-    top, bottom = max(center_y - half, row0, 0), min(center_y + half + 1, row1, height)
+    center_x = floor(x + 0.5)
+    center_y = floor(y + 0.5)
+    left = max(center_x - half, 0)
+    right = min(center_x + half + 1, width)
+    top = max(center_y - half, row0, 0)
+    bottom = min(center_y + half + 1, row1, height)
     if right <= left or bottom <= top:
         return
-    at_x, at_y = (center_x - x) * samples, (center_y - y) * samples
-    first_x, first_y = floor(at_x), floor(at_y)
-    wx, wy = cubic(at_x - first_x), cubic(at_y - first_y)
-    u0, u1, u2, u3 = np.float32(wx[0]), np.float32(wx[1]), np.float32(wx[2]), np.float32(wx[3])
-    v0, v1, v2, v3 = np.float32(wy[0]), np.float32(wy[1]), np.float32(wy[2]), np.float32(wy[3])
-    phase, row = np.empty(4, np.int64), np.empty(4, np.int64)
+    at_x = (center_x - x) * samples
+    at_y = (center_y - y) * samples
+    first_x = floor(at_x)
+    first_y = floor(at_y)
+    wx = cubic(at_x - first_x)
+    wy = cubic(at_y - first_y)
+    u0 = np.float32(wx[0])
+    u1 = np.float32(wx[1])
+    u2 = np.float32(wx[2])
+    u3 = np.float32(wx[3])
+    v0 = np.float32(wy[0])
+    v1 = np.float32(wy[1])
+    v2 = np.float32(wy[2])
+    v3 = np.float32(wy[3])
+    phase = np.empty(4, np.int64)
+    row = np.empty(4, np.int64)
     start = np.empty(4, np.int64)
     for s in range(4):
-        phase[s], row[s] = (first_y + s - 1) % samples, size // 2 - center_y + (first_y + s - 1) // samples
+        phase[s] = (first_y + s - 1) % samples
+        row[s] = size // 2 - center_y + (first_y + s - 1) // samples
         k = first_x + s - 1
         start[s] = k % samples * size + size // 2 + left - center_x + k // samples
     sums = np.empty(table.shape[2], np.float32)
-    a, b, c, d = sums[start[0] :], sums[start[1] :], sums[start[2] :], sums[start[3] :]
+    a = sums[start[0] :]
+    b = sums[start[1] :]
+    c = sums[start[2] :]
+    d = sums[start[3] :]
     for j in range(top, bottom):
-        first, second = table[phase[0], row[0] + j], table[phase[1], row[1] + j]
-        third, fourth = table[phase[2], row[2] + j], table[phase[3], row[3] + j]
+        first = table[phase[0], row[0] + j]
+        second = table[phase[1], row[1] + j]
+        third = table[phase[2], row[2] + j]
+        fourth = table[phase[3], row[3] + j]
         for i in range(sums.size):
             sums[i] = v0 * first[i] + v1 * second[i] + v2 * third[i] + v3 * fourth[i]
         line = patch[j, left:right]

@@ -30,9 +30,13 @@ FADE_PX = 2.0  # width over which infinite wings are faded to zero
 OTF_FLOOR = 1e-6  # a transfer function below this is taken as zero
 HARMONICS = (0, 4, 8)  # a square has only multiples of four
 HARMONIC_FLOOR = 5e-5  # a harmonic below this fraction of the peak is left out
-MAX_T8 = 1e-2, 1e-4  # largest T8, over the peak and over the total light, for which T0 to T8 are enough
+MAX_T8 = (
+    1e-2,
+    1e-4,
+)  # largest T8, over the peak and over the total light, for which T0 to T8 are enough
 MAX_TERMS = 1024  # most terms of a Fourier-Bessel series
-NO_RADIAL, NO_GRID = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.float32)
+NO_RADIAL = np.empty((0, 3), np.float32)
+NO_GRID = np.empty((0, 0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +56,22 @@ class Kernel:
         """Pixels whose center is farther than this in x or in y get no light."""
         if len(self.grid):
             return self.grid.shape[2] / 2
-        return (len(self.radial) - 2) / PER_PX if len(self.radial) else REACH_SIGMA * self.sigma_px + 0.5
+        return (
+            (len(self.radial) - 2) / PER_PX
+            if len(self.radial)
+            else REACH_SIGMA * self.sigma_px + 0.5
+        )
 
     @property
     def peak(self) -> float:
         """Share of the light in the brightest pixel of a centered image."""
         if len(self.grid):
             return float(self.grid.max())
-        return float(self.radial[0, 0] if len(self.radial) else special.erf(np.sqrt(0.125) / self.sigma_px) ** 2)
+        return float(
+            self.radial[0, 0]
+            if len(self.radial)
+            else special.erf(np.sqrt(0.125) / self.sigma_px) ** 2
+        )
 
 
 def build_kernel(
@@ -80,7 +92,9 @@ def build_kernel(
     power-law wings beyond their reach is added to the image by normalization, so that its total is 1. Raises
     InputError for an unreadable file of a measured PSF.
     """
-    steps = tuple(round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px))
+    steps = tuple(
+        round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
+    )
     if psf.kind == "gaussian" and not (steps[1] or steps[2]):
         return Kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)), NO_RADIAL, NO_GRID)
     round_image = None if psf.kind in NOT_ROUND else round_kernel(psf, camera, *steps)
@@ -99,7 +113,12 @@ class PsfModel:
     @classmethod
     def from_steps(cls, psf: Psf, camera: CameraConfig, sigma: int, *radii: int) -> PsfModel:
         """From sizes in steps of QUANTUM_PX."""
-        return cls(psf, camera, sigma * QUANTUM_PX, tuple(radius * QUANTUM_PX for radius in radii if radius))
+        return cls(
+            psf,
+            camera,
+            sigma * QUANTUM_PX,
+            tuple(radius * QUANTUM_PX for radius in radii if radius),
+        )
 
     def otf(self, fx: Floats, fy: Floats, extra_sigma_px: float) -> Otf:
         """The product of the transfer functions without the pixel's, times that of an extra Gaussian."""
@@ -119,7 +138,9 @@ class PsfModel:
 
     def wing_margin_px(self) -> float:
         """How much farther wings must be followed so that aliasing is below 1e-4 of the peak."""
-        return 2 * EXTENT[self.psf.kind](self.psf, self.camera)[0] if self.psf.kind in WINGED else 0.0
+        return (
+            2 * EXTENT[self.psf.kind](self.psf, self.camera)[0] if self.psf.kind in WINGED else 0.0
+        )
 
 
 @lru_cache(maxsize=1024)
@@ -140,7 +161,9 @@ def softening_sigma_px(bandwidth: float, highest: float) -> float:
     """Sigma of the Gaussian that passes only OTF_FLOOR at the highest frequency of a table; 0 if no
     softening is needed.
     """
-    return 0.0 if bandwidth <= highest else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
+    return (
+        0.0 if bandwidth <= highest else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +181,9 @@ class FourierBesselSeries:
 
 
 @lru_cache(maxsize=8)
-def fourier_bessel_series(box_px: float, reach_px: float, highest: float, per_px: int) -> FourierBesselSeries:
+def fourier_bessel_series(
+    box_px: float, reach_px: float, highest: float, per_px: int
+) -> FourierBesselSeries:
     """The series up to a frequency; it does not depend on the image.
 
     T_n(r) = 2 pi integral of OTF(f) P_n(f) J_n(2 pi f r) f df; a function that vanishes beyond B is the sum
@@ -169,13 +194,16 @@ def fourier_bessel_series(box_px: float, reach_px: float, highest: float, per_px
     f = zeros / (2 * np.pi * box_px)
     angle = np.arange(256) * 2 * np.pi / 256
     square = np.sinc(f[..., None] * np.cos(angle)) * np.sinc(f[..., None] * np.sin(angle))
-    weight, matrix = np.empty_like(f), np.empty((len(f), len(r), f.shape[1]), np.float32)
+    weight = np.empty_like(f)
+    matrix = np.empty((len(f), len(r), f.shape[1]), np.float32)
     x = np.arange(0, zeros.max() + 1, 0.05)
     for k, n in enumerate(HARMONICS):
         harmonic = (square[k] * np.cos(n * angle)).mean(axis=1) * (2 if n else 1)
         weight[k] = harmonic / (np.pi * (box_px * special.jv(n + 1, zeros[k])) ** 2)
         # A spline of this step is within 2e-8 of J_n and ten times as fast.
-        matrix[k] = scipy.interpolate.CubicSpline(x, special.jv(n, x))(np.outer(r, 2 * np.pi * f[k]))
+        matrix[k] = scipy.interpolate.CubicSpline(x, special.jv(n, x))(
+            np.outer(r, 2 * np.pi * f[k])
+        )
     return FourierBesselSeries(f, weight, matrix)
 
 
@@ -187,16 +215,22 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     radius by 0.2 px.
     """
     model = PsfModel.from_steps(psf, camera, *steps)
-    reach, highest_passed = model.reach_px(), bandwidth(psf, camera, model.sigma_px, OTF_FLOOR)
+    reach = model.reach_px()
+    highest_passed = bandwidth(psf, camera, model.sigma_px, OTF_FLOOR)
     # Radii in coarse steps, so that images of similar size share a cached series.
     step = 4.0 if reach < 64 else 16.0
     sizes = reach, reach + model.wing_margin_px()
     table_px, box_px = (float(np.ceil(size / step)) * step for size in sizes)
     highest = min(highest_passed, 16.0, max(MAX_TERMS / 2 / box_px, 0.5))
-    coarse = 4 if highest <= 4 else 1  # a series of low frequencies is summed at every fourth radius
+    coarse = (
+        4 if highest <= 4 else 1
+    )  # a series of low frequencies is summed at every fourth radius
     terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
-    spectrum = model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest)) * terms.weight
-    rows, count = int(reach * PER_PX / coarse) + 2, int(reach * PER_PX) + 1
+    spectrum = (
+        model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest)) * terms.weight
+    )
+    rows = int(reach * PER_PX / coarse) + 2
+    count = int(reach * PER_PX) + 1
     products = zip(terms.matrix[:, :rows], spectrum.astype(np.float32), strict=True)
     harmonics = interpolate_cubic(
         np.array([matrix @ spectrum_n for matrix, spectrum_n in products], dtype=float), coarse
@@ -215,12 +249,18 @@ def interpolate_cubic(samples: Floats, factor: int) -> Floats:
     if factor == 1:
         return samples
     s = np.arange(factor) / factor
-    a, b, c, d = s + 1, s, s - 1, s - 2
+    a = s + 1
+    b = s
+    c = s - 1
+    d = s - 2
     weights = np.array([-b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6])
     count, rows = samples.shape
     padded = np.zeros((count, rows + 3))
-    padded[:, 0], padded[:, 1:-2] = samples[:, 1], samples
-    return np.asarray(sum(padded[:, k : k + rows, None] * weights[k] for k in range(4))).reshape(count, -1)
+    padded[:, 0] = samples[:, 1]
+    padded[:, 1:-2] = samples
+    return np.asarray(sum(padded[:, k : k + rows, None] * weights[k] for k in range(4))).reshape(
+        count, -1
+    )
 
 
 def pack_table(harmonics: Floats) -> Singles:
@@ -254,7 +294,8 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     """
     model = PsfModel.from_steps(psf, camera, *steps)
     half = int(np.ceil(model.reach_px()))
-    highest_passed, size = bandwidth(psf, camera, model.sigma_px, 1e-3), 2 * half + 1
+    highest_passed = bandwidth(psf, camera, model.sigma_px, 1e-3)
+    size = 2 * half + 1
     samples = 128
     while samples > 4 and (samples >= 14 * highest_passed or samples * size > 3072):
         samples //= 2
@@ -263,10 +304,19 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     box = fft.next_fast_len(max(size, with_wings), real=True)
     fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
     fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
-    otf = model.otf(fx, fy, softening_sigma_px(highest_passed, 0.4 * samples)) * np.sinc(fx) * np.sinc(fy)
+    otf = (
+        model.otf(fx, fy, softening_sigma_px(highest_passed, 0.4 * samples))
+        * np.sinc(fx)
+        * np.sinc(fy)
+    )
     image = fft.irfft2(otf, s=(samples * box,) * 2)
-    pixel, position = np.arange(size) - half, np.arange(-1, samples + 2)
+    pixel = np.arange(size) - half
+    position = np.arange(-1, samples + 2)
     # Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
     index = (pixel * samples + samples // 2 - position[:, None]) % (samples * box)
-    tables = np.maximum(image[index[:, None, :, None], index[None, :, None, :]], 0)  # clip the negative ringing
-    return Kernel(0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32))
+    tables = np.maximum(
+        image[index[:, None, :, None], index[None, :, None, :]], 0
+    )  # clip the negative ringing
+    return Kernel(
+        0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32)
+    )

@@ -11,16 +11,27 @@ from numpy.typing import NDArray
 from skysim.camera.psf import ellipse
 from skysim.camera.psf.kernel import QUANTUM_PX, Kernel, build_kernel
 from skysim.camera.psf.led_disk import DiskImages
-from skysim.camera.psf.otf import NOT_ROUND, WINGED, blur_radius_px, chromatic_sigma_px, field_sigma_px
+from skysim.camera.psf.otf import (
+    NOT_ROUND,
+    WINGED,
+    blur_radius_px,
+    chromatic_sigma_px,
+    field_sigma_px,
+)
 from skysim.camera.psf.splat import PER_PX, Singles
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, Psf
 
-GAUSS, ROUND, GRID, ELLIPSE = 0, 1, 2, 3
+GAUSS = 0
+ROUND = 1
+GRID = 2
+ELLIPSE = 3
 BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
 MAX_ROUND_ERROR = 1e-4  # of the peak: a disk whose round image differs by less is drawn round
-PACKING = np.array([1 << 42, 1 << 21, 1])  # packs three sizes, in steps of 0.01 px, into one integer
+PACKING = np.array(
+    [1 << 42, 1 << 21, 1]
+)  # packs three sizes, in steps of 0.01 px, into one integer
 
 
 class Kernels(NamedTuple):
@@ -97,11 +108,15 @@ def source_kernels(
         extra = np.hypot(extra, chromatic_sigma_px(camera, chromatic, position))
         shift_m = chromatic[:, 0]
     emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
-    blur = blur_radius_px(camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf), shift_m)
+    blur = blur_radius_px(
+        camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf), shift_m
+    )
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
-    emitter, blur = (np.where(outside_px < MAX_RADIUS_PX, radius, 0.0) for radius in (emitter, blur))
+    emitter, blur = (
+        np.where(outside_px < MAX_RADIUS_PX, radius, 0.0) for radius in (emitter, blur)
+    )
     axes_px = np.column_stack([emitter, emitter]) if disks is None else disks.semi_axes_px()
     widest = np.where(emitter > 0, np.fmax(emitter, axes_px[:, 0]), 0)
     largest = (widest + blur).max(initial=0.0)
@@ -114,7 +129,9 @@ def source_kernels(
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
     if disks is not None:
-        variance_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak) + extra**2 + blur**2 / 4
+        variance_px2 = (
+            1 / (2 * np.pi * build_kernel(camera.psf, camera).peak) + extra**2 + blur**2 / 4
+        )
         error = round_error(disks, axes_px, emitter, variance_px2)
         chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
         sizes = (part[chosen] for part in (axes_px, blur, extra, variance_px2))
@@ -125,7 +142,9 @@ def source_kernels(
     cache = kernel_cache(camera)
     codes = steps @ PACKING
     all_in_focus = codes.size > 0 and not codes.any()  # stars in focus share one key: skip the sort
-    first, inverse = ([0], np.zeros(len(codes), int)) if all_in_focus else np.unique(codes, True, True)[1:]
+    first, inverse = (
+        ([0], np.zeros(len(codes), int)) if all_in_focus else np.unique(codes, True, True)[1:]
+    )
     keys = [tuple(key) for key in steps[first].tolist()]
     add_kernels(cache, camera, keys)
     rows = np.array([cache.rows[key] for key in keys], dtype=np.int64)[inverse]
@@ -137,11 +156,15 @@ def source_kernels(
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))
         reach = np.where(point, reach * np.maximum(widening, 1), reach)
-    bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)  # it takes a while to build
+    bessel = (
+        ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
+    )  # it takes a while to build
     return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel)
 
 
-def round_error(disks: DiskImages, axes_px: Floats, drawn_px: Floats, variance_px2: Floats) -> Floats:
+def round_error(
+    disks: DiskImages, axes_px: Floats, drawn_px: Floats, variance_px2: Floats
+) -> Floats:
     """(N,) about the largest error, over the peak, of disks of these (N, 2) semi-axes drawn as circles of these radii
     about their centers.
 
@@ -154,7 +177,9 @@ def round_error(disks: DiskImages, axes_px: Floats, drawn_px: Floats, variance_p
     edge_px = np.abs(axes_px - drawn_px[:, None]).max(axis=1)
     shift_px, gradient_px = (np.hypot(*part.T) for part in (disks.center, disks.gradient))
     gradient = np.minimum(gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px)
-    return np.asarray((np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient)
+    return np.asarray(
+        (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
+    )
 
 
 def ellipse_disks(
@@ -177,9 +202,13 @@ def ellipse_disks(
     """
     matrix, center, gradient = disks
     square = matrix @ matrix.transpose(0, 2, 1)
-    xx, xy, yy = square[:, 0, 0], square[:, 0, 1], square[:, 1, 1]
-    mean, zero = center + gradient / 4, np.zeros_like(gradient)
-    winged, odd = psf.kind in WINGED, psf.kind in WINGED + NOT_ROUND
+    xx = square[:, 0, 0]
+    xy = square[:, 0, 1]
+    yy = square[:, 1, 1]
+    mean = center + gradient / 4
+    zero = np.zeros_like(gradient)
+    winged = psf.kind in WINGED
+    odd = psf.kind in WINGED + NOT_ROUND
     wide = (axes_px[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.column_stack(
@@ -193,7 +222,9 @@ def ellipse_disks(
     reach = ellipse.reach_px(psf, camera, radius_px + blur_px, sigma_px)
     one = np.ones_like(xx)
     half_px = ellipse.box_half_px(reach + np.abs(drawn).max(axis=1))
-    disk = np.column_stack([drawn, mean, xx, xy, yy, *parts, blur_px, sigma_px, reach * winged, odd * one])
+    disk = np.column_stack(
+        [drawn, mean, xx, xy, yy, *parts, blur_px, sigma_px, reach * winged, odd * one]
+    )
     return disk, np.column_stack([BOX_KEY * one, half_px, 0 * one]).astype(np.int64)
 
 
@@ -203,7 +234,8 @@ def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, 
         for container in cache:
             container.clear()
         cache.tables.append(np.empty(0, np.float32))
-    tables, begin = [cache.tables[0]], len(cache.tables[0])
+    tables = [cache.tables[0]]
+    begin = len(cache.tables[0])
     for key in dict.fromkeys(key for key in keys if key not in cache.rows):
         properties, sizes, table = make_kernel(camera, key)
         cache.rows[key] = len(cache.kernels)

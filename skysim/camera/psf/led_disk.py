@@ -38,8 +38,10 @@ class DiskImages(NamedTuple):
         (s1 +- s2)^2 = |A|^2 +- 2 |det A|.
         """
         a, b, c, d = np.nan_to_num(self.matrix).reshape(-1, 4).T
-        squares, twice = a * a + b * b + c * c + d * d, 2 * np.abs(a * d - b * c)
-        total, difference = np.sqrt(squares + twice), np.sqrt(np.maximum(squares - twice, 0))
+        squares = a * a + b * b + c * c + d * d
+        twice = 2 * np.abs(a * d - b * c)
+        total = np.sqrt(squares + twice)
+        difference = np.sqrt(np.maximum(squares - twice, 0))
         return np.column_stack([total + difference, total - difference]) / 2
 
 

@@ -46,7 +46,9 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
     """
     distance = np.asarray(distance_m, dtype=float)
     color = focus_shift_m / camera.focal_length_m**2
-    diameter_m = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m + color)
+    diameter_m = (
+        camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m + color)
+    )
     return diameter_m / (2 * camera.pixel_m)
 
 
@@ -63,7 +65,9 @@ def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -
     axis; that of the mean d is drawn as a disk, and what is missing is k^2 var(d) / 4. Lateral color smears along the
     radius of the field; half of its variance goes to each axis.
     """
-    scale_px_m = camera.pupil_m * camera.image_distance_m / (2 * camera.pixel_m * camera.focal_length_m**2)
+    scale_px_m = (
+        camera.pupil_m * camera.image_distance_m / (2 * camera.pixel_m * camera.focal_length_m**2)
+    )
     radius = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1) / camera.corner_px
     return np.hypot(scale_px_m * chromatic[:, 1] / 2, radius * chromatic[:, 3] / math.sqrt(2))
 
@@ -130,8 +134,12 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     # The transform is separable: compute it on the distinct fx and fy, then spread it to all pairs.
     distinct_fx, i = np.unique(fx, return_inverse=True)
     distinct_fy, j = np.unique(fy, return_inverse=True)
-    wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * cell_response(distinct_fx / psf.oversampling)
-    wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * cell_response(distinct_fy / psf.oversampling)
+    wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * cell_response(
+        distinct_fx / psf.oversampling
+    )
+    wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * cell_response(
+        distinct_fy / psf.oversampling
+    )
     product = wave_y.T @ cells @ wave_x
     return np.asarray(product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))])
 
@@ -140,7 +148,9 @@ def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
     """x of a measured table's columns and y of its rows, from its center of gravity."""
     cells = read_cells(psf.file)
     position_px = np.arange(len(cells)) / psf.oversampling
-    return position_px - cells.sum(axis=0) @ position_px, position_px - cells.sum(axis=1) @ position_px
+    return position_px - cells.sum(axis=0) @ position_px, position_px - cells.sum(
+        axis=1
+    ) @ position_px
 
 
 @lru_cache(maxsize=16)
@@ -165,10 +175,16 @@ def read_cells(file: str) -> Floats:
     except (OSError, ValueError) as error:
         raise InputError("camera.psf.file", f"{path}: {error}") from None
     if cells.ndim != 2 or cells.shape[0] != cells.shape[1] or not 3 <= len(cells) <= 1024:
-        raise InputError("camera.psf.file", f"{path}: shape {cells.shape}", "a square of 3 to 1024 numbers a side")
+        raise InputError(
+            "camera.psf.file",
+            f"{path}: shape {cells.shape}",
+            "a square of 3 to 1024 numbers a side",
+        )
     total = cells.sum()
     if not (np.isfinite(total) and total > 0):
-        raise InputError("camera.psf.file", f"{path}: its numbers add up to {total:g}", "a finite sum above 0")
+        raise InputError(
+            "camera.psf.file", f"{path}: its numbers add up to {total:g}", "a finite sum above 0"
+        )
     return np.asarray(cells / total)
 
 
@@ -177,7 +193,9 @@ def cell_response(u: Floats) -> Floats:
 
     Keys' kernel (a = -1/2) has the transform (3 s1^2 - 3 s2^2 - s2 + s4) / (pi u)^2 with sk = sinc(k u).
     """
-    one, two, four = np.sinc(u), np.sinc(2 * u), np.sinc(4 * u)
+    one = np.sinc(u)
+    two = np.sinc(2 * u)
+    four = np.sinc(4 * u)
     keys = (3 * one**2 - 3 * two**2 - two + four) / np.maximum((np.pi * u) ** 2, 1e-300)
     ratio = keys / np.where(np.abs(one) > 1e-6, one, np.inf)
     return np.asarray(np.where(np.abs(u) < 1e-4, 1.0, ratio))

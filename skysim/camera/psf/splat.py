@@ -24,12 +24,16 @@ LANES = 32  # buffers are multiples of this (four registers of eight), so that S
 
 
 @jit
-def add_gaussian(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float) -> None:
+def add_gaussian(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
+) -> None:
     """Add a Gaussian's exact fraction in each pixel: the product of two differences of the error function."""
     height, width = patch.shape
     reach = REACH_SIGMA * sigma_px + 0.5
-    left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
-    top, bottom = max(ceil(y - reach), row0, 0), min(floor(y + reach) + 1, row1, height)
+    left = max(ceil(x - reach), 0)
+    right = min(floor(x + reach) + 1, width)
+    top = max(ceil(y - reach), row0, 0)
+    bottom = min(floor(y + reach) + 1, row1, height)
     if right <= left or bottom <= top:
         return
     scale = 1 / (sigma_px * sqrt(2.0))
@@ -50,7 +54,9 @@ def add_gaussian(patch: Floats, row0: int, row1: int, x: float, y: float, electr
 
 
 @jit(fastmath=True)
-def add_round(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles) -> None:
+def add_round(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, radial: Singles
+) -> None:
     """Add a round image seen by square pixels: T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta.
 
     radial (R, 3, 5 or 7): at r = i / PER_PX of T0 the value, the step to the next entry and Bessel's second
@@ -64,13 +70,19 @@ def add_round(patch: Floats, row0: int, row1: int, x: float, y: float, electrons
     """
     height, width = patch.shape
     reach = (radial.shape[0] - 2) / PER_PX
-    left, right = max(ceil(x - reach), 0), min(floor(x + reach) + 1, width)
-    top, bottom = max(ceil(y - reach), row0, 0), min(floor(y + reach) + 1, row1, height)
+    left = max(ceil(x - reach), 0)
+    right = min(floor(x + reach) + 1, width)
+    top = max(ceil(y - reach), row0, 0)
+    bottom = min(floor(y + reach) + 1, row1, height)
     if right <= left or bottom <= top:
         return
     lanes = (right - left + LANES - 1) // LANES * LANES
-    buffers, entry = np.empty((4, lanes), np.float32), np.empty(lanes, np.int32)
-    u, f, c4, c8 = buffers[0], buffers[1], buffers[2], buffers[3]
+    buffers = np.empty((4, lanes), np.float32)
+    entry = np.empty(lanes, np.int32)
+    u = buffers[0]
+    f = buffers[1]
+    c4 = buffers[2]
+    c8 = buffers[3]
     for i in range(lanes):
         u[i] = (left + i - x) ** 2
     for j in range(top, bottom):
@@ -95,8 +107,11 @@ def add_round(patch: Floats, row0: int, row1: int, x: float, y: float, electrons
         else:
             for i in range(first, last):
                 k = np.uint64(entry[i])
-                t4, t8 = radial[k, 3] + f[i] * radial[k, 4], radial[k, 5] + f[i] * radial[k, 6]
-                row[i] += electrons * (interpolate_t0(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8)
+                t4 = radial[k, 3] + f[i] * radial[k, 4]
+                t8 = radial[k, 5] + f[i] * radial[k, 6]
+                row[i] += electrons * (
+                    interpolate_t0(radial, entry[i], f[i]) + c4[i] * t4 + c8[i] * t8
+                )
 
 
 @jit(fastmath=True)
@@ -127,12 +142,17 @@ def interpolate_t0(radial: Singles, entry: int, f: float) -> float:
 @jit
 def cubic(t: float) -> tuple[float, float, float, float]:
     """Lagrange's weights of the samples at -1, 0, 1, 2 at 0 <= t < 1."""
-    a, b, c, d = t + 1, t, t - 1, t - 2
+    a = t + 1
+    b = t
+    c = t - 1
+    d = t - 2
     return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
 
 
 @jit(fastmath=True)
-def add_grid(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles) -> None:
+def add_grid(
+    patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, grid: Singles
+) -> None:
     """Add an image of any shape from its tables at S x S sub-pixel positions, with cubic interpolation between them.
 
     grid (S + 3, S + 3, N, N): grid[q, p, j, i] is the fraction in pixel (i, j) of an image centered at
@@ -141,27 +161,39 @@ def add_grid(patch: Floats, row0: int, row1: int, x: float, y: float, electrons:
     every mixture.
     """
     height, width = patch.shape
-    steps, size = grid.shape[0] - 3, grid.shape[2]
-    center_x, center_y = floor(x + 0.5), floor(y + 0.5)
-    phase_x, phase_y = (x - center_x + 0.5) * steps, (y - center_y + 0.5) * steps
-    p, q = min(int(phase_x), steps - 1), min(int(phase_y), steps - 1)
+    steps = grid.shape[0] - 3
+    size = grid.shape[2]
+    center_x = floor(x + 0.5)
+    center_y = floor(y + 0.5)
+    phase_x = (x - center_x + 0.5) * steps
+    phase_y = (y - center_y + 0.5) * steps
+    p = min(int(phase_x), steps - 1)
+    q = min(int(phase_y), steps - 1)
     wx0, wx1, wx2, wx3 = cubic(phase_x - p)
     wy = cubic(phase_y - q)
-    corner_x, corner_y = center_x - size // 2, center_y - size // 2
-    left, right = max(corner_x, 0), min(corner_x + size, width)
-    top, bottom = max(corner_y, row0, 0), min(corner_y + size, row1, height)
+    corner_x = center_x - size // 2
+    corner_y = center_y - size // 2
+    left = max(corner_x, 0)
+    right = min(corner_x + size, width)
+    top = max(corner_y, row0, 0)
+    bottom = min(corner_y + size, row1, height)
     if right <= left or bottom <= top:
         return
     sums = np.empty(right - left, np.float32)
-    first, last = left - corner_x, right - corner_x
+    first = left - corner_x
+    last = right - corner_x
     for j in range(top, bottom):
         sums[:] = 0
         for s in range(4):
             tables = grid[q + s, p : p + 4, j - corner_y, first:last]
-            w0, w1 = np.float32(wy[s] * wx0), np.float32(wy[s] * wx1)
-            w2, w3 = np.float32(wy[s] * wx2), np.float32(wy[s] * wx3)
+            w0 = np.float32(wy[s] * wx0)
+            w1 = np.float32(wy[s] * wx1)
+            w2 = np.float32(wy[s] * wx2)
+            w3 = np.float32(wy[s] * wx3)
             for i in range(sums.size):
-                sums[i] += w0 * tables[0, i] + w1 * tables[1, i] + w2 * tables[2, i] + w3 * tables[3, i]
+                sums[i] += (
+                    w0 * tables[0, i] + w1 * tables[1, i] + w2 * tables[2, i] + w3 * tables[3, i]
+                )
         row = patch[j, left:right]
         for i in range(sums.size):
             row[i] += electrons * sums[i]

@@ -34,7 +34,9 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
     reach = (1 + ghost.radius_px / camera.corner_px) / abs(ghost.magnification)
     field_rad = math.atan(math.tan(optics.field_rad) * reach)
     scale = -ghost.magnification * getattr(optics, "scale", 1.0)
-    return ScaledOptics(camera, optics.collecting_m2 * ghost.share, optics.fold_r, field_rad, scale=scale)
+    return ScaledOptics(
+        camera, optics.collecting_m2 * ghost.share, optics.fold_r, field_rad, scale=scale
+    )
 
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:

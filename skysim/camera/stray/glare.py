@@ -38,7 +38,9 @@ def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
     spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(config, (height, width), block)
     scattered = fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
     light_e *= 1 - config.share
-    light_e += config.share * ndimage.zoom(scattered, block, order=1, mode="reflect", grid_mode=True)
+    light_e += config.share * ndimage.zoom(
+        scattered, block, order=1, mode="reflect", grid_mode=True
+    )
 
 
 def block_px(shape: tuple[int, ...], core_px: float) -> int:
@@ -62,5 +64,7 @@ def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
 def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:
     """The truth of images from which a share of the light was scattered away."""
     return replace(
-        sources, electrons=(1 - config.share) * sources.electrons, peak_e=(1 - config.share) * sources.peak_e
+        sources,
+        electrons=(1 - config.share) * sources.electrons,
+        peak_e=(1 - config.share) * sources.peak_e,
     )

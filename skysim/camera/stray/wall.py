@@ -17,11 +17,16 @@ from skysim.sources.dome.reflection.mirror import mirrored
 from skysim.sources.photometry import Band
 
 IRRADIANCE = 16, 21  # places over the chip's rows and columns at which the wall's light is computed
-GRID = 28, 36  # directions over the chip's rows and columns from which images in the wall are searched
+GRID = (
+    28,
+    36,
+)  # directions over the chip's rows and columns from which images in the wall are searched
 MARGIN = 0.15  # of the chip's size, beyond its edges, for images of LEDs that reach in
 
 
-def wall_glow(dome: ReflectingDome, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band) -> Floats:
+def wall_glow(
+    dome: ReflectingDome, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
+) -> Floats:
     """(h, w) electrons s^-1 px^-1 at the nodes of `background.glow_map`: the radiance rho E / pi times the etendue.
 
     camera_m : (3,) the entrance pupil in the lab; outside of the wall it sees nothing
@@ -35,14 +40,19 @@ def wall_glow(dome: ReflectingDome, optics: Optics, cam_from_lab: Rotation, came
     few = chip_grid(optics, IRRADIANCE, 0.0) @ cam_from_lab.as_matrix()
     seen = np.isfinite(dome.wall.meet(camera_m, view.toward_lab)[:, 0])
     wall_m = camera_m + dome.wall.exit_m(camera_m, few.reshape(-1, 3))[:, None] * few.reshape(-1, 3)
-    radiance = seen * dome.config.diffuse * spread(dome.diffuse, wall_m, dome.wall.inward(wall_m), shape)
+    radiance = (
+        seen * dome.config.diffuse * spread(dome.diffuse, wall_m, dome.wall.inward(wall_m), shape)
+    )
     if dome.config.floor:
-        up, depth_m = np.array([0.0, 0.0, 1.0]), camera_m[2] + dome.config.floor.depth_m
+        up = np.array([0.0, 0.0, 1.0])
+        depth_m = camera_m[2] + dome.config.floor.depth_m
         floor_m = camera_m + meeting(few.reshape(-1, 3), depth_m)
         axis_m = np.linalg.norm((camera_m + meeting(view.toward_lab, depth_m))[:, :2], axis=1)
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
         radiance += (
-            on_floor * dome.config.floor.share * spread(dome.diffuse, floor_m, np.tile(up, (len(floor_m), 1)), shape)
+            on_floor
+            * dome.config.floor.share
+            * spread(dome.diffuse, floor_m, np.tile(up, (len(floor_m), 1)), shape)
         )
     return np.asarray(radiance / np.pi * view.etendue_m2_sr()).reshape(shape)
 
@@ -52,7 +62,9 @@ def meeting(toward: Floats, depth_m: float) -> Floats:
     return toward * (depth_m / np.where(toward[:, 2] < 0, -toward[:, 2], np.nan))[:, None]
 
 
-def spread(diffuse: DiffuseLight, points_m: Floats, normals: Floats, shape: tuple[int, int]) -> Floats:
+def spread(
+    diffuse: DiffuseLight, points_m: Floats, normals: Floats, shape: tuple[int, int]
+) -> Floats:
     """(h * w,) irradiance at the nodes, linear between points at `IRRADIANCE` evenly spread places of the chip."""
     values = np.nan_to_num(diffuse.irradiance_e_s_m2(points_m, normals)).reshape(IRRADIANCE)
     places = (np.linspace(0, 1, count) for count in IRRADIANCE)

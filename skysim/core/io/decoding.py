@@ -23,7 +23,9 @@ def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
     if prod(sides) > MAX_PIXELS:
         raise InputError(path, f"{size} pixels by its header", f"up to {MAX_PIXELS}")
     if (size_bytes := prod(sides) * each_bytes) > MAX_BYTES:
-        raise InputError(path, f"{size} pixels of {size_bytes} bytes by its header", f"up to {MAX_BYTES} bytes")
+        raise InputError(
+            path, f"{size} pixels of {size_bytes} bytes by its header", f"up to {MAX_BYTES} bytes"
+        )
 
 
 def check_bytes(path: Path) -> None:
@@ -48,7 +50,8 @@ def silent_opencv() -> Iterator[None]:
 def silent_stderr() -> Iterator[None]:
     """Suppress output of C libraries: libpng and OpenCV write their messages directly to file descriptor 2."""
     sys.stderr.flush()
-    saved, devnull = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    saved = os.dup(2)
+    devnull = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(devnull, 2)
         yield

@@ -24,7 +24,9 @@ from skysim.core.io import decoding, tiff
 from skysim.core.io.decoding import check_pixels, silent_stderr
 
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
-PNG_MAGIC, JPEG_MAGIC, BMP_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+JPEG_MAGIC = b"\xff\xd8\xff"
+BMP_MAGIC = b"BM"
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 
 
@@ -58,8 +60,16 @@ def check_encoded_size(path: Path, data: bytes) -> None:
         check_pixels(path, *sides, each_bytes=each_bytes)
 
 
-Sizes = Iterator[tuple[tuple[int, ...], int]]  # width and height, and the bytes of each pixel as OpenCV decodes it
-PNG_SAMPLES = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}  # by color type: OpenCV adds colors to gray with alpha, alpha to a palette
+Sizes = Iterator[
+    tuple[tuple[int, ...], int]
+]  # width and height, and the bytes of each pixel as OpenCV decodes it
+PNG_SAMPLES = {
+    0: 1,
+    2: 3,
+    3: 4,
+    4: 4,
+    6: 4,
+}  # by color type: OpenCV adds colors to gray with alpha, alpha to a palette
 
 
 def png_size(data: bytes) -> Sizes:
@@ -70,14 +80,17 @@ def png_size(data: bytes) -> Sizes:
     """
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     end = [chunk_end for _, _, chunk_end in png_chunks(data)][-1] + 4  # behind the chunk's checksum
-    complete = end <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(data)
+    complete = end <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(
+        data
+    )
     if complete or width * height > decoding.MAX_PIXELS:  # the caller reports an excessive size
         yield (width, height), PNG_SAMPLES.get(color, 4) * max(bits // 8, 1)
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
     """Kind of each chunk, and where its body begins and ends, up to IEND (PNG, section 5.3)."""
-    at, kind = len(PNG_MAGIC), b""
+    at = len(PNG_MAGIC)
+    kind = b""
     while kind != b"IEND" and at < len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         yield kind, at + 8, at + 8 + length
@@ -96,7 +109,9 @@ def opened_by_pillow(data: bytes) -> Iterator[Any]:
     from PIL import BmpImagePlugin, JpegImagePlugin
 
     # The class, not Image.open: that has a limit of its own.
-    plugin = BmpImagePlugin.BmpImageFile if data.startswith(BMP_MAGIC) else JpegImagePlugin.JpegImageFile
+    plugin = (
+        BmpImagePlugin.BmpImageFile if data.startswith(BMP_MAGIC) else JpegImagePlugin.JpegImageFile
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged EXIF
         with plugin(io.BytesIO(data)) as image:
@@ -136,7 +151,9 @@ def read_exif(data: bytes) -> tiff.Exif:
     if data.startswith(tiff.MAGICS):
         return tiff.read_exif(data)._replace(orientation=1)
     if data.startswith(PNG_MAGIC):
-        return tiff.read_exif(next((data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b""))
+        return tiff.read_exif(
+            next((data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+        )
     if data.startswith(JPEG_MAGIC):
         with opened_by_pillow(data) as image:
             return tiff.read_exif(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))

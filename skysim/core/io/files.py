@@ -144,11 +144,16 @@ def write_image(path: Path, image: NDArray) -> None:
     would not report why a file cannot be written.
     """
     try:
-        encoded, data = cv2.imencode(path.suffix, image, UNCOMPRESSED_TIFF if path.suffix == ".tif" else ())
+        encoded, data = cv2.imencode(
+            path.suffix, image, UNCOMPRESSED_TIFF if path.suffix == ".tif" else ()
+        )
     except cv2.error:
         encoded = False
     if not encoded:
-        raise InputError(path, f"an image of {image.dtype} and shape {image.shape} cannot be encoded in this format")
+        raise InputError(
+            path,
+            f"an image of {image.dtype} and shape {image.shape} cannot be encoded in this format",
+        )
     with atomic_file(path) as temporary:
         temporary.write_bytes(data.data)
 
@@ -165,7 +170,9 @@ def read_table(path: Path) -> Any:
 
     try:
         return Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
+    except (
+        Exception
+    ) as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
         raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
 
 
@@ -176,7 +183,11 @@ def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> li
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
     positive = key in ("size_px", "focal_px")
-    if numbers.shape != (count,) or not np.isfinite(numbers).all() or (positive and numbers.min() <= 0):
+    if (
+        numbers.shape != (count,)
+        or not np.isfinite(numbers).all()
+        or (positive and numbers.min() <= 0)
+    ):
         what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
         raise InputError(path, f"{key} in the header is {meta.get(key)!r}", what)
     return [float(number) for number in numbers]

@@ -29,17 +29,33 @@ from skysim.core.io import decoding
 from skysim.core.io.decoding import check_pixels
 from skysim.core.io.guarded import run_guarded
 
-SUFFIXES = tuple(f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts"))
-MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
+SUFFIXES = tuple(
+    f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts")
+)
+MAGIC = (
+    b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
+)
 GZIP_BLOCK = 1 << 20  # bytes unpacked at a time
 MAX_HDUS = 1000  # that are searched for an image
-CARD_BYTES, MAX_CARDS = 80, 100_000  # a line of a header, and their greatest number
-AXES, MAX_AXES = re.compile(rb"NAXIS *= *(\d+)"), 999  # FITS standard 4.0, section 4.4.1.1
+# a line of a header, and their greatest number
+CARD_BYTES = 80
+MAX_CARDS = 100_000
+# FITS standard 4.0, section 4.4.1.1
+AXES = re.compile(rb"NAXIS *= *(\d+)")
+MAX_AXES = 999
 MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
-TILES_CPU_S, TILES_BYTES = 10, 1 << 31  # for a compressed image
+# for a compressed image
+TILES_CPU_S = 10
+TILES_BYTES = 1 << 31
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
-TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP")  # of the chip, degrees Celsius: conventions of imaging programs
-TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}  # values of ROWORDER, which is a convention of imaging programs
+TEMPERATURE_KEYS = (
+    "CCD-TEMP",
+    "DET-TEMP",
+)  # of the chip, degrees Celsius: conventions of imaging programs
+TOP_DOWN = {
+    "TOP-DOWN": True,
+    "BOTTOM-UP": False,
+}  # values of ROWORDER, which is a convention of imaging programs
 
 
 class FitsImage(NamedTuple):
@@ -69,7 +85,10 @@ def read_fits_image(path: Path) -> FitsImage:
     from astropy.io import fits
 
     try:
-        with open_fits(path) as file, fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+        with (
+            open_fits(path) as file,
+            fits.open(file, memmap=False, disable_image_compression=True) as hdus,
+        ):
             for number, hdu in enumerate(islice(hdus, MAX_HDUS)):
                 check_hdu(path, hdu)
                 if hdu.header.get("ZIMAGE"):
@@ -78,12 +97,18 @@ def read_fits_image(path: Path) -> FitsImage:
                     pixels = np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
                 else:
                     place = hdu.fileinfo()
-                    check_header(path, file, place["datLoc"] + place["datSpan"])  # the next one, before it is opened
+                    check_header(
+                        path, file, place["datLoc"] + place["datSpan"]
+                    )  # the next one, before it is opened
                     continue
-                return FitsImage(channels_last(path, pixels), *header_values(hdu.header, hdus[0].header))
+                return FitsImage(
+                    channels_last(path, pixels), *header_values(hdu.header, hdus[0].header)
+                )
     except InputError:
         raise
-    except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
+    except (
+        Exception
+    ) as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
         raise InputError(path, f"not a complete FITS file: {error}") from None
     raise InputError(path, "a FITS file without an image")
 
@@ -122,7 +147,9 @@ def unpack(path: Path, file: IO[bytes]) -> None:
             while block := packed.read(GZIP_BLOCK):
                 size += len(block)
                 if size > decoding.MAX_BYTES:
-                    raise InputError(path, f"more than {decoding.MAX_BYTES} bytes when unpacked", "no more")
+                    raise InputError(
+                        path, f"more than {decoding.MAX_BYTES} bytes when unpacked", "no more"
+                    )
                 file.write(block)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(path, f"not a complete gzip file: {error}") from None
@@ -185,7 +212,9 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
     if pixels.ndim == 3 and pixels.shape[2] == 3:
         return np.ascontiguousarray(pixels[:, :, ::-1])
     if pixels.ndim != 2:
-        raise InputError(path, f"a FITS image of shape {shape}", "(H, W), color (3, H, W) and (H, W, 3)")
+        raise InputError(
+            path, f"a FITS image of shape {shape}", "(H, W), color (3, H, W) and (H, W, 3)"
+        )
     return pixels
 
 
@@ -201,7 +230,8 @@ def header_values(
     date_utc = None
     with contextlib.suppress(ValueError):
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
-    exposure_s, temperature_c = first_number(found, EXPOSURE_KEYS), first_number(found, TEMPERATURE_KEYS)
+    exposure_s = first_number(found, EXPOSURE_KEYS)
+    temperature_c = first_number(found, TEMPERATURE_KEYS)
     return TOP_DOWN.get(found.get("ROWORDER", "").upper()), date_utc, exposure_s, temperature_c
 
 

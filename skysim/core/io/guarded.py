@@ -26,7 +26,15 @@ def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) ->
 
     cpu_s : processor time, with start-up; memory_bytes : address space, with the libraries
     """
-    command = [sys.executable, "-m", __name__, str(cpu_s), str(memory_bytes), str(script), *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        __name__,
+        str(cpu_s),
+        str(memory_bytes),
+        str(script),
+        *arguments,
+    ]
     with tempfile.TemporaryFile() as errors:
         try:
             code = subprocess.run(

@@ -48,8 +48,12 @@ def read_picture(path: Path) -> Picture:
     check_name(path)
     if not is_fits(path):
         data = path.read_bytes()
-        pixels, exif = encoded.decode_image(path, data), encoded.read_exif(data)
-        return Picture(check_numbers(path, encoded.upright(pixels, exif.orientation)), focal_35mm=exif.focal_35mm)
+        pixels = encoded.decode_image(path, data)
+        exif = encoded.read_exif(data)
+        return Picture(
+            check_numbers(path, encoded.upright(pixels, exif.orientation)),
+            focal_35mm=exif.focal_35mm,
+        )
     image = fits.read_fits_image(path)
     pixels = image.pixels if image.top_down else np.ascontiguousarray(image.pixels[::-1])
     return Picture(
@@ -67,12 +71,17 @@ def read_image(path: Path) -> NDArray:
     Raises InputError with one line for a file that is missing, truncated, not an image, or has too many pixels.
     """
     check_name(path)
-    return check_numbers(path, fits.read_fits(path) if is_fits(path) else encoded.decode_image(path, path.read_bytes()))
+    return check_numbers(
+        path,
+        fits.read_fits(path) if is_fits(path) else encoded.decode_image(path, path.read_bytes()),
+    )
 
 
 def image_suffix(name: str) -> str:
     """The suffix of an image file's name, in small letters: the longest known one; empty if there is none."""
-    return max((suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)), key=len, default="")
+    return max(
+        (suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)), key=len, default=""
+    )
 
 
 def check_name(path: Path) -> None:
@@ -101,7 +110,9 @@ def monochrome(image: NDArray) -> NDArray:
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise InputError("", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels")
+        raise InputError(
+            "", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels"
+        )
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
@@ -116,7 +127,8 @@ class LiveCamera:
     """An open camera or video stream, read frame by frame."""
 
     def __init__(self, source: str) -> None:
-        self.source, self.frame_count = source, 0
+        self.source = source
+        self.frame_count = 0
         with silent_opencv():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
             self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
@@ -128,7 +140,9 @@ class LiveCamera:
         if not ok or frame is None:
             if self.frame_count:
                 raise InputError(self.source, f"ends after {self.frame_count} frames")
-            raise InputError(self.source, "no camera found", "an index such as 0, a video file, a URL")
+            raise InputError(
+                self.source, "no camera found", "an index such as 0, a video file, a URL"
+            )
         self.frame_count += 1
         return np.asarray(frame)
 

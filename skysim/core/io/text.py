@@ -32,7 +32,9 @@ def read_lines(path: Path) -> list[Line]:
             raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(
+            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
     return [(n, line.strip()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
@@ -42,7 +44,9 @@ def excerpt(text: object) -> str:
     return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
 
 
-def to_numbers(source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int) -> Floats:
+def to_numbers(
+    source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
+) -> Floats:
     """(N, width) finite numbers of the words of each line. Raises InputError for the first line that has others."""
     for line, words in zip(places, rows, strict=True):
         if len(words) != width:
@@ -69,7 +73,12 @@ def check_numbers(where: Where, words: Sequence[str]) -> None:
 
 
 def seconds_since(
-    source: str, places: Sequence[int], epochs: Sequence[str], start: datetime.datetime, system: str, unit: str = "line"
+    source: str,
+    places: Sequence[int],
+    epochs: Sequence[str],
+    start: datetime.datetime,
+    system: str,
+    unit: str = "line",
 ) -> Floats:
     """(N,) seconds from a start in UTC to epochs (ISO 8601, calendar or day of year) of a time system of SCALES.
 
@@ -79,7 +88,9 @@ def seconds_since(
     from astropy.time import Time
 
     bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
-    bad += [n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))]
+    bad += [
+        n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))
+    ]
     if bad:
         raise InputError(
             source,
@@ -89,7 +100,8 @@ def seconds_since(
         )
     texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
     ordinal = bool(texts) and texts[0].count("-") == 1
-    kind, scale = ("yday" if ordinal else "isot"), SCALES[system]
+    kind = "yday" if ordinal else "isot"
+    scale = SCALES[system]
     if ordinal:
         texts = [text.replace("-", ":", 1).replace("T", ":", 1) for text in texts]
     with warnings.catch_warnings():
@@ -99,7 +111,9 @@ def seconds_since(
         except ValueError:
             n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
             raise InputError(
-                source, f"{excerpt(epochs[n])} is not a date and time", where=Where(source, places[n], unit)
+                source,
+                f"{excerpt(epochs[n])} is not a date and time",
+                where=Where(source, places[n], unit),
             ) from None
         times.precision = 9
     try:
@@ -139,7 +153,10 @@ def read_named_rows(
     for place, row in zip(places, rows, strict=True):
         if len(row) != len(columns):
             raise InputError(
-                path, f"{len(row)} values", f"{len(columns)}, as the first line has", where=Where(path, place)
+                path,
+                f"{len(row)} values",
+                f"{len(columns)}, as the first line has",
+                where=Where(path, place),
             )
     used = [columns.index(one) for one in (*needed, *also) if one in columns]
     numbers = to_numbers(str(path), places, [[row[k] for k in used] for row in rows], len(used))
@@ -182,5 +199,7 @@ def one_of(path: str | Path, metadata: dict[str, Line], key: str, allowed: Itera
     line, value = metadata[key]
     names = list(allowed)
     if value.upper() not in names:
-        raise InputError(path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line))
+        raise InputError(
+            path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line)
+        )
     return value.upper()

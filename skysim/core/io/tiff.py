@@ -12,8 +12,14 @@ MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # Integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned, so a
 # negative size, which libtiff rejects, is a huge one here.
 INTEGER_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
-WIDTH_TAG, HEIGHT_TAG, SAMPLES_TAG, BITS_TAG, PLANAR_TAG = 256, 257, 277, 258, 284
-ORIENTATION_TAG, EXIF_TAG, FOCAL_35MM_TAG = 274, 34665, 41989
+WIDTH_TAG = 256
+HEIGHT_TAG = 257
+SAMPLES_TAG = 277
+BITS_TAG = 258
+PLANAR_TAG = 284
+ORIENTATION_TAG = 274
+EXIF_TAG = 34665
+FOCAL_35MM_TAG = 41989
 MAX_ENTRIES = 1 << 16
 
 
@@ -55,17 +61,24 @@ class Tiff:
         size, head, value = (20, 8, 12) if big else (12, 2, 8)
         for n in range(min(count, MAX_ENTRIES)):
             begin = at + head + n * size
-            tag, kind = self.number("H", begin), self.number("H", begin + 2)
+            tag = self.number("H", begin)
+            kind = self.number("H", begin + 2)
             yield Entry(tag, kind, self.number("Q" if big else "I", begin + 4), begin + value)
 
     def value(self, entry: Entry) -> int | None:
         """The first value of an entry, if it is an integer in the entry itself; else None."""
-        return self.number(INTEGER_TYPES[entry.kind], entry.at) if entry.kind in INTEGER_TYPES else None
+        return (
+            self.number(INTEGER_TYPES[entry.kind], entry.at)
+            if entry.kind in INTEGER_TYPES
+            else None
+        )
 
     def most_bits(self, entry: Entry) -> int:
         """Bits of the first sample by a BITS_TAG, whose values are in the entry itself, or where it points to."""
         inside = entry.values * 2 <= (8 if self.is_big else 4)
-        return self.number("H", entry.at if inside else self.number("Q" if self.is_big else "I", entry.at))
+        return self.number(
+            "H", entry.at if inside else self.number("Q" if self.is_big else "I", entry.at)
+        )
 
 
 def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
@@ -74,7 +87,8 @@ def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
     Of a repeated tag the greatest value counts: libtiff uses the first.
     """
     tiff = Tiff(data)
-    values, bits = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1, PLANAR_TAG: 1}, 8
+    values = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1, PLANAR_TAG: 1}
+    bits = 8
     for entry in tiff.entries():
         if entry.tag in values:
             values[entry.tag] = max(values[entry.tag], tiff.value(entry) or 0)

@@ -44,12 +44,15 @@ class StrictLoader(yaml.SafeLoader):
         self.size: dict[int, int] = {}  # nodes within each completely composed node, by id
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        before, mark = self.nodes, self.peek_event().start_mark
+        before = self.nodes
+        mark = self.peek_event().start_mark
         aliased = self.check_event(yaml.AliasEvent)
         # Limits are checked while composing, before any value is constructed from an expanding alias.
         self.depth += 1
         if self.depth > MAX_DEPTH:
-            raise yaml.composer.ComposerError(None, None, f"more than {MAX_DEPTH} sections deep", mark)
+            raise yaml.composer.ComposerError(
+                None, None, f"more than {MAX_DEPTH} sections deep", mark
+            )
         node = super().compose_node(parent, index)
         self.depth -= 1
         # An alias of a node that is not yet complete lies within that node: it is recursive.
@@ -66,7 +69,9 @@ class StrictLoader(yaml.SafeLoader):
         try:
             return super().construct_object(node, deep)
         except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
-            problem = f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
+            problem = (
+                f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
+            )
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
@@ -104,7 +109,8 @@ def existing_file(value: str) -> str:
 
 def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a file given by path, or by its name in a folder. Raises InputError."""
-    path, shipped = Path(name), folder / f"{name}.yaml"
+    path = Path(name)
+    shipped = folder / f"{name}.yaml"
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
     if not path.suffix and is_file(shipped):
@@ -137,7 +143,10 @@ def parse_overrides(
 
 def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
     """The values of overrides as YAML text, as `--set` takes them: strings unchanged, other values as JSON."""
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in (overrides or {}).items()}
+    return {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in (overrides or {}).items()
+    }
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
@@ -148,11 +157,15 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
         text = path.read_text(encoding="utf-8")
         node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise InputError(
+            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = Where(path, mark.line + 1 if mark else None)
-        raise InputError(path, f"not YAML: {getattr(error, 'problem', error)}", where=where) from error
+        raise InputError(
+            path, f"not YAML: {getattr(error, 'problem', error)}", where=where
+        ) from error
     if not isinstance(tree, dict):
         raise InputError(path, "", "a mapping of keys to values")
     reject_duplicate_keys(node, path)
@@ -184,7 +197,9 @@ def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     problem = f"unknown version {excerpt(repr(version))}"
     if type(version) is int:
         problem = f"version {version} is " + (
-            f"newer than skysim {__version__} supports" if version > VERSION else "no longer supported"
+            f"newer than skysim {__version__} supports"
+            if version > VERSION
+            else "no longer supported"
         )
     raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
 
@@ -196,14 +211,20 @@ def set_key(tree: dict[str, Any], key: str, value: str) -> None:
         raise InputError(OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
-        node = node.setdefault(parent, {}) if isinstance(node, dict) else node[list_index(node, parent, key)]
+        node = (
+            node.setdefault(parent, {})
+            if isinstance(node, dict)
+            else node[list_index(node, parent, key)]
+        )
         if not isinstance(node, dict | list):
             section = excerpt(".".join(parents[: depth + 1]))
             raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)
     try:
         node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(value)[1]
     except yaml.YAMLError as error:
-        raise InputError(excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES) from error
+        raise InputError(
+            excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES
+        ) from error
 
 
 def list_index(values: list[Any], component: str, key: str) -> int:
@@ -211,7 +232,10 @@ def list_index(values: list[Any], component: str, key: str) -> int:
     digits = component.isascii() and component.isdigit() and len(component) < 10
     if not digits or int(component) >= len(values):
         raise InputError(
-            excerpt(key), f"{excerpt(component)} is not a list index", f"0 to {len(values) - 1}", OVERRIDES
+            excerpt(key),
+            f"{excerpt(component)} is not a list index",
+            f"0 to {len(values) - 1}",
+            OVERRIDES,
         )
     return int(component)
 
@@ -274,7 +298,8 @@ def explain(
 
 def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     """One error of pydantic; its key is relative to the error's location."""
-    kind, context = error["type"], error.get("ctx", {})
+    kind = error["type"]
+    context = error.get("ctx", {})
     if kind == "value_error":  # a validator's own, which may name a key below
         cause = context["error"]
         return cause if isinstance(cause, InputError) else InputError("", cause)
@@ -285,7 +310,10 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     if kind == "missing":
         return InputError("", "missing")
     if kind == "union_tag_invalid":
-        return InputError("kind", *unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")]))
+        return InputError(
+            "kind",
+            *unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")]),
+        )
     if kind == "union_tag_not_found":
         return InputError("", "kind is missing")
     value = excerpt(repr(error["input"]))
@@ -331,8 +359,12 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
     for key in loc:
         node = resolve(node, schema)
         # Branches of a union; an optional section has its union nested one level deeper.
-        options = [resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])]
-        options += [resolve(option, schema) for outer in options for option in outer.get("oneOf", [])]
+        options = [
+            resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])
+        ]
+        options += [
+            resolve(option, schema) for outer in options for option in outer.get("oneOf", [])
+        ]
         if key in node.get("properties", {}):
             node = node["properties"][key]
         elif isinstance(key, int):
@@ -364,14 +396,22 @@ def suggestion(word: str, allowed: Sequence[str]) -> str:
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
     """How many components of a dotted key occur in the text, and the line of the last one that does."""
     node = yaml.compose(text, yaml.SafeLoader)
-    depth, line = 0, None
+    depth = 0
+    line = None
     for key in keys:
         entry = None
         if isinstance(node, yaml.MappingNode):
             entry = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and key.isascii() and key.isdigit() and int(key) < len(node.value):
+        elif (
+            isinstance(node, yaml.SequenceNode)
+            and key.isascii()
+            and key.isdigit()
+            and int(key) < len(node.value)
+        ):
             entry = (node.value[int(key)],) * 2
         if not entry:
             break
-        depth, line, node = depth + 1, entry[0].start_mark.line + 1, entry[1]
+        depth = depth + 1
+        line = entry[0].start_mark.line + 1
+        node = entry[1]
     return depth, line

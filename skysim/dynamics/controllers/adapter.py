@@ -10,7 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, printable
-from skysim.core.plugins import MAX_STATUS_CHARS, Program, ProgramError, describe_error, host_command
+from skysim.core.plugins import (
+    MAX_STATUS_CHARS,
+    Program,
+    ProgramError,
+    describe_error,
+    host_command,
+)
 from skysim.core.types import Floats
 from skysim.dynamics.controllers.interface import (
     CONTROLLERS,
@@ -58,7 +64,10 @@ class ExternalLaw:
         answer: Callable[[ControllerInput], Floats],
         program: Program | None = None,
     ) -> None:
-        self.reference, self.name, self.answer, self.program = reference, name, answer, program
+        self.reference = reference
+        self.name = name
+        self.answer = answer
+        self.program = program
         self.tick = 0
         self.commanded_nm = self.achieved_nm = np.zeros(3)
 
@@ -81,7 +90,11 @@ class ExternalLaw:
         try:
             self.commanded_nm = self.answer(inputs)
         except Exception as error:
-            reason = str(error) if isinstance(error, ProgramError | ValueError) else describe_error(error)
+            reason = (
+                str(error)
+                if isinstance(error, ProgramError | ValueError)
+                else describe_error(error)
+            )
             self.close()
             text = printable(reason)[:MAX_STATUS_CHARS]
             raise InputError(CONTROLLERS.key, f"{self.name}: {text}, at {t_s:g} s") from error
@@ -109,17 +122,23 @@ def external_law(
             law = build_law(source.factory, setup)
         except Exception as error:
             raise InputError(CONTROLLERS.key, f"{name}: {describe_error(error)}") from error
-        return ExternalLaw(reference, name, lambda inputs: check_torque(law(inputs), setup.authority_nm))
+        return ExternalLaw(
+            reference, name, lambda inputs: check_torque(law(inputs), setup.authority_nm)
+        )
     environment = None
     if name in source.programs:
         arguments = shlex.split(source.programs[name])
     else:
         arguments, environment = host_command("skysim.dynamics.controllers.host", name)
-    program = Program(CONTROLLERS.key, name, arguments, setup.as_tree(), config.time_limit_s, environment)
+    program = Program(
+        CONTROLLERS.key, name, arguments, setup.as_tree(), config.time_limit_s, environment
+    )
 
     def answer(inputs: ControllerInput) -> Floats:
         message = (json.dumps(inputs.as_tree()) + "\n").encode()
-        return torque_of_reply(program.exchange([message], config.time_limit_s), inputs.tick, setup.authority_nm)
+        return torque_of_reply(
+            program.exchange([message], config.time_limit_s), inputs.tick, setup.authority_nm
+        )
 
     return ExternalLaw(reference, name, answer, program)
 

@@ -10,7 +10,13 @@ from functools import partial
 from typing import IO, Any
 
 from skysim.core.plugins import Respond, describe_error, serve
-from skysim.dynamics.controllers.interface import CONTROLLERS, ControllerInput, ControllerSetup, build_law, check_torque
+from skysim.dynamics.controllers.interface import (
+    CONTROLLERS,
+    ControllerInput,
+    ControllerSetup,
+    build_law,
+    check_torque,
+)
 
 
 def create(name: str, tree: dict[str, Any]) -> Respond:

@@ -22,9 +22,13 @@ from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-CONTROLLERS = PluginKind("law", "skysim.controllers", "motion.control.law", (*BUILT_IN_LAWS, PRESCRIBED))
+CONTROLLERS = PluginKind(
+    "law", "skysim.controllers", "motion.control.law", (*BUILT_IN_LAWS, PRESCRIBED)
+)
 PROTOCOL = 1  # version, the first key of the set-up
-MAX_AUTHORITIES = 1000.0  # largest torque over the actuators' authority: larger ones are errors of unit or sign
+MAX_AUTHORITIES = (
+    1000.0  # largest torque over the actuators' authority: larger ones are errors of unit or sign
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +108,8 @@ class ControllerInput:
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
         """The inverse of `as_tree`."""
         values: dict[str, Any] = {
-            name: np.array(value) if isinstance(value, list) else value for name, value in tree.items()
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in tree.items()
         }
         return cls(**values)
 

@@ -47,20 +47,26 @@ class Simulation:
         history_s: float | None = None,
     ) -> None:
         check_tilt(vehicle, lab_from_body)
-        self.vehicle, self.model = vehicle, vehicle.model
+        self.vehicle = vehicle
+        self.model = vehicle.model
         self.step_s = float(self.model.opt.timestep)
         self.last_step = max(1, int(np.ceil(min(duration_s / self.step_s, MAX_STEPS) - 1e-6)))
-        self.history_steps = self.last_step if history_s is None else int(np.ceil(history_s / self.step_s))
+        self.history_steps = (
+            self.last_step if history_s is None else int(np.ceil(history_s / self.step_s))
+        )
         rows = min(self.last_step, 2 * self.history_steps) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
-        self.step = self.first_step = 0  # step number of the present, and of the first row of `states`
+        self.step = self.first_step = (
+            0  # step number of the present, and of the first row of `states`
+        )
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
         self.set_initial_state(lab_from_body, rate_body_rad_s)
 
     def set_initial_state(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
         """Set the initial state; speeds and gimbal angles are those of the scene."""
-        vehicle, data = self.vehicle, self.data
+        vehicle = self.vehicle
+        data = self.data
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
         data.qvel[:3] = rate_body_rad_s
         set_start(vehicle.config, self.model, data)
@@ -115,7 +121,8 @@ class Simulation:
         they are checked after every call.
         """
         self.discard_old(len(control))
-        row, end = self.row, self.row + len(control)
+        row = self.row
+        end = self.row + len(control)
         with mujoco_warnings():
             self.rollout.rollout(
                 [self.model],
@@ -142,9 +149,13 @@ class Simulation:
     def warning_names(self) -> str:
         """Names of MuJoCo's warnings."""
         warnings = [
-            warning for warning in mujoco.mjtWarning.__members__.values() if int(warning) < len(self.data.warning)
+            warning
+            for warning in mujoco.mjtWarning.__members__.values()
+            if int(warning) < len(self.data.warning)
         ]
-        return ", ".join(str(warning.name) for warning in warnings if self.data.warning[int(warning)].number)
+        return ", ".join(
+            str(warning.name) for warning in warnings if self.data.warning[int(warning)].number
+        )
 
     def times_s(self, begin: int, end: int) -> Floats:
         """Times of the steps from begin to before end."""
@@ -152,13 +163,16 @@ class Simulation:
 
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
         """Times (K,), lab_from_body (K, 4) as wxyz and rates (K, 3) from a step on."""
-        states, nq = self.states[begin - self.first_step : self.row + 1], self.model.nq
+        states = self.states[begin - self.first_step : self.row + 1]
+        nq = self.model.nq
         return self.times_s(begin, self.step + 1), states[:, 1:5], states[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:
         """The motion from a step on, as a Trajectory."""
         t_s, lab_from_body_wxyz, rate = self.knots(begin)
-        return Trajectory(t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy())
+        return Trajectory(
+            t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy()
+        )
 
 
 class PrescribedMotion(Simulation):
@@ -176,7 +190,9 @@ class PrescribedMotion(Simulation):
     ) -> None:
         self.state_at = state_at
         wxyz, rate = state_at(0.0)
-        super().__init__(vehicle, Rotation.from_quat(wxyz, scalar_first=True), rate, duration_s, history_s)
+        super().__init__(
+            vehicle, Rotation.from_quat(wxyz, scalar_first=True), rate, duration_s, history_s
+        )
 
     def advance(self, control: Floats) -> None:
         """Advance one step for each row of control (K, nu), whose values have no effect."""
@@ -204,7 +220,9 @@ def simulate(
     rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo warned.
     """
     simulation = Simulation(vehicle, lab_from_body_start, rate_body_rad_s, duration_s)
-    steps = max(1, round(control_period_s / simulation.step_s)) if controller else simulation.steps_left
+    steps = (
+        max(1, round(control_period_s / simulation.step_s)) if controller else simulation.steps_left
+    )
     limit = vehicle.config.torque_limit_nm
     while simulation.steps_left:
         control = np.zeros((min(steps, simulation.steps_left), vehicle.model.nu))
@@ -226,5 +244,7 @@ def check_tilt(vehicle: VehicleModel, lab_from_body: Rotation) -> None:
     tilt = float(tilt_deg(lab_from_body))
     if vehicle.config.mount == "air_bearing" and tilt > vehicle.config.tilt_stop_deg:
         raise InputError(
-            "motion.start", f"tilt of {tilt:.1f} deg", f"up to vehicle.tilt_stop_deg {vehicle.config.tilt_stop_deg:g}"
+            "motion.start",
+            f"tilt of {tilt:.1f} deg",
+            f"up to vehicle.tilt_stop_deg {vehicle.config.tilt_stop_deg:g}",
         )

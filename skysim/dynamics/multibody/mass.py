@@ -43,10 +43,13 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
     bus = model.body("bus").id
     counted = model.body_rootid == bus
     counted[bus] &= not without_bus
-    mass, center = model.body_mass[counted], data.xipos[counted]
+    mass = model.body_mass[counted]
+    center = data.xipos[counted]
     axes = data.ximat[counted].reshape(-1, 3, 3)
     inertia = np.einsum("nij,nj,nkj->ik", axes, model.body_inertia[counted], axes)
-    inertia += sum((parallel_axis(m, p) for m, p in zip(mass, center, strict=True)), np.zeros((3, 3)))
+    inertia += sum(
+        (parallel_axis(m, p) for m, p in zip(mass, center, strict=True)), np.zeros((3, 3))
+    )
     return MassProperties(float(mass.sum()), mass @ center / max(mass.sum(), 1e-300), inertia)
 
 
@@ -63,9 +66,12 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     The inertia is that about the bearing's center, with principal axes along the body's. No part is moved: only the
     bus's inertial changes (in place of a lab's balance masses), and the camera keeps its position.
     """
-    total, carried = tree_mass(model), tree_mass(model, without_bus=True)
+    total = tree_mass(model)
+    carried = tree_mass(model, without_bus=True)
     center = np.array(vehicle.center_of_mass_m)
-    inertia = total.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
+    inertia = (
+        total.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
+    )
     declared = MassProperties(vehicle.mass_kg or total.mass_kg, center, inertia)
     mass = declared.mass_kg - carried.mass_kg
     if mass <= 0:
@@ -78,9 +84,14 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
     own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
     subject = ("vehicle.inertia", f"less what the bus carries ({path}), its")
-    if vehicle.camera_m is not None and is_lever_too_long(own_inertia, model, np.array(vehicle.camera_m)):
+    if vehicle.camera_m is not None and is_lever_too_long(
+        own_inertia, model, np.array(vehicle.camera_m)
+    ):
         distance_m = np.linalg.norm(vehicle.camera_m)
-        subject = ("vehicle.camera", f"with the camera {distance_m:.3g} m from the bearing, the bus's ({path})")
+        subject = (
+            "vehicle.camera",
+            f"with the camera {distance_m:.3g} m from the bearing, the bus's ({path})",
+        )
     set_inertial(bus, mass, center_bus, own_inertia, subject)
     return declared
 
@@ -91,7 +102,9 @@ def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
     if carrier == model.body("bus").id:
         return False
     without_lever = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
-    return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(np.linalg.eigvalsh(without_lever))
+    return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(
+        np.linalg.eigvalsh(without_lever)
+    )
 
 
 def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
@@ -105,13 +118,18 @@ def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: P
     if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
         return
     for joint in wheel_joints:
-        rotor, own = joint.parent, model.body(joint.parent.name)
-        axle = model.joint(joint.name).axis  # in the rotor's axes, whatever frame the file gave it in
+        rotor = joint.parent
+        own = model.body(joint.parent.name)
+        axle = model.joint(
+            joint.name
+        ).axis  # in the rotor's axes, whatever frame the file gave it in
         across = np.cross(axle, np.eye(3)[np.argmin(np.abs(axle))])
         across /= np.linalg.norm(across)
         product = np.outer(axle, np.cross(axle, across))
         axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
-        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (product + product.T)
+        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (
+            product + product.T
+        )
         center_m = own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across
         subject = ("vehicle.wheels.dynamic_imbalance", f"with it {joint.name}'s ({path})")
         set_inertial(rotor, own.mass[0], center_m, inertia, subject)
@@ -122,7 +140,9 @@ def is_possible(moments: NDArray[Any]) -> bool:
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 
 
-def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: tuple[str, str]) -> None:
+def set_inertial(
+    body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: tuple[str, str]
+) -> None:
     """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia.
 
     subject : the key at fault, and whose moments they are
@@ -137,7 +157,9 @@ def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Flo
         )
     body.explicitinertial = True
     # MuJoCo silently takes a NaN ipos as the body's pos: always set it.
-    body.mass, body.ipos, body.inertia = mass_kg, center_m, moments
+    body.mass = mass_kg
+    body.ipos = center_m
+    body.inertia = moments
     body.iquat = Rotation.from_matrix(axes * np.linalg.det(axes)).as_quat(scalar_first=True)
     # An orientation or full inertia that the file gives in another form would override these.
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -198,12 +220,16 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     mujoco.mj_forward(model, data)
     ids = [model.joint(name).id for name in names]
     bodies = model.jnt_bodyid[ids]
-    axes, centers_m = data.xaxis[ids].T.copy(), data.subtree_com[bodies].T.copy()
+    axes = data.xaxis[ids].T.copy()
+    centers_m = data.subtree_com[bodies].T.copy()
     position_m = held_position_m(vehicle.trim, names) if vehicle.trim else np.zeros(0)
     for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:
-            raise InputError(path, f"joint {joint.name} must be on a body directly in body bus, not in another body")
+            raise InputError(
+                path,
+                f"joint {joint.name} must be on a body directly in body bus, not in another body",
+            )
         body.pos = body.pos + at_m * axis  # the bus's axes are the lab's in the model
         spec.delete(joint)
     return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)

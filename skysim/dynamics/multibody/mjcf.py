@@ -16,13 +16,16 @@ from skysim.core.paths import SCENES
 from skysim.dynamics.multibody.mjcf_sandbox import check_confined
 
 TRIAL = Path(__file__).parent / "mjcf_trial.py"
-TRIAL_CPU_S, TRIAL_BYTES = 3, 1 << 30
+TRIAL_CPU_S = 3
+TRIAL_BYTES = 1 << 30
 
 
 def load(path: Path) -> Any:
     """The MJCF file as an MjSpec."""
     if not path.is_file():
-        raise InputError(path, "no such file; vehicle.model is a path relative to the scene or to scenes/")
+        raise InputError(
+            path, "no such file; vehicle.model is a path relative to the scene or to scenes/"
+        )
     check_confined(path)
     if fault := trial_fault(path, path.stat().st_mtime_ns):
         raise InputError(path, f"not a MuJoCo model that skysim reads: {fault}")

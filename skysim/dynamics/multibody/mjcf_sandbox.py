@@ -52,14 +52,22 @@ class References:
         """Add the names in an XML file."""
         # Normalized, since a file that includes itself through `..` would otherwise give new folders without end.
         # The other two cover how the system resolves `..` after a link.
-        self.bases |= {os.path.normpath(path.parent), str(path.parent.resolve()), str(path.resolve().parent)}
+        self.bases |= {
+            os.path.normpath(path.parent),
+            str(path.parent.resolve()),
+            str(path.resolve().parent),
+        }
         for element in xml_root(path).iter():
             tag = element.tag.lower()
             for key, value in element.attrib.items():
                 if key.lower() in FOLDER_ATTRIBUTES | FILE_ATTRIBUTES:
                     target = self.files if key.lower() in FILE_ATTRIBUTES else self.folders
                     target.add(
-                        FileReference(value, f"{path}: {element.tag} {key}={excerpt(repr(value))}", tag in XML_ELEMENTS)
+                        FileReference(
+                            value,
+                            f"{path}: {element.tag} {key}={excerpt(repr(value))}",
+                            tag in XML_ELEMENTS,
+                        )
                     )
 
     def candidates(self) -> Iterator[tuple[FileReference, Path]]:
@@ -68,14 +76,21 @@ class References:
         """
         subfolders = {"", *(reference.value for reference in self.folders)}
         if len(self.bases) * len(subfolders) * len(self.files) > MAX_CANDIDATES:
-            raise InputError(self.folder, "the model names too many files", f"{MAX_CANDIDATES} candidate paths")
+            raise InputError(
+                self.folder, "the model names too many files", f"{MAX_CANDIDATES} candidate paths"
+            )
         for base in self.bases:
             for reference in self.folders:
-                yield from ((reference, candidate) for candidate in path_variants(base, reference.value))
+                yield from (
+                    (reference, candidate) for candidate in path_variants(base, reference.value)
+                )
             for reference in self.files:
                 for name in {reference.value, os.path.basename(reference.value)}:  # strippath
                     for folder in subfolders:
-                        yield from ((reference, candidate) for candidate in path_variants(base, folder, name))
+                        yield from (
+                            (reference, candidate)
+                            for candidate in path_variants(base, folder, name)
+                        )
 
 
 def path_variants(*parts: str) -> tuple[Path, Path]:
@@ -86,8 +101,10 @@ def path_variants(*parts: str) -> tuple[Path, Path]:
 
 def check_confined(path: Path) -> None:
     """Raise InputError (one line) for a model that names files outside of its folder."""
-    references, checked = References(path.resolve().parent, set()), set[tuple[FileReference, Path]]()
-    pending, visited = [path], {file_identity(path)}
+    references = References(path.resolve().parent, set())
+    checked = set[tuple[FileReference, Path]]()
+    pending = [path]
+    visited = {file_identity(path)}
     while pending:
         for file in pending:
             references.add(file)
@@ -144,7 +161,9 @@ def xml_root(path: Path) -> ElementTree.Element:
         for key, value in element.attrib.items():
             if not all(map(is_moderate, value.split())):
                 raise InputError(
-                    path, f"{element.tag} {key}={excerpt(repr(value))}", f"finite numbers up to {MAX_NUMBER:g}"
+                    path,
+                    f"{element.tag} {key}={excerpt(repr(value))}",
+                    f"finite numbers up to {MAX_NUMBER:g}",
                 )
     return root
 

@@ -13,7 +13,11 @@ from typing import Any
 import mujoco
 
 ERRORS = (ValueError, mujoco.FatalError)
-MAX_ELEMENTS = {"nbody": 2000, "ngeom": 2000, "nv": 1000}  # occlusion takes the square of the geoms, inertia of nv
+MAX_ELEMENTS = {
+    "nbody": 2000,
+    "ngeom": 2000,
+    "nv": 1000,
+}  # occlusion takes the square of the geoms, inertia of nv
 
 
 def run_trial(path: str) -> None:

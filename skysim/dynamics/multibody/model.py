@@ -54,7 +54,8 @@ CAM_FROM_MJCAM = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 # The tilt stop's two ends, above the bearing in the lab and on the vehicle. Unequal, so that the distance between
 # them never vanishes and its derivative is not zero at any tilt except 0.
-STOP_LAB_M, STOP_BODY_M = 1.0, 0.5
+STOP_LAB_M = 1.0
+STOP_BODY_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,9 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     """
     if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(
-            "vehicle.center_of_mass", "a free vehicle rotates about it, so it must be the body's origin", "0"
+            "vehicle.center_of_mass",
+            "a free vehicle rotates about it, so it must be the body's origin",
+            "0",
         )
     spec = load(path)
     spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
@@ -136,7 +139,9 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
-        raise InputError(path, f"a name is reserved for skysim's bearing: {one_line(error)}") from error
+        raise InputError(
+            path, f"a name is reserved for skysim's bearing: {one_line(error)}"
+        ) from error
     balanced = compile_spec(spec, path)
     # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     check_compiled(balanced, mass, path)
@@ -155,15 +160,20 @@ def put_at_origin(spec: Any, path: Path) -> Any:
         raise InputError(path, f"no {', no '.join(missing)}; a vehicle needs {REQUIRED}")
     bus = spec.body("bus")
     if bus.parent.name != "world" or bus.frame is not None:
-        raise InputError(path, "body bus must be a direct child of worldbody, not of another body or frame")
+        raise InputError(
+            path, "body bus must be a direct child of worldbody, not of another body or frame"
+        )
     for joint in list(bus.joints):
         if joint.name.startswith(tuple(prefix for kind in KINDS for prefix in kind.joints)):
             raise InputError(path, f"joint {joint.name} must be on a child body of bus")
         spec.delete(joint)
     for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
         spec.delete(key)
-    bus.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # an euler or axisangle would win over the quat
-    bus.pos, bus.quat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    bus.alt.type = (
+        mujoco.mjtOrientation.mjORIENTATION_QUAT
+    )  # an euler or axisangle would win over the quat
+    bus.pos = [0.0, 0.0, 0.0]
+    bus.quat = [1.0, 0.0, 0.0, 0.0]
     return bus
 
 
@@ -191,7 +201,8 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     T = -(viscous + quadratic |rate|) rate about each axis, T = -stiffness times the rotation vector of
     lab_from_body.
     """
-    drag, cable = vehicle.drag, vehicle.disturbances.cable
+    drag = vehicle.drag
+    cable = vehicle.disturbances.cable
     bus.add_joint(
         type=mujoco.mjtJoint.mjJNT_BALL,
         name="bearing",
@@ -205,7 +216,9 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.
     spec.option.tolerance = 1e-16
     # Few constraints on one tree: no contacts, no search for islands; PGS is the fastest solver here.
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    spec.option.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    )
     spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.compiler.fusestatic = True  # one rigid body instead of ten: 14 us a step instead of 20
@@ -241,7 +254,11 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     bus = model.body("bus").id
     mass = tree_mass(model)
     for prefix in (prefix for kind in KINDS for prefix in kind.sites):
-        bodies = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(prefix)]
+        bodies = [
+            model.site(k).bodyid[0]
+            for k in range(model.nsite)
+            if model.site(k).name.startswith(prefix)
+        ]
         if any(model.body_rootid[body] != bus for body in bodies):
             raise InputError(path, f"sites {prefix}* must be on body bus or its children")
     if (model.body_rootid[model.jnt_bodyid] != bus).any():
@@ -251,7 +268,8 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     matches = (
         abs(mass.mass_kg - declared.mass_kg) < 1e-9 * declared.mass_kg
         and np.abs(mass.center_m - declared.center_m).max() < 1e-9
-        and np.abs(mass.inertia_kg_m2 - declared.inertia_kg_m2).max() < 1e-7 * declared.inertia_kg_m2.max()
+        and np.abs(mass.inertia_kg_m2 - declared.inertia_kg_m2).max()
+        < 1e-7 * declared.inertia_kg_m2.max()
     )
     if not matches:
         raise InputError(

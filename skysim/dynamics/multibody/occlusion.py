@@ -24,7 +24,9 @@ from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
 
-OPAQUE, TRANSPARENT = 0, 5  # groups of geoms: those that block light, and the camera's own housing
+# groups of geoms: those that block light, and the camera's own housing
+OPAQUE = 0
+TRANSPARENT = 5
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only
 
 
@@ -67,14 +69,18 @@ def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstac
     return Obstacles(model, data, camera_body_m)
 
 
-def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) -> NDArray[np.bool_]:
+def camera_housing(
+    model: Any, data: Any, camera_body_m: Floats, is_main: bool
+) -> NDArray[np.bool_]:
     """(ngeom,) which geoms belong to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
     is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id) & is_main
     six_directions = np.vstack([np.eye(3), -np.eye(3)])
     for geom in np.flatnonzero(~is_housing):
         model.geom_group[:], model.geom_group[geom] = TRANSPARENT, OPAQUE
-        is_housing[geom] = np.isfinite(free_distance_m(model, data, camera_body_m, six_directions)).all()
+        is_housing[geom] = np.isfinite(
+            free_distance_m(model, data, camera_body_m, six_directions)
+        ).all()
     return np.asarray(is_housing)
 
 
@@ -94,7 +100,8 @@ def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> ND
 @jit
 def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
     """(N, 3) unit vectors from the pupil to sources, and (N,) where these rays end: in m, infinity for stars."""
-    rays, end_m = np.empty((len(place), 3)), np.empty(len(place))
+    rays = np.empty((len(place), 3))
+    end_m = np.empty(len(place))
     for n in range(len(place)):
         square = 0.0
         for i in range(3):
@@ -110,10 +117,22 @@ def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
 def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
     """(N,) distance from a point of the lab along unit vectors (N, 3) to the next geom that blocks; inf if none."""
     count = len(rays)
-    geom, distance_m = np.empty(count, np.int32), np.empty(count)
+    geom = np.empty(count, np.int32)
+    distance_m = np.empty(count)
     if count:
         directions = np.ascontiguousarray(rays).ravel()
         mujoco.mj_multiRay(
-            model, data, from_m, directions, GROUPS, True, -1, geom, distance_m, None, count, mujoco.mjMAXVAL
+            model,
+            data,
+            from_m,
+            directions,
+            GROUPS,
+            True,
+            -1,
+            geom,
+            distance_m,
+            None,
+            count,
+            mujoco.mjMAXVAL,
         )
     return np.where(distance_m >= 0, distance_m, np.inf)

@@ -25,7 +25,9 @@ def steady(rate_rad_s: float, t_s: float) -> Derivatives:
 
 
 @jit
-def rest_to_rest(angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float) -> Derivatives:
+def rest_to_rest(
+    angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float
+) -> Derivatives:
     """The rate rises along the smoothstep 3x^2 - 2x^3 (x = t / ramp), cruises at rate_rad_s and falls likewise.
 
     The acceleration is continuous: zero at both ends of a ramp and 1.5 rate / ramp at its middle.
@@ -35,7 +37,8 @@ def rest_to_rest(angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s:
     ramp_time_s = duration_s - t_s if braking else t_s
     x = min(ramp_time_s / ramp_s, 1.0)
     angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(ramp_time_s - ramp_s, 0.0))
-    rate, acceleration = rate_rad_s * x**2 * (3 - 2 * x), rate_rad_s / ramp_s * 6 * x * (1 - x)
+    rate = rate_rad_s * x**2 * (3 - 2 * x)
+    acceleration = rate_rad_s / ramp_s * 6 * x * (1 - x)
     return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
 
 
@@ -59,7 +62,8 @@ def modulated_sine(amplitude_rad: float, gain: Derivatives, phase: Derivatives) 
     """amplitude gain(t) sin(phase(t)), and its two derivatives by the product rule."""
     e, slope, curvature = gain
     phi, omega, chirp = phase
-    s, c = math.sin(phi), math.cos(phi)
+    s = math.sin(phi)
+    c = math.cos(phi)
     rate = slope * s + e * omega * c
     acceleration = (curvature - e * omega**2) * s + (2 * slope * omega + e * chirp) * c
     return amplitude_rad * e * s, amplitude_rad * rate, amplitude_rad * acceleration

@@ -17,7 +17,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where
-from skysim.core.io.text import Line, Segment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers
+from skysim.core.io.text import (
+    Line,
+    Segment,
+    check_version,
+    excerpt,
+    keyword_value,
+    one_of,
+    seconds_since,
+    to_numbers,
+)
 from skysim.core.time import SCALES
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import REFERENCES, frame_of, icrs_from
@@ -27,7 +36,8 @@ VERSION = "CCSDS_AEM_VERS"
 VERSIONS = ("1.0", "2.0")
 # Numbers after the epoch; the first four are the quaternion.
 TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
-DIRECTIONS, ORDERS = ("A2B", "B2A"), ("FIRST", "LAST")
+DIRECTIONS = ("A2B", "B2A")
+ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
 SAME_ATTITUDE_RAD = 1e-6  # of a sample that both of two adjoining segments have
 
@@ -46,7 +56,9 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
 
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
     """The version, and the segments of the message. Raises InputError for a line out of place."""
-    version, segments, section = "", list[Segment](), ""
+    version = ""
+    segments = list[Segment]()
+    section = ""
     for n, line in lines:
         if line.split(maxsplit=1)[0] == "COMMENT":
             continue
@@ -63,7 +75,12 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
             elif key == VERSION:
                 version = value
         else:
-            raise InputError(path, f"{excerpt(line)} after {section}", "DATA_START or META_START", where=Where(path, n))
+            raise InputError(
+                path,
+                f"{excerpt(line)} after {section}",
+                "DATA_START or META_START",
+                where=Where(path, n),
+            )
     check_version(path, VERSION, version, VERSIONS)
     if section not in ("", "DATA_STOP"):
         raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
@@ -79,10 +96,15 @@ def next_section(where: Where, section: str, keyword: str) -> str:
     return keyword
 
 
-def segment_samples(path: Path, version: str, segment: Segment, start: datetime.datetime) -> Samples:
+def segment_samples(
+    path: Path, version: str, segment: Segment, start: datetime.datetime
+) -> Samples:
     """The samples of one segment within its useable span. Raises InputError."""
-    metadata, source = segment.metadata, str(path)
-    segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ())))
+    metadata = segment.metadata
+    source = str(path)
+    segment.require(
+        path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ()))
+    )
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
     frames = [frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]]
@@ -96,12 +118,22 @@ def segment_samples(path: Path, version: str, segment: Segment, start: datetime.
         )
     for n, words in segment.data:
         if len(words) != width + 1:
-            raise InputError(path, f"{len(words)} values", f"an epoch and {width} numbers", where=Where(path, n))
+            raise InputError(
+                path, f"{len(words)} values", f"an epoch and {width} numbers", where=Where(path, n)
+            )
     lines = [n for n, _ in segment.data]
     numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
     t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
-    last = one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "LAST" if "QUATERNION_TYPE" in metadata else True
-    reverse = one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A" if "ATTITUDE_DIR" in metadata else False
+    last = (
+        one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "LAST"
+        if "QUATERNION_TYPE" in metadata
+        else True
+    )
+    reverse = (
+        one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
+        if "ATTITUDE_DIR" in metadata
+        else False
+    )
     xyzw: Floats = numbers[:, [0, 1, 2, 3] if last else [1, 2, 3, 0]]
     a, b = frames[::-1] if reverse else frames
     samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
@@ -109,7 +141,9 @@ def segment_samples(path: Path, version: str, segment: Segment, start: datetime.
     return take(to_icrs(samples, names), useable)
 
 
-def within_span(path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str) -> slice:
+def within_span(
+    path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str
+) -> slice:
     """The samples from USEABLE_START_TIME to USEABLE_STOP_TIME; all where a keyword is missing."""
     ends_s = [-np.inf, np.inf]
     for side, key in enumerate(("USEABLE_START_TIME", "USEABLE_STOP_TIME")):
@@ -122,7 +156,12 @@ def within_span(path: Path, metadata: dict[str, Line], t_s: Floats, start: datet
 
 def take(samples: Samples, which: slice) -> Samples:
     """A range of the samples."""
-    return replace(samples, places=samples.places[which], t_s=samples.t_s[which], a_from_b=samples.a_from_b[which])
+    return replace(
+        samples,
+        places=samples.places[which],
+        t_s=samples.t_s[which],
+        a_from_b=samples.a_from_b[which],
+    )
 
 
 def to_icrs(samples: Samples, names: list[str]) -> Samples:
@@ -145,15 +184,26 @@ def join(first: Samples, second: Samples) -> Samples:
     if direction != first.direction:
         second = second.inverted()
     if second.direction != first.direction:
-        raise second.error(0, f"a segment of {direction} after one of {first.direction}", "the same frames")
+        raise second.error(
+            0, f"a segment of {direction} after one of {first.direction}", "the same frames"
+        )
     gap_s = second.t_s[0] - first.t_s[-1]
-    if gap_s == 0 and (first.a_from_b[-1].inv() * second.a_from_b[0]).magnitude() < SAME_ATTITUDE_RAD:
+    if (
+        gap_s == 0
+        and (first.a_from_b[-1].inv() * second.a_from_b[0]).magnitude() < SAME_ATTITUDE_RAD
+    ):
         second = take(second, slice(1, None))
     elif gap_s <= 0:
-        raise second.error(0, f"a segment that begins {-gap_s:.6g} s before the end of the one before it")
+        raise second.error(
+            0, f"a segment that begins {-gap_s:.6g} s before the end of the one before it"
+        )
     longest_s = max(float(np.diff(part.t_s).max(initial=0.0)) for part in (first, second))
     if gap_s > 1.5 * longest_s:
-        raise second.error(0, f"a gap of {gap_s:.6g} s between two segments", f"up to 1.5 steps, {1.5 * longest_s:.6g}")
+        raise second.error(
+            0,
+            f"a gap of {gap_s:.6g} s between two segments",
+            f"up to 1.5 steps, {1.5 * longest_s:.6g}",
+        )
     return replace(
         first,
         places=np.concatenate([first.places, second.places]),

@@ -8,9 +8,18 @@ from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt
 from skysim.core.time import J2000_JD
 
-ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"  # as skysim writes them
+# as skysim writes them
+ICRF = "ICRF"
+LAB = "LAB"
+CAMERA = "STARTRACKER_1"
+BODY = "SC_BODY_1"
 EME2000 = ("EME2000", "J2000")
-REFERENCES = {ICRF: "icrs", "GCRF": "icrs", LAB: "lab", **dict.fromkeys(EME2000, "icrs")}  # frame of Samples, by name
+REFERENCES = {
+    ICRF: "icrs",
+    "GCRF": "icrs",
+    LAB: "lab",
+    **dict.fromkeys(EME2000, "icrs"),
+}  # frame of Samples, by name
 VEHICLES = {BODY: "body", "SC_BODY": "body", CAMERA: "cam", "STARTRACKER": "cam"}
 
 

@@ -57,7 +57,9 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
     if first.startswith("# %ECSV"):
         return table.read_ecsv(source, start, rotation)
     if first.startswith("<"):
-        raise InputError(source, "XML", "CSV, ECSV, CCSDS AEM in keyword = value notation, or STK (.a)")
+        raise InputError(
+            source, "XML", "CSV, ECSV, CCSDS AEM in keyword = value notation, or STK (.a)"
+        )
     return table.read_csv(source, lines, start, rotation)
 
 
@@ -73,7 +75,16 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
             f"attitudes {samples.direction} with light of kind {scene.light.kind}",
             f"{', '.join(allowed)}, or the inverse",
         )
-    lab_from_body = samples.a_from_b * mount.cam_from_body if samples.b == "cam" else samples.a_from_b
+    lab_from_body = (
+        samples.a_from_b * mount.cam_from_body if samples.b == "cam" else samples.a_from_b
+    )
     return Samples(
-        samples.source, samples.unit, samples.places, samples.t_s, "lab", "body", lab_from_body, samples.absolute
+        samples.source,
+        samples.unit,
+        samples.places,
+        samples.t_s,
+        "lab",
+        "body",
+        lab_from_body,
+        samples.absolute,
     )

@@ -12,9 +12,12 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where
 from skysim.core.types import Floats
 
-MIN_SAMPLES, MAX_SAMPLES = 4, 1_000_000  # a not-a-knot cubic takes four
+# a not-a-knot cubic takes four
+MIN_SAMPLES = 4
+MAX_SAMPLES = 1_000_000
 UNIT_TOLERANCE = 1e-3  # of a quaternion's norm
-MAX_TIME_S, MIN_STEP_S = 1e9, 1e-6
+MAX_TIME_S = 1e9
+MIN_STEP_S = 1e-6
 # Largest rotation between two samples. The interpolated attitude of a constant rate errs with the fifth power of it,
 # most in the first and the last step: by 0.04 arcsec at 10 deg, by 1.3 arcsec at 20 (measured).
 MAX_STEP_DEG = 10.0
@@ -43,7 +46,9 @@ class Samples:
 
     def error(self, n: int, problem: str, allowed: str = "") -> InputError:
         """The error of one sample."""
-        return InputError(self.source, problem, allowed, Where(self.source, int(self.places[n]), self.unit))
+        return InputError(
+            self.source, problem, allowed, Where(self.source, int(self.places[n]), self.unit)
+        )
 
     @property
     def direction(self) -> str:
@@ -85,11 +90,18 @@ def check_samples(samples: Samples) -> Samples:
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
         raise InputError(samples.source, f"{count} attitudes", f"{MIN_SAMPLES} to {MAX_SAMPLES}")
     if len(bad := np.flatnonzero(~(np.abs(samples.t_s) <= MAX_TIME_S))):
-        raise samples.error(int(bad[0]), f"time {samples.t_s[bad[0]]:.9g} s", f"within {MAX_TIME_S:g} s of the start")
+        raise samples.error(
+            int(bad[0]),
+            f"time {samples.t_s[bad[0]]:.9g} s",
+            f"within {MAX_TIME_S:g} s of the start",
+        )
     if len(bad := np.flatnonzero(np.diff(samples.t_s) < MIN_STEP_S)):
         n = int(bad[0]) + 1
-        after, before = samples.t_s[n], samples.t_s[n - 1]
-        raise samples.error(n, f"time {after:.9g} s is not after {before:.9g} s, by a microsecond at least")
+        after = samples.t_s[n]
+        before = samples.t_s[n - 1]
+        raise samples.error(
+            n, f"time {after:.9g} s is not after {before:.9g} s, by a microsecond at least"
+        )
     angle_deg = np.degrees((samples.a_from_b[:-1].inv() * samples.a_from_b[1:]).magnitude())
     if len(bad := np.flatnonzero(angle_deg > MAX_STEP_DEG)):
         n = int(bad[0]) + 1

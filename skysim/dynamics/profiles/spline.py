@@ -52,10 +52,15 @@ def fit_spline(samples: Samples) -> AttitudeSpline:
 
     wxyz = samples.a_from_b.as_quat(scalar_first=True)
     dot = np.sum(wxyz[1:] * wxyz[:-1], axis=1)
-    sign = np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])  # q and -q are the same attitude
+    sign = np.concatenate(
+        [[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))]
+    )  # q and -q are the same attitude
     cubic = CubicSpline(samples.t_s, wxyz * sign[:, None])
     return AttitudeSpline(
-        samples.source, samples.t_s, np.ascontiguousarray(cubic.c.transpose(1, 0, 2)), samples.absolute
+        samples.source,
+        samples.t_s,
+        np.ascontiguousarray(cubic.c.transpose(1, 0, 2)),
+        samples.absolute,
     )
 
 
@@ -68,10 +73,12 @@ def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats
     The rate follows from q' = q (0, rate) / 2; the derivative of |p| drops out, being along q.
     """
     k = min(max(int(np.searchsorted(t_s, at_s, side="right")) - 1, 0), len(t_s) - 2)
-    s, (c3, c2, c1, c0) = at_s - t_s[k], coefficients[k]
+    s = at_s - t_s[k]
+    (c3, c2, c1, c0) = coefficients[k]
     p = ((c3 * s + c2) * s + c1) * s + c0
     p_rate = (3 * c3 * s + 2 * c2) * s + c1
-    norm2, conjugate = (p**2).sum(), quaternion.inverse(p)
+    norm2 = (p**2).sum()
+    conjugate = quaternion.inverse(p)
     rate = 2 / norm2 * quaternion.multiply(conjugate, p_rate)[1:]
     turning = quaternion.multiply(conjugate, 6 * c3 * s + 2 * c2)[1:]
     return p / np.sqrt(norm2), rate, 2 / norm2 * (turning - (p * p_rate).sum() * rate)
@@ -80,7 +87,9 @@ def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats
 @jit
 def spline_states(t_s: Floats, coefficients: Floats, at_s: Floats) -> tuple[Floats, Floats, Floats]:
     """`spline_state` at (K,) times."""
-    attitude, rate, acceleration = np.empty((len(at_s), 4)), np.empty((len(at_s), 3)), np.empty((len(at_s), 3))
+    attitude = np.empty((len(at_s), 4))
+    rate = np.empty((len(at_s), 3))
+    acceleration = np.empty((len(at_s), 3))
     for n in range(len(at_s)):
         attitude[n], rate[n], acceleration[n] = spline_state(t_s, coefficients, at_s[n])
     return attitude, rate, acceleration

@@ -22,16 +22,35 @@ SECTIONS = {
     "attitudetimequatscalarfirst": (5, [2, 3, 4, 1]),
     "attitudetimequatangvels": (8, [1, 2, 3, 4]),
 }
-SECTION_NAMES = ("AttitudeTimeQuaternions", "AttitudeTimeQuatScalarFirst", "AttitudeTimeQuatAngVels")
-UNUSED = ("MessageLevel", "InterpolationMethod", "InterpolationOrder", "BlockingFactor", "AttitudeDeviations")
-KEYWORDS = ("NumberOfAttitudePoints", "ScenarioEpoch", "CentralBody", "CoordinateAxes", "TimeFormat", *UNUSED)
+SECTION_NAMES = (
+    "AttitudeTimeQuaternions",
+    "AttitudeTimeQuatScalarFirst",
+    "AttitudeTimeQuatAngVels",
+)
+UNUSED = (
+    "MessageLevel",
+    "InterpolationMethod",
+    "InterpolationOrder",
+    "BlockingFactor",
+    "AttitudeDeviations",
+)
+KEYWORDS = (
+    "NumberOfAttitudePoints",
+    "ScenarioEpoch",
+    "CentralBody",
+    "CoordinateAxes",
+    "TimeFormat",
+    *UNUSED,
+)
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
 def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
     """The samples of an attitude file. Raises InputError for other data than quaternions in ICRF, J2000 or LAB."""
     keywords: dict[str, Line] = {}
-    section, rows, inside = "", list[tuple[int, list[str]]](), False
+    section = ""
+    rows = list[tuple[int, list[str]]]()
+    inside = False
     for n, line in lines[1:]:  # the first has the version
         words = line.split()
         lower = line.lower()
@@ -47,7 +66,9 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
             rows.append((n, words))
         elif lower.startswith("attitudetime"):
             if lower not in SECTIONS:
-                raise InputError(path, *unknown_name("data", words[0], SECTION_NAMES), Where(path, n))
+                raise InputError(
+                    path, *unknown_name("data", words[0], SECTION_NAMES), Where(path, n)
+                )
             section = lower
         else:
             name = next((known for known in KEYWORDS if known.lower() == words[0].lower()), None)
@@ -84,7 +105,13 @@ def to_samples(
         t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()
     frames = (REFERENCES[axes.upper()], "body")
     samples = from_quaternions(
-        str(path), "line", places, t_s, frames, values[:, columns], absolute="ScenarioEpoch" in keywords
+        str(path),
+        "line",
+        places,
+        t_s,
+        frames,
+        values[:, columns],
+        absolute="ScenarioEpoch" in keywords,
     )
     return replace(samples, a_from_b=icrs_from(axes) * samples.a_from_b)
 
@@ -95,10 +122,17 @@ def point_count(path: Path, keywords: dict[str, Line], count: int) -> int:
         return count
     line, text = keywords["NumberOfAttitudePoints"]
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(path, f"NumberOfAttitudePoints {excerpt(text)}", "a whole number", where=Where(path, line))
+        raise InputError(
+            path,
+            f"NumberOfAttitudePoints {excerpt(text)}",
+            "a whole number",
+            where=Where(path, line),
+        )
     if int(text) > count:
         raise InputError(
-            path, f"NumberOfAttitudePoints {text}, but there are {count}: the file is cut off", where=Where(path, line)
+            path,
+            f"NumberOfAttitudePoints {text}, but there are {count}: the file is cut off",
+            where=Where(path, line),
         )
     return int(text)
 
@@ -111,8 +145,13 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
         date = datetime.datetime(int(year), MONTHS.index(month[:3].lower()) + 1, int(day))
         if not 0 <= float(seconds) < 60 or not 0 <= int(minutes) < 60 or not 0 <= int(hours) < 24:
             raise ValueError
-        return date + datetime.timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds))
+        return date + datetime.timedelta(
+            hours=int(hours), minutes=int(minutes), seconds=float(seconds)
+        )
     except (ValueError, OverflowError):
         raise InputError(
-            path, f"ScenarioEpoch {excerpt(text)}", "1 Jul 2005 12:00:00.00", where=Where(path, line)
+            path,
+            f"ScenarioEpoch {excerpt(text)}",
+            "1 Jul 2005 12:00:00.00",
+            where=Where(path, line),
         ) from None

@@ -26,28 +26,51 @@ from skysim.core.types import Floats
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
 from skysim.sources.stars import cam_from_icrs
 
-QUATERNIONS = ("lab_from_body", "body_from_lab", "icrs_from_body", "body_from_icrs", "icrs_from_cam", "cam_from_icrs")
+QUATERNIONS = (
+    "lab_from_body",
+    "body_from_lab",
+    "icrs_from_body",
+    "body_from_icrs",
+    "icrs_from_cam",
+    "cam_from_icrs",
+)
 BARE = ("q_x", "q_y", "q_z", "q_w")
-BODY_ANGLES, CAMERA_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg"), ("ra_deg", "dec_deg", "roll_deg")
+BODY_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+CAMERA_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 TIMES = ("t_s", "utc")
 UNITS = {"t_s": "s", **dict.fromkeys(BODY_ANGLES + CAMERA_ANGLES, "deg")}
 COLUMNS = (
-    "t_s or utc, with A_from_B_qx, _qy, _qz, _qw (A_from_B: " + ", ".join(QUATERNIONS) + "), or q_x, q_y, q_z, q_w and"
+    "t_s or utc, with A_from_B_qx, _qy, _qz, _qw (A_from_B: "
+    + ", ".join(QUATERNIONS)
+    + "), or q_x, q_y, q_z, q_w and"
     " the maneuver's key rotation, or roll_deg, pitch_deg, yaw_deg, or ra_deg, dec_deg, roll_deg"
 )
 
 
-def read_csv(path: Path, lines: list[Line], start: datetime.datetime, rotation: str | None) -> Samples:
+def read_csv(
+    path: Path, lines: list[Line], start: datetime.datetime, rotation: str | None
+) -> Samples:
     """Samples of a CSV file: a line of column names, then a line each; lines that begin with # are comments."""
-    rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if not line.startswith("#")]
+    rows = [
+        (n, [cell.strip() for cell in line.split(",")])
+        for n, line in lines
+        if not line.startswith("#")
+    ]
     if not rows:
         raise InputError(path, "empty", "a line of column names, then a line for each attitude")
-    (head, names), body = rows[0], rows[1:]
+    body = rows[1:]
+    (head, names) = rows[0]
     check_names(Where(path, head), names, rotation)
     for n, cells in body:
         if len(cells) != len(names):
-            raise InputError(path, f"{len(cells)} values", f"{len(names)}, one for each column", where=Where(path, n))
-    places, columns = [n for n, _ in body], dict[str, Any]()
+            raise InputError(
+                path,
+                f"{len(cells)} values",
+                f"{len(names)}, one for each column",
+                where=Where(path, n),
+            )
+    places = [n for n, _ in body]
+    columns = dict[str, Any]()
     if "utc" in names:
         date = names.index("utc")
         columns["utc"] = [cells.pop(date) for _, cells in body]
@@ -62,14 +85,20 @@ def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Sam
     return from_table(files.read_table(path), str(path), start, rotation)
 
 
-def from_table(table: Any, source: str, start: datetime.datetime, rotation: str | None = None) -> Samples:
+def from_table(
+    table: Any, source: str, start: datetime.datetime, rotation: str | None = None
+) -> Samples:
     """Samples of an astropy Table, a pandas DataFrame or a mapping of columns. Raises InputError."""
     try:
-        names = [str(name) for name in (table.colnames if hasattr(table, "colnames") else table.keys())]
+        names = [
+            str(name) for name in (table.colnames if hasattr(table, "colnames") else table.keys())
+        ]
         columns = {name: table[name] for name in names}
     except (AttributeError, TypeError, KeyError):
         raise InputError(
-            source, type(table).__name__, "an astropy Table, a pandas DataFrame or a mapping of columns"
+            source,
+            type(table).__name__,
+            "an astropy Table, a pandas DataFrame or a mapping of columns",
         ) from None
     check_names(Where(source), names, rotation)
     values: dict[str, Any] = {}
@@ -81,7 +110,9 @@ def from_table(table: Any, source: str, start: datetime.datetime, rotation: str 
     count = len(next(iter(values.values())))
     for name, column in values.items():
         if len(column) != count:
-            raise InputError(source, f"column {name} has {len(column)} values", f"{count}, as the first")
+            raise InputError(
+                source, f"column {name} has {len(column)} values", f"{count}, as the first"
+            )
     return to_samples(source, "row", range(1, count + 1), values, start, rotation)
 
 
@@ -92,9 +123,13 @@ def to_column(source: str, name: str, column: Any) -> Floats:
     except (TypeError, ValueError):
         raise InputError(source, f"column {name} has values that are no numbers") from None
     if numbers.ndim != 1:
-        raise InputError(source, f"column {name} has shape {numbers.shape}", "one number in each row")
+        raise InputError(
+            source, f"column {name} has shape {numbers.shape}", "one number in each row"
+        )
     if len(bad := np.flatnonzero(~np.isfinite(numbers))):
-        raise InputError(source, f"{name} is not a finite number", where=Where(source, int(bad[0]) + 1, "row"))
+        raise InputError(
+            source, f"{name} is not a finite number", where=Where(source, int(bad[0]) + 1, "row")
+        )
     return np.asarray(numbers, dtype=np.float64)
 
 
@@ -107,7 +142,10 @@ def to_epochs(column: Any) -> list[str]:
     values = np.asarray(column)
     if values.dtype.kind == "M":
         return [str(text) for text in np.datetime_as_string(values.astype("datetime64[ns]"))]
-    return [value.isoformat() if isinstance(value, datetime.datetime) else str(value) for value in values.tolist()]
+    return [
+        value.isoformat() if isinstance(value, datetime.datetime) else str(value)
+        for value in values.tolist()
+    ]
 
 
 def check_names(where: Where, names: Sequence[str], rotation: str | None) -> None:
@@ -124,7 +162,9 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
     found = {name for name in names if name not in TIMES}
     if len(found) + 1 != len(names) or not any(set(columns) == found for columns in attitudes):
         given = ", ".join(printable(name) for name in names)
-        raise InputError(where.file, f"columns {given} are not one time and one attitude", COLUMNS, where)
+        raise InputError(
+            where.file, f"columns {given} are not one time and one attitude", COLUMNS, where
+        )
     if found == set(BARE) and rotation is None:
         raise InputError(
             where.file,
@@ -133,7 +173,9 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
             where,
         )
     if found != set(BARE) and rotation is not None:
-        raise InputError(where.file, "the columns name the rotation", "no key rotation in the maneuver", where)
+        raise InputError(
+            where.file, "the columns name the rotation", "no key rotation in the maneuver", where
+        )
 
 
 def to_samples(
@@ -157,7 +199,12 @@ def to_samples(
         return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
     if "ra_deg" in columns:
         if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):
-            raise InputError(source, "dec_deg is beyond a pole", "-90 to 90", where=Where(source, places[bad[0]], unit))
+            raise InputError(
+                source,
+                "dec_deg is beyond a pole",
+                "-90 to 90",
+                where=Where(source, places[bad[0]], unit),
+            )
         camera = cam_from_icrs(*stack(columns, CAMERA_ANGLES).T)
         return Samples(source, unit, ends, t_s, "cam", "icrs", camera, absolute)
     first = next(name for name in columns if name.endswith(("_qw", "q_w")))

@@ -17,7 +17,9 @@ from skysim.dynamics.multibody import VehicleModel
 from skysim.scene.scene import Scene
 
 PARAMETERS = 17  # beside the wheels' relative errors
-LAB_TORQUE_SHARE = 0.05  # standard deviation of the constant lab torque, relative to the offset's torque
+LAB_TORQUE_SHARE = (
+    0.05  # standard deviation of the constant lab torque, relative to the offset's torque
+)
 DRAG_RATE_RAD_S = 0.1  # at which the drag's standard deviation is as large as that torque
 LEAST_TORQUE_NM = 1e-7  # rms of the random torque that is always assumed
 DEFAULT_CORRELATION_S = 2.0
@@ -51,13 +53,19 @@ class Uncertainty:
 
 
 def parse_uncertainty(
-    inertia_sigma: str, offset_sigma: str, wheel_sigma: str, mount_sigma: str, tacho_sigma_rpm: float
+    inertia_sigma: str,
+    offset_sigma: str,
+    wheel_sigma: str,
+    mount_sigma: str,
+    tacho_sigma_rpm: float,
 ) -> Uncertainty:
     """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = inertia_sigma, offset_sigma, wheel_sigma, mount_sigma
     inertia, offset_m, wheel, mount_rad = quantities_within("balance", RANGES, texts)
     if not 0 <= tacho_sigma_rpm <= MAX_TACHO_RPM:
-        raise InputError("balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm")
+        raise InputError(
+            "balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm"
+        )
     return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
 
 
@@ -80,7 +88,8 @@ def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertain
 
     The level of air currents is assumed as in the scene, or LEAST_TORQUE_NM.
     """
-    rng, count = random_stream(scene.seed, BALANCE, 0), len(at_zero.wheels)
+    rng = random_stream(scene.seed, BALANCE, 0)
+    count = len(at_zero.wheels)
     true_kg_m2 = at_zero.inertia_kg_m2
     inertia_sigma = uncertainty.inertia_sigma * np.trace(true_kg_m2) / 3 * np.repeat([1.0, 0.5], 3)
     moment_kg_m = at_zero.mass.mass_kg * uncertainty.offset_sigma_m
@@ -106,7 +115,8 @@ def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertain
 def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> Lab:
     """The lab as the estimator assumes it."""
     disturbances = scene.vehicle.disturbances
-    air, earth = disturbances.air_current, imu.earth_rate_lab_rad_s(scene.site)
+    air = disturbances.air_current
+    earth = imu.earth_rate_lab_rad_s(scene.site)
     return Lab(
         vehicle.gravity_m_s2,
         vehicle.wheels.axes,

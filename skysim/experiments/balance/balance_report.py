@@ -16,7 +16,18 @@ from skysim.experiments.balance.assumptions import Assumptions
 from skysim.experiments.balance.flight import BalanceFlight
 from skysim.experiments.balance.observability import largest_tilt_deg
 from skysim.experiments.balance.procedure import Iteration, Plan, filtered
-from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
+from skysim.results.report import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Report,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -39,7 +50,8 @@ def statistics(scene: str, plan: Plan, iterations: Sequence[Iteration]) -> dict[
 
 def flight_row(number: int, one: Iteration) -> dict[str, Any]:
     """Numbers of one flight; those that begin with true are of the simulated vehicle."""
-    trims, mass = one.flight.vehicle.trims, one.flight.vehicle.mass
+    trims = one.flight.vehicle.trims
+    mass = one.flight.vehicle.mass
     per_um = 1e6 / mass.mass_kg
     return {
         "flight": number,
@@ -62,7 +74,8 @@ def flight_row(number: int, one: Iteration) -> dict[str, Any]:
 
 def true_values(flight: BalanceFlight) -> Floats:
     """(9,) inertia and moment of the simulated vehicle with its trim masses at zero."""
-    vehicle, record = flight.vehicle, flight.record
+    vehicle = flight.vehicle
+    record = flight.record
     inertia = vehicle.inertia_kg_m2 - record.added_inertia_kg_m2
     moment = vehicle.mass.mass_kg * vehicle.mass.center_m - record.added_moment_kg_m
     return np.concatenate([inertia_six(inertia), moment])
@@ -75,7 +88,9 @@ def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[st
     columns = (scale * estimate.values[:9], scale * estimate.sigma[:9], scale * true_values(flight))
     return [
         {"what": name, "estimate": value, "sigma": sigma, "truth": truth}
-        for name, value, sigma, truth in zip(names, *(column.tolist() for column in columns), strict=True)
+        for name, value, sigma, truth in zip(
+            names, *(column.tolist() for column in columns), strict=True
+        )
     ]
 
 
@@ -97,14 +112,23 @@ def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDA
     numbers = np.arange(1, len(iterations) + 1)
     torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
     torque.semilogy(numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound")
-    torque.semilogy(numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle")
+    torque.semilogy(
+        numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
+    )
     torque.axhline(torque_bar_nm, color="0.5", linestyle=":")
     torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
     rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
     for axis, name in enumerate(MOMENT_NAMES):
-        values, sigma = ([row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um"))
+        values, sigma = (
+            [row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um")
+        )
         offset.errorbar(numbers, values, sigma, marker="o", capsize=3, label=name)
-    offset.set(xlabel="flight", ylabel="center of mass from the bearing's center [um]", xticks=numbers, yscale="symlog")
+    offset.set(
+        xlabel="flight",
+        ylabel="center of mass from the bearing's center [um]",
+        xticks=numbers,
+        yscale="symlog",
+    )
     record = iterations[-1].flight.record
     angles_deg = record.lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
     for name, angle in zip(("roll", "pitch", "yaw"), angles_deg.T, strict=True):
@@ -125,11 +149,19 @@ def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> 
     """The report of a balance. picture : see `balance_figure`, PNG"""
     blocks = [
         verdict(statistics),
-        Facts([("every number of this page", [Cell("balance.json", link="balance.json")])], on_terminal=False),
+        Facts(
+            [("every number of this page", [Cell("balance.json", link="balance.json")])],
+            on_terminal=False,
+        ),
         Section("Balance", [Figure(picture, CAPTION)]),
         Section("Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False),
-        Section("With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])),
-        Section("By the filter in flight, from the last flight", mass_blocks(statistics.get("in_flight", []))),
+        Section(
+            "With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])
+        ),
+        Section(
+            "By the filter in flight, from the last flight",
+            mass_blocks(statistics.get("in_flight", [])),
+        ),
     ]
     return Report(f"Balance of {statistics['scene']}", blocks, command)
 
@@ -144,7 +176,8 @@ FLIGHTS = (
 def verdict(statistics: dict[str, Any]) -> Verdict:
     """Whether the vehicle is balanced, and how well that is known."""
     flights = statistics["flights"]
-    last, frames = flights[-1], sum(one["frames"] for one in flights)
+    last = flights[-1]
+    frames = sum(one["frames"] for one in flights)
     return Verdict(
         f"{'balanced' if statistics['balanced'] else 'not balanced'}: gravity torque at most (estimate and 2σ)"
         f" {last['torque_bound_nm']:.2g} N m, bar {statistics['torque_bar_nm']:.2g} N m; the simulated vehicle's is"
@@ -157,14 +190,20 @@ def verdict(statistics: dict[str, Any]) -> Verdict:
 def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
     """One row per flight."""
     columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
-    columns += [Column("trim masses", "mm"), Column("center of mass", "µm"), Column("of the simulated vehicle", "µm")]
+    columns += [
+        Column("trim masses", "mm"),
+        Column("center of mass", "µm"),
+        Column("of the simulated vehicle", "µm"),
+    ]
     columns += [Column("gravity torque", "N m", ".2g"), Column("at most", "N m", ".2g")]
     rows = []
     for one in flights:
         trims = ", ".join(f"{place:.3f}" for place in one["trim_mm"])
         truth = ", ".join(f"{value:.3g}" for value in one["true_offset_um"])
         flown = [one["flight"], f"{one['solved']} / {one['frames']}", one["tilt_deg"]]
-        rows.append([*flown, trims, offset_text(one), truth, one["torque_nm"], one["torque_bound_nm"]])
+        rows.append(
+            [*flown, trims, offset_text(one), truth, one["torque_nm"], one["torque_bound_nm"]]
+        )
     return Table(columns, rows)
 
 
@@ -185,7 +224,9 @@ def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
     return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
 
 
-def write_all(folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str) -> Report:
+def write_all(
+    folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str
+) -> Report:
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
     files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))

@@ -26,10 +26,14 @@ from skysim.simulation.flight import Flight, open_flight
 YAWS_DEG = (0.0, 120.0, 240.0)
 AXES_DEG = (0.0, 90.0, 45.0)  # of the tilting at each of these, from body x
 PERIODS = 2  # of tilting at each yaw
-TORQUE_SHARE, MOMENTUM_SHARE = 0.3, 0.3  # of what the wheels can do that the maneuver takes
+# of what the wheels can do that the maneuver takes
+TORQUE_SHARE = 0.3
+MOMENTUM_SHARE = 0.3
 STOP_MARGIN_DEG = 1.0
 LEAST_ATTITUDES = 20
-MAX_HZ, YAW_DEG_S, YAW_DEG_S2 = 0.1, 5.0, 1.0
+MAX_HZ = 0.1
+YAW_DEG_S = 5.0
+YAW_DEG_S2 = 1.0
 SWING_S = 150.0
 ProgressCallback = Callable[[float, float], None]
 
@@ -52,11 +56,17 @@ def check_scene(scene: Scene) -> None:
     """Refuse a scene whose vehicle cannot be weighed so."""
     vehicle = scene.vehicle
     if vehicle.mount != "air_bearing":
-        raise InputError("vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing")
+        raise InputError(
+            "vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing"
+        )
     if isinstance(scene.light, StarsConfig):
-        raise InputError("light.kind", "stars: balancing needs attitudes relative to the lab", "dome")
+        raise InputError(
+            "light.kind", "stars: balancing needs attitudes relative to the lab", "dome"
+        )
     if vehicle.disturbances.cable:
-        raise InputError("vehicle.disturbances.cable", "its spring acts like a low center of mass", "no cable")
+        raise InputError(
+            "vehicle.disturbances.cable", "its spring acts like a low center of mass", "no cable"
+        )
     if vehicle.cmgs:
         raise InputError("vehicle.cmgs", "the stored momentum must be that of wheels", "no cmgs")
 
@@ -69,12 +79,16 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
     """
     wheels = scene.vehicle.wheels
     if wheels is None:
-        raise InputError("vehicle.wheels", "none, and the inertia's scale is that of the wheels", "excite swing")
+        raise InputError(
+            "vehicle.wheels", "none, and the inertia's scale is that of the wheels", "excite swing"
+        )
     largest = float(np.linalg.eigvalsh(vehicle.inertia_kg_m2)[2])
     torque = TORQUE_SHARE * wheels.torque_limit_nm / (largest * math.radians(tilt_deg))
     limit_rad_s = wheels.speed_limit_rpm * RPM_RAD_S
     momentum = MOMENTUM_SHARE * float(vehicle.wheels.inertia_kg_m2.min()) * limit_rad_s / largest
-    rate_hz = min(MAX_HZ, math.sqrt(torque) / (2 * math.pi), momentum / math.radians(tilt_deg) / (2 * math.pi))
+    rate_hz = min(
+        MAX_HZ, math.sqrt(torque) / (2 * math.pi), momentum / math.radians(tilt_deg) / (2 * math.pi)
+    )
     acceleration = math.degrees(TORQUE_SHARE * wheels.torque_limit_nm / largest)
     legs = []
     for yaw_deg, axis_deg in zip(YAWS_DEG, AXES_DEG, strict=True):
@@ -98,14 +112,21 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
     control = scene.motion.control
     law = {"law": "pid", "actuators": "wheels"}
     if control and control.law in ("pid", "pd"):
-        law |= {key: getattr(control, key) for key in ("bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz")}
+        law |= {
+            key: getattr(control, key)
+            for key in ("bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz")
+        }
     motion = MotionConfig.model_validate({"control": law, "maneuver": legs[1:]})
     return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(update={"motion": motion})
 
 
 def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
     """The scene with the vehicle let go at rest, tilted and at another yaw in every flight, without control."""
-    start = {"roll_deg": tilt_deg, "pitch_deg": tilt_deg / 2, "yaw_deg": YAWS_DEG[number % len(YAWS_DEG)]}
+    start = {
+        "roll_deg": tilt_deg,
+        "pitch_deg": tilt_deg / 2,
+        "yaw_deg": YAWS_DEG[number % len(YAWS_DEG)],
+    }
     motion = MotionConfig.model_validate({"start": start})
     return scene.model_copy(update={"motion": motion})
 
@@ -136,17 +157,22 @@ def fly(
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
     kept = rows[: contact[0]] if len(contact) else rows
     if len(kept) < LEAST_ATTITUDES:
-        cause = "before the vehicle touched its tilt stop: balance it by hand first" if len(contact) else "were solved"
+        cause = (
+            "before the vehicle touched its tilt stop: balance it by hand first"
+            if len(contact)
+            else "were solved"
+        )
         raise InputError("balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more")
     t_s, attitudes, covariances, shared = zip(*kept, strict=True)
-    speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(scene.seed, BALANCE, 1).standard_normal(
-        log.wheel_rad_s.shape
-    )
+    speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(
+        scene.seed, BALANCE, 1
+    ).standard_normal(log.wheel_rad_s.shape)
     lab_from_body = Rotation.concatenate(attitudes)
     record = BearingRecord(
         np.array(t_s),
         lab_from_body,
-        np.array(covariances) + timing_covariance(np.array(t_s), lab_from_body, scene.exposure.time_tag_jitter_s),
+        np.array(covariances)
+        + timing_covariance(np.array(t_s), lab_from_body, scene.exposure.time_tag_jitter_s),
         log.t_s,
         speeds * assumptions.wheel_inertia_kg_m2,
         *vehicle.trims.added(vehicle.trims.position_m),
@@ -155,7 +181,9 @@ def fly(
     return BalanceFlight(record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept))
 
 
-def measured_attitudes(flight: Flight, watch: ProgressCallback | None) -> list[tuple[float, Rotation, Floats, Floats]]:
+def measured_attitudes(
+    flight: Flight, watch: ProgressCallback | None
+) -> list[tuple[float, Rotation, Floats, Floats]]:
     """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
     camera = flight.lab.camera
     body_from_cam = camera.mount.cam_from_body.inv()
@@ -165,11 +193,21 @@ def measured_attitudes(flight: Flight, watch: ProgressCallback | None) -> list[t
         assert shot.report is not None
         attitude = shot.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
-            systematic = np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
-            covariance, shared = (
-                R_body_from_cam @ one @ R_body_from_cam.T for one in (attitude.covariance_rad2, systematic)
+            systematic = (
+                np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
             )
-            rows.append((shot.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance, shared))
+            covariance, shared = (
+                R_body_from_cam @ one @ R_body_from_cam.T
+                for one in (attitude.covariance_rad2, systematic)
+            )
+            rows.append(
+                (
+                    shot.frame.t_mid_s,
+                    (body_from_cam * attitude.cam_from_ref).inv(),
+                    covariance,
+                    shared,
+                )
+            )
     return rows
 
 

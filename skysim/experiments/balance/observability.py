@@ -16,15 +16,21 @@ AXES = "xyz"
 
 
 def check_observed(
-    estimate: MassEstimate, prior: Prior, records: Sequence[BearingRecord], inertia_bar: float, moment_bar_kg_m: Floats
+    estimate: MassEstimate,
+    prior: Prior,
+    records: Sequence[BearingRecord],
+    inertia_bar: float,
+    moment_bar_kg_m: Floats,
 ) -> None:
     """Raise InputError, in one line, if moments of inertia or the moment are less certain than asked.
 
     inertia_bar : standard deviation of a moment of inertia over its value;  moment_bar_kg_m : (3,) standard deviations
     of the components of the moment
     """
-    values, sigma = estimate.values, estimate.sigma
-    rate_deg_s, tilt_deg = largest_rates_deg_s(records), largest_tilt_deg(records)
+    values = estimate.values
+    sigma = estimate.sigma
+    rate_deg_s = largest_rates_deg_s(records)
+    tilt_deg = largest_tilt_deg(records)
     faults = []
     for axis in range(3):
         bar = inertia_bar * abs(values[axis])
@@ -43,7 +49,9 @@ def check_observed(
                 f"{known}, not {1e6 * moment_bar_kg_m[axis]:.3g}, after tilts of {tilt_deg:.1f} deg: {needed}"
             )
     if faults:
-        raise InputError("balance", f"{faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}")
+        raise InputError(
+            "balance", f"{faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}"
+        )
 
 
 def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:
@@ -59,7 +67,10 @@ def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:
 def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
     """(3,) largest rate about each body axis between two attitudes."""
     rates = [
-        np.abs((one.lab_from_body[:-1].inv() * one.lab_from_body[1:]).as_rotvec() / np.diff(one.t_s)[:, None])
+        np.abs(
+            (one.lab_from_body[:-1].inv() * one.lab_from_body[1:]).as_rotvec()
+            / np.diff(one.t_s)[:, None]
+        )
         for one in records
     ]
     return np.degrees(np.concatenate(rates).max(axis=0))

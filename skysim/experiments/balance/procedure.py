@@ -68,9 +68,16 @@ class Bars:
 def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
     """Parse the bars. Raises InputError for what is no torque or length, or not above 0."""
     values: list[float | None] = []
-    for name, text, unit, what in (("torque", torque, "N m", "torque"), ("offset_bar", offset, "m", "length")):
+    for name, text, unit, what in (
+        ("torque", torque, "N m", "torque"),
+        ("offset_bar", offset, "m", "length"),
+    ):
         try:
-            value = None if text is None else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
+            value = (
+                None
+                if text is None
+                else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
+            )
         except InputError as error:
             raise error.under(f"balance.{name}") from None
         if value is not None and not value > 0:
@@ -120,7 +127,9 @@ class Iteration:
 Watch = Callable[[float, float], None]
 
 
-def balance(scene: Scene, plan: Plan, uncertainty: Uncertainty, watch: Watch | None = None) -> Iterator[Iteration]:
+def balance(
+    scene: Scene, plan: Plan, uncertainty: Uncertainty, watch: Watch | None = None
+) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 
     Raises InputError for a vehicle that cannot be balanced so.
@@ -133,10 +142,13 @@ def balance(scene: Scene, plan: Plan, uncertainty: Uncertainty, watch: Watch | N
             "none, so nothing can be moved",
             "joints trim_* in the vehicle's file and vehicle.trim, or an estimate only",
         )
-    assumptions, records = assumed(scene, uncertainty), list[BearingRecord]()
+    assumptions = assumed(scene, uncertainty)
+    records = list[BearingRecord]()
     position_m = vehicle.trims.position_m
     for number in range(plan.max_flights if plan.moves else 1):
-        flown = flight.fly(in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch)
+        flown = flight.fly(
+            in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch
+        )
         records.append(flown.record)
         estimate = estimated(records, assumptions)
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
@@ -160,7 +172,9 @@ def in_flight(scene: Scene, plan: Plan, number: int, position_m: Floats) -> Scen
     if scene.vehicle.trim:
         scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
     if plan.excite == "swing":
-        return flight.with_frames(flight.excited_by_swing(scene, plan.tilt_deg, number), flight.SWING_S)
+        return flight.with_frames(
+            flight.excited_by_swing(scene, plan.tilt_deg, number), flight.SWING_S
+        )
     scene = flight.excited_by_wheels(scene, multibody.build(scene.vehicle), plan.tilt_deg)
     return flight.with_frames(scene, flight.maneuver_s(scene))
 
@@ -184,7 +198,8 @@ def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
 
 def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene) -> Floats:
     """(n,) places of the trim masses that cancel a moment (3,) as flown. Raises InputError beyond their travel."""
-    trims, config = vehicle.trims, scene.vehicle.trim
+    trims = vehicle.trims
+    config = scene.vehicle.trim
     assert config is not None
     lever = trims.axes * trims.mass_kg
     if np.linalg.matrix_rank(lever, tol=MAX_SHRINK) < 3:

@@ -9,20 +9,33 @@ import numpy as np
 from skysim.experiments.characterize.night.lens import Night
 from skysim.experiments.characterize.night.star_images import ImageSize
 from skysim.experiments.characterize.sensor.dark_current import DarkCurrent
-from skysim.experiments.characterize.sensor.photon_transfer import BLACK, CURVATURE, FIRST_DARK, GAIN, LIGHT, model
+from skysim.experiments.characterize.sensor.photon_transfer import (
+    BLACK,
+    CURVATURE,
+    FIRST_DARK,
+    GAIN,
+    LIGHT,
+    model,
+)
 from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.results.plots import INK, png
 from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
 from skysim.scene.sections.camera import CameraConfig
 
 
-def characterize_report(statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None) -> Report:
+def characterize_report(
+    statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None
+) -> Report:
     """The report of a characterized camera. statistics : as in `characterize.json`"""
-    figures = [Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)]
+    figures = [
+        Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)
+    ]
     if dark := found.dark:
         figures.append(Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT))
     if night:
-        figures.append(Figure(png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT))
+        figures.append(
+            Figure(png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT)
+        )
     values = value_table(statistics)
     blocks = [
         verdict(statistics, len(values.rows)),
@@ -35,24 +48,33 @@ def characterize_report(statistics: dict[str, Any], config: CameraConfig, found:
 
 def verdict(statistics: dict[str, Any], values: int) -> Verdict:
     """How many values are known, and how well the law of photon transfer holds."""
-    unknown, misfit = len(statistics["remarks"]), statistics["misfit"]
-    text = f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
+    unknown = len(statistics["remarks"])
+    misfit = statistics["misfit"]
+    text = (
+        f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
+    )
     return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
 
 
 def facts(statistics: dict[str, Any]) -> Facts:
     """The preset, and the conditions of the values."""
-    celsius, night = statistics["temperature_c"], statistics["night"]
+    celsius = statistics["temperature_c"]
+    night = statistics["night"]
     rows = [
         ("for camera.preset", [statistics["preset"]]),
         ("dark current at", ["an unknown temperature" if celsius is None else f"{celsius:g} °C"]),
-        ("linearity error", [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"]),
+        (
+            "linearity error",
+            [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"],
+        ),
         ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
     ]
     if night:
         residuals = "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
         stars = f"{night['stars']} star images in {night['frames']} frames"
-        rows.append(("night", [f"{stars}, of which {night['identified']} were identified{residuals}"]))
+        rows.append(
+            ("night", [f"{stars}, of which {night['identified']} were identified{residuals}"])
+        )
     return Facts(rows)
 
 
@@ -62,7 +84,10 @@ def value_table(statistics: dict[str, Any]) -> Table:
     columns += [Column("file", format=".5g"), Column("unit", kind="text")]
     values = statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
     interval = "{low:.5g} to {high:.5g}"
-    rows = [[row["what"], row["value"], interval.format(**row), row["file"], row["unit"]] for row in values]
+    rows = [
+        [row["what"], row["value"], interval.format(**row), row["file"], row["unit"]]
+        for row in values
+    ]
     return Table(columns, rows)
 
 
@@ -72,17 +97,21 @@ TRANSFER_TEXT = (
     " Right: the signal over that of a linear sensor with the same lamp, less 1; line: the fitted amplifier."
 )
 DARK_TEXT = (
-    "Dark current of the pixels at the darks' temperature: bars measured, line expected (lognormal, hot pixels, noise)."
+    "Dark current of the pixels at the darks' temperature: bars measured, line expected "
+    "(lognormal, hot pixels, noise)."
 )
 SIZE_TEXT = (
-    "Size of the star images over the field, line: the fit; the principal point is at 0, the farthest corner at 1."
+    "Size of the star images over the field, line: the fit; the principal point is at 0, "
+    "the farthest corner at 1."
 )
 
 
 def draw_transfer(axes: Any, found: Sensor) -> None:
     """Variance against mean, and the linearity."""
-    transfer, (curve, line) = found.transfer, axes
-    black, curvature = transfer.values[BLACK], transfer.values[CURVATURE]
+    transfer = found.transfer
+    (curve, line) = axes
+    black = transfer.values[BLACK]
+    curvature = transfer.values[CURVATURE]
     fitted = transfer.points
     beyond = [one for one in found.flats if one not in fitted]
     groups = (
@@ -92,12 +121,20 @@ def draw_transfer(axes: Any, found: Sensor) -> None:
     )
     for name, points, colors in groups:
         mean, variance = (
-            np.array([getattr(one.moments, key) for one in points]) for key in ("mean_dn", "variance_dn2")
+            np.array([getattr(one.moments, key) for one in points])
+            for key in ("mean_dn", "variance_dn2")
         )
-        curve.scatter(np.maximum(mean - black, 0.1), np.maximum(variance, 0.05), 18, label=name, **colors)
+        curve.scatter(
+            np.maximum(mean - black, 0.1), np.maximum(variance, 0.05), 18, label=name, **colors
+        )
     expected_mean, expected_variance = model(fitted, transfer.values)
     order = np.argsort(expected_mean)
-    curve.plot(np.maximum(expected_mean - black, 0.1)[order], expected_variance[order], color="0.4", zorder=0)
+    curve.plot(
+        np.maximum(expected_mean - black, 0.1)[order],
+        expected_variance[order],
+        color="0.4",
+        zorder=0,
+    )
     curve.set(xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]")
     curve.legend()
     plain_labels(curve.xaxis, curve.yaxis)
@@ -110,7 +147,9 @@ def draw_transfer(axes: Any, found: Sensor) -> None:
     x = np.linspace(0, linear[inside].max(), 50)
     line.plot(x, -100 * curvature * x, color="0.4", zorder=0)
     line.set(
-        xlabel="signal of a linear sensor [DN]", ylabel="deviation [%]", title=f"{1 / transfer.values[GAIN]:.4g} e-/DN"
+        xlabel="signal of a linear sensor [DN]",
+        ylabel="deviation [%]",
+        title=f"{1 / transfer.values[GAIN]:.4g} e-/DN",
     )
 
 
@@ -126,7 +165,8 @@ def plain_labels(*axis: Any) -> None:
 def draw_dark(axes: Any, dark: DarkCurrent) -> None:
     """Density of the pixels' rates, hot ones too, measured and expected."""
     width = np.diff(dark.edges)
-    measured, expected = dark.counts[1:-1] / width, dark.expected[1:-1] / width
+    measured = dark.counts[1:-1] / width
+    expected = dark.expected[1:-1] / width
     axes.stairs(measured, dark.edges, color=INK[0], fill=True, alpha=0.4, label="measured")
     axes.plot((dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected")
     axes.set_xscale("symlog", linthresh=dark.mean.value)
@@ -141,7 +181,17 @@ def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
     center_px = night.lens.camera.center_px if night.lens else config.center_px
     rho = np.linalg.norm(size.used.xy_px - np.array(center_px), axis=1) / config.corner_px
     sigma_px = np.sqrt(size.used.variance_px2)
-    axes.errorbar(rho, sigma_px, size.used.variance_sigma_px2 / (2 * sigma_px), fmt=".", color=INK[0], elinewidth=0.6)
+    axes.errorbar(
+        rho,
+        sigma_px,
+        size.used.variance_sigma_px2 / (2 * sigma_px),
+        fmt=".",
+        color=INK[0],
+        elinewidth=0.6,
+    )
     x = np.linspace(0, 1, 60)
     axes.plot(x, np.hypot(size.sigma_px.value, size.corner_sigma_px.value * x), color=INK[1])
-    axes.set(xlabel="distance from the principal point, of the corner's", ylabel="standard deviation [px]")
+    axes.set(
+        xlabel="distance from the principal point, of the corner's",
+        ylabel="standard deviation [px]",
+    )

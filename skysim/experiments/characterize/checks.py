@@ -16,15 +16,22 @@ from skysim.experiments.characterize.frames import Setting, Stack, describe
 from skysim.experiments.characterize.sensor.levels import Level, Mask
 from skysim.experiments.characterize.sensor.photon_transfer import FIT_RANGE
 
-LEAST_LEVELS = 4  # of flats that are not saturated: three rates and a curvature, with one to test them
-MEDIAN_SIGMAS = 0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
+LEAST_LEVELS = (
+    4  # of flats that are not saturated: three rates and a curvature, with one to test them
+)
+MEDIAN_SIGMAS = (
+    0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
+)
 MAX_ZEROS = 1e-3  # of a dark's pixels
 BLOCK = 32  # pixels: side of the blocks whose medians show structure
 MAX_DARK_RANGE = 2.0  # of the blocks' medians, in standard deviations of a pixel
 MAX_FLAT_RANGE = 0.3  # of the light over the frame, relative to its mean
 BRIGHT = 0.2  # signal over the brightest, from which on a flat must be flat
 MAX_PAIR_CHANGE = 0.03  # of the light from frame to frame, relative
-SPOT_SIGMAS, SPOT_PIXELS, MAX_SPOTS = 12.0, 4, 3  # of a bright pixel, of a spot, and spots beyond those by chance
+# of a bright pixel, of a spot, and spots beyond those by chance
+SPOT_SIGMAS = 12.0
+SPOT_PIXELS = 4
+MAX_SPOTS = 3
 POLYPLETS = 110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
 
 
@@ -62,19 +69,28 @@ def check_darks(darks: Stack) -> None:
 
 def level_of(stack: Stack, setting: Setting) -> Level:
     """The level of a setting."""
-    return next(one for one in stack.levels if Setting(one.exposure_s, one.temperature_c) == setting)
+    return next(
+        one for one in stack.levels if Setting(one.exposure_s, one.temperature_c) == setting
+    )
 
 
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, equal frame by frame, or has structure or stars."""
     folder = darks.folder
     which = f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
-    mean, noise_dn = level.mean_dn, math.sqrt(float(np.median(level.variance_dn2)))
+    mean = level.mean_dn
+    noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:
-        raise InputError(folder, f"{which} have {100 * zeros:.2g} % of the pixels at 0 DN", "a higher black level")
+        raise InputError(
+            folder,
+            f"{which} have {100 * zeros:.2g} % of the pixels at 0 DN",
+            "a higher black level",
+        )
     if not level.variance_dn2.any():
-        raise InputError(folder, f"{which} are equal in every pixel", "frames of their own, no copies")
+        raise InputError(
+            folder, f"{which} are equal in every pixel", "frames of their own, no copies"
+        )
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
     if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
@@ -87,7 +103,9 @@ def check_dark(darks: Stack, level: Level) -> None:
     # Hot pixels are single, but for those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
     both = np.minimum(level.first_dn, level.second_dn)
-    bright = both > np.median(mean) + SPOT_SIGMAS * max(spread(mean), noise_dn / math.sqrt(level.count))
+    bright = both > np.median(mean) + SPOT_SIGMAS * max(
+        spread(mean), noise_dn / math.sqrt(level.count)
+    )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))
     sizes = np.bincount(labels.ravel())[1:]
     by_chance = POLYPLETS * bright.mean() ** SPOT_PIXELS * bright.size
@@ -125,7 +143,9 @@ def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
     for one, signal in zip(flats.levels, signals, strict=True):
         which = f"the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
-            raise InputError(flats.folder, f"{which} are equal in every pixel", "frames of their own, no copies")
+            raise InputError(
+                flats.folder, f"{which} are equal in every pixel", "frames of their own, no copies"
+            )
         change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
         if change > MAX_PAIR_CHANGE:
             raise InputError(
@@ -169,6 +189,10 @@ def extremes(medians: Floats) -> Place:
         row, column = np.unravel_index(index, medians.shape)
         vertical = ("top", "middle", "bottom")[int(3 * row / medians.shape[0])]
         horizontal = ("left", "center", "right")[int(3 * column / medians.shape[1])]
-        return "center" if (vertical, horizontal) == ("middle", "center") else f"{vertical} {horizontal}"
+        return (
+            "center"
+            if (vertical, horizontal) == ("middle", "center")
+            else f"{vertical} {horizontal}"
+        )
 
     return Place(word(int(np.argmax(medians))), word(int(np.argmin(medians))))

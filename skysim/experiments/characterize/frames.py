@@ -25,7 +25,9 @@ TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
 TEMPERATURE = re.compile(r"(?:^|[_\- ])([-+]?\d+(?:\.\d+)?)C(?=$|[_\- ])")
-TEMPERATURE_STEP_C = 0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
+TEMPERATURE_STEP_C = (
+    0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
+)
 
 
 class Setting(NamedTuple):
@@ -68,7 +70,11 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
         if parent not in tables:
             tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
         picture = images.read_picture(path)
-        yield path, setting_of(path, folder, picture, tables[parent]), raw_numbers(path, picture.pixels)
+        yield (
+            path,
+            setting_of(path, folder, picture, tables[parent]),
+            raw_numbers(path, picture.pixels),
+        )
 
 
 def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
@@ -84,16 +90,27 @@ def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
     return pixels.astype(np.uint16)
 
 
-def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str, Setting]) -> Setting:
+def setting_of(
+    path: Path, root: Path, picture: images.Picture, table: dict[str, Setting]
+) -> Setting:
     """Exposure and temperature of a frame. Raises InputError without an exposure."""
     if path.name in table:
         return table[path.name]
-    names = [path.name[: -len(images.image_suffix(path.name))], *path.relative_to(root).parts[-2::-1]]
-    exposure_s, temperature_c = picture.exposure_s, picture.temperature_c
+    names = [
+        path.name[: -len(images.image_suffix(path.name))],
+        *path.relative_to(root).parts[-2::-1],
+    ]
+    exposure_s = picture.exposure_s
+    temperature_c = picture.temperature_c
     if exposure_s is None:
-        exposure_s = next((float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))), None)
+        exposure_s = next(
+            (float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))),
+            None,
+        )
     if temperature_c is None:
-        temperature_c = next((float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None)
+        temperature_c = next(
+            (float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None
+        )
     if exposure_s is None or exposure_s < 0:
         raise InputError(
             path,
@@ -108,7 +125,9 @@ def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str,
 
 def read_settings(path: Path) -> dict[str, Setting]:
     """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
-    refusal = InputError(path, "no exposures", "columns file, exposure_s and, if known, temperature_c")
+    refusal = InputError(
+        path, "no exposures", "columns file, exposure_s and, if known, temperature_c"
+    )
     files, numbers = read_named_rows(path, "file", ["exposure_s"], refusal, ["temperature_c"])
     if (numbers[:, 0] < 0).any():
         raise InputError(path, "an exposure below 0", "seconds, 0 or more")
@@ -125,7 +144,8 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     shape : (height, width) of the camera's frames
     """
     builders: dict[Setting, LevelBuilder] = {}
-    stack, shift = Stack(folder), None
+    stack = Stack(folder)
+    shift = None
     for path, setting, frame in read_frames(folder):
         if frame.shape != shape:
             size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
@@ -133,7 +153,9 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
         shift = padding_bits(frame, bits) if shift is None else shift
         numbers = np.right_shift(frame, np.uint16(shift))
         if numbers.max() >= 2**bits:
-            raise InputError(path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera")
+            raise InputError(
+                path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera"
+            )
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
     check_settings(stack, builders)
@@ -160,7 +182,9 @@ def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
     unknown = [setting for setting in builders if setting.temperature_c is None]
     if unknown and len(unknown) < len(builders):
         path = stack.medians[unknown[0]][0][1]
-        raise InputError(path, "no temperature, which other frames have", "of all frames, or of none")
+        raise InputError(
+            path, "no temperature, which other frames have", "of all frames, or of none"
+        )
 
 
 def describe(setting: Setting) -> str:

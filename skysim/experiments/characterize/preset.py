@@ -18,7 +18,9 @@ DIGITS = 6
 AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
 
 
-def preset_text(camera: Mapping[str, Any], config: CameraConfig, sensor: Sensor, night: Night | None, name: str) -> str:
+def preset_text(
+    camera: Mapping[str, Any], config: CameraConfig, sensor: Sensor, night: Night | None, name: str
+) -> str:
     """The file: YAML with the source of each value. camera : raw section of the camera that was measured"""
     head = [
         f"# {printable(name)}, measured. Written by `skysim characterize`.",
@@ -35,9 +37,15 @@ def measured(sensor: Sensor) -> dict[str, tuple[Any, str]]:
         value = max(one.value, 0.0) if key in AT_LEAST_ZERO or one.value < 0 else one.value
         found[f"detector.{key}"] = (rounded(value), comment(one))
     if sensor.dark_temperature_c is not None:
-        found["detector.dark_temperature_c"] = (rounded(sensor.dark_temperature_c), "[M] of the darks")
+        found["detector.dark_temperature_c"] = (
+            rounded(sensor.dark_temperature_c),
+            "[M] of the darks",
+        )
     else:
-        found["detector.temperature_c"] = (None, "the darks' temperature is unknown: dark_e_s is at it")
+        found["detector.temperature_c"] = (
+            None,
+            "the darks' temperature is unknown: dark_e_s is at it",
+        )
     found["detector.reset_noise_e"] = (0.0, "[M] contained in read_noise_e")
     return found
 
@@ -83,7 +91,9 @@ def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> It
     yield from section_lines(tree, "", {key: source for key, (_, source) in found.items()})
 
 
-def section_lines(section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]) -> Iterator[Line]:
+def section_lines(
+    section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
+) -> Iterator[Line]:
     """The lines of a section and, after its values, of the sections in it."""
     for key, value in section.items():
         if not isinstance(value, dict):

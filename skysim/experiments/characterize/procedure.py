@@ -49,7 +49,8 @@ def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
 
 def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> Sensor:
     """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
-    shape, bits = (camera.height_px, camera.width_px), camera.detector.bits
+    shape = (camera.height_px, camera.width_px)
+    bits = camera.detector.bits
     darks = read_stack(darks_folder, shape, bits)
     checks.check_darks(darks)
     flats = read_stack(flats_folder, shape, bits)
@@ -71,7 +72,12 @@ def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found
 
 
 def write_results(
-    folder: Path, config: CameraConfig, raw: dict[str, Any], found: Sensor, night: Night | None, name: str
+    folder: Path,
+    config: CameraConfig,
+    raw: dict[str, Any],
+    found: Sensor,
+    night: Night | None,
+    name: str,
 ) -> tuple[dict[str, Any], Report]:
     """Write preset and report; returns the statistics, which `characterize.json` holds too, and the report."""
     path = folder / "camera.yaml"
@@ -104,7 +110,9 @@ def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
     if night.lens:
         before = [1e3 * config.focal_length_m, *config.center_px, *config.distortion]
         found = lens.lens_estimates(config, night.lens)
-        rows += [row(name, one, value) for (name, one), value in zip(found.items(), before, strict=True)]
+        rows += [
+            row(name, one, value) for (name, one), value in zip(found.items(), before, strict=True)
+        ]
     return {
         "values": rows,
         "frames": night.frames,
@@ -128,9 +136,16 @@ def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
 
 def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     """Both folders. Raises InputError if one is missing."""
-    for name, folder, why in (("darks", darks, "dark current and black level"), ("flats", flats, "gain and full well")):
+    for name, folder, why in (
+        ("darks", darks, "dark current and black level"),
+        ("flats", flats, "gain and full well"),
+    ):
         if folder is None:
-            raise InputError(f"characterize.{name}", f"missing: without them {why} are unknown", f"a folder of {name}")
+            raise InputError(
+                f"characterize.{name}",
+                f"missing: without them {why} are unknown",
+                f"a folder of {name}",
+            )
     assert darks is not None
     assert flats is not None
     return darks, flats

@@ -15,9 +15,13 @@ from skysim.core.io.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
-DARKS, PAIR = 16, 2  # frames of a dark's exposure, and of a flat's
+# frames of a dark's exposure, and of a flat's
+DARKS = 16
+PAIR = 2
 DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks, of the longest
-DARK_NOISES, LEAST_DARK_E = 8.0, 200.0  # dark current of the longest dark: squared read noises, electrons
+# dark current of the longest dark: squared read noises, electrons
+DARK_NOISES = 8.0
+LEAST_DARK_E = 200.0
 WARMER_C = 10.0
 FLAT_S = 0.1  # exposure that saturates a flat
 FLAT_PARTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66, 0.8, 0.9, 1.3, 1.5)
@@ -55,11 +59,19 @@ def frames_of(camera: CameraConfig, shot: Shot, seed: int) -> Iterator[NDArray[n
     """The frames of a shot by the simulated detector, uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
     made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
-    key = (shot.kind == "flats", round(1e6 * shot.exposure_s), round(10 * (shot.temperature_c + 300)))
+    key = (
+        shot.kind == "flats",
+        round(1e6 * shot.exposure_s),
+        round(10 * (shot.temperature_c + 300)),
+    )
     for n in range(shot.frames):
-        light_e = np.full((camera.height_px, camera.width_px), shot.light_e_s * shot.exposure_s, np.float32)
+        light_e = np.full(
+            (camera.height_px, camera.width_px), shot.light_e_s * shot.exposure_s, np.float32
+        )
         detector.smear(light_e, max(shot.exposure_s, 1e-9), camera.shutter)
-        yield detector.expose(light_e, shot.exposure_s, made, random_stream(seed, *map(int, key), n))
+        yield detector.expose(
+            light_e, shot.exposure_s, made, random_stream(seed, *map(int, key), n)
+        )
 
 
 def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path]:

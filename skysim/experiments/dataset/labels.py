@@ -27,7 +27,9 @@ from skysim.tracking.settings import assumed_settings
 
 SATURATED = "saturated"
 MASKS = (SATURATED, PARTICLES, SMEAR)
-REACH_SIGMA = 3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
+REACH_SIGMA = (
+    3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
+)
 DISC_PX = 2.0  # sources of a larger radius are discs with edges
 EDGE_PX = 3.0  # reach of the blur about the edge of a disc
 STILL_PX = 1e-6  # a shorter streak has no direction
@@ -35,7 +37,10 @@ SOURCE = np.dtype(
     [
         ("id", "<i8"),
         *((name, "<f8") for name in ("x_px", "y_px", "flux_x_px", "flux_y_px")),
-        *((name, "<f4") for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")),
+        *(
+            (name, "<f4")
+            for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")
+        ),
         *((name, "<f4") for name in ("sigma_px", "radius_px")),
         ("saturated", "?"),
         ("detected", "?"),
@@ -118,7 +123,9 @@ def label_frame(setup: Setup, seed: int, by: Labeller | None = None) -> Labelled
 
 def least_value(frame: Frame) -> float:
     """The least value of a saturated pixel, an integer if pixels are, which compares faster."""
-    return math.ceil(frame.saturation_dn) if frame.image_dn.dtype.kind == "u" else frame.saturation_dn
+    return (
+        math.ceil(frame.saturation_dn) if frame.image_dn.dtype.kind == "u" else frame.saturation_dn
+    )
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
@@ -135,7 +142,9 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
         rows[name] = getattr(truth, name)[order]
     rows["sigma_px"] = across_sigma_px(truth.area_px, truth.streak_px)[order]
     rows["detected_x_px"] = rows["detected_y_px"] = np.nan
-    chosen = brightest_near(found_px, truth.flux_xy_px[order], SAME_LIGHT_PX + truth.streak_px[order] / 2)
+    chosen = brightest_near(
+        found_px, truth.flux_xy_px[order], SAME_LIGHT_PX + truth.streak_px[order] / 2
+    )
     own = chosen[chosen >= 0]
     rows["detected"][own] = True
     rows["detected_x_px"][own], rows["detected_y_px"][own] = found_px[chosen >= 0].T
@@ -149,9 +158,11 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDA
     is_free = np.ones(len(source_px), np.bool_)
     for m in range(len(found_px)):
         for n in range(len(source_px)):
-            dx, dy = source_px[n, 0] - found_px[m, 0], source_px[n, 1] - found_px[m, 1]
+            dx = source_px[n, 0] - found_px[m, 0]
+            dy = source_px[n, 1] - found_px[m, 1]
             if is_free[n] and dx * dx + dy * dy <= reach_px[n] * reach_px[n]:
-                chosen[m], is_free[n] = n, False
+                chosen[m] = n
+                is_free[n] = False
                 break
     return chosen
 
@@ -159,7 +170,9 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDA
 def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
     """Set the radius of Sun, Moon and planets among the sources, in place, without the lens's distortion."""
     for body in bodies:
-        rows["radius_px"][rows["id"] == body.id] = math.radians(body.diameter_arcsec / 7200) * focal_px
+        rows["radius_px"][rows["id"] == body.id] = (
+            math.radians(body.diameter_arcsec / 7200) * focal_px
+        )
 
 
 def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
@@ -168,9 +181,13 @@ def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents
     It is wider on each side by REACH_SIGMA standard deviations of the blur, or by the radius of a disc and its blurred
     edge. A rolling shutter exposes the row of a disc's center later than the middle one, and shears the disc.
     """
-    streak = np.nan_to_num(np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float))
+    streak = np.nan_to_num(
+        np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float)
+    )
     length = np.linalg.norm(streak, axis=1)
-    along = np.where(length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0])
+    along = np.where(
+        length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0]
+    )
     # Of a source at the row y at mid-exposure: delay = row_time (y + v_y delay - middle row), in exposures.
     rolling = window.row_time_s / window.exposure_s
     rolling = rolling / np.maximum(1 - rolling * streak[:, 1], 0.1)
@@ -178,7 +195,9 @@ def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents
     disc = radius > DISC_PX
     delay = rolling * (rows["y_px"] - (height_px - 1) / 2)
     middle = np.column_stack([rows["x_px"], rows["y_px"]]) + delay[:, None] * streak
-    center = np.where(disc[:, None], middle, np.column_stack([rows["flux_x_px"], rows["flux_y_px"]]))
+    center = np.where(
+        disc[:, None], middle, np.column_stack([rows["flux_x_px"], rows["flux_y_px"]])
+    )
     reach = np.where(disc, radius + EDGE_PX, REACH_SIGMA * rows["sigma_px"])
     shear = np.where(disc, rolling * radius, 0.0) * length
     return Extents(center, along, np.column_stack([length / 2 + reach + shear, reach]))
@@ -201,7 +220,9 @@ def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
     """
     rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
     y, x = np.nonzero(mask[rows] >= least)
-    flat = np.sort(x * len(mask) + rows[y])  # a copy of the transposed mask would take ten times longer
+    flat = np.sort(
+        x * len(mask) + rows[y]
+    )  # a copy of the transposed mask would take ten times longer
     if not len(flat):
         return [mask.size]
     breaks = np.flatnonzero(np.diff(flat) != 1)

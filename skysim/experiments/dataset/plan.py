@@ -22,9 +22,13 @@ from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import TRIAL, Plan, TrialSpec, digest, resolve_point
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
-AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}  # factors of a scene without variations
+AS_IT_IS: dict[str, Any] = {
+    "variation": {"levels": {"none": {}}}
+}  # factors of a scene without variations
 TRACKED = f"{TRIAL}tracked"
-DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
+DRAW = (
+    2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
+)
 FORMATS = ("webdataset", "zarr", "coco")
 
 
@@ -53,7 +57,8 @@ class DatasetPlan:
 
     def draw(self, shard: int, frame: int) -> tuple[dict[str, Value], Settings]:
         """The level of each factor in a frame, and the settings that they make together."""
-        levels, settings = {}, Settings()
+        levels = {}
+        settings = Settings()
         for n, (name, factor) in enumerate(self.factors.items()):
             number = (0, frame) if is_of_frame(factor) else (1, shard)
             u = float(random_stream(self.spec.seed, DRAW, *number, n).random())
@@ -74,7 +79,10 @@ class DatasetPlan:
             "seed": spec.seed,
             "set": spec.base,
             "trial": spec.trial,
-            "factors": {name: factor.model_dump(mode="json", by_alias=True) for name, factor in self.factors.items()},
+            "factors": {
+                name: factor.model_dump(mode="json", by_alias=True)
+                for name, factor in self.factors.items()
+            },
             "hardware": list(spec.hardware),
             "frames": self.frames,
             "frames_per_shard": self.frames_per_shard,
@@ -120,17 +128,23 @@ def load(
             raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
     plan = study_plan(scene, vary, seed, overrides or {})
     check_trial(plan, vary)
-    return DatasetPlan(plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats)))
+    return DatasetPlan(
+        plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats))
+    )
 
 
 def check_trial(plan: Plan, vary: Path | None) -> None:
     """Refuse the key of the trial that is for solving alone. Raises InputError."""
-    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(*map(keys_of, plan.study.factors.values()))
+    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(
+        *map(keys_of, plan.study.factors.values())
+    )
     if TRACKED in keys:
         raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
 
 
-def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]) -> Plan:
+def study_plan(
+    scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]
+) -> Plan:
     """The plan of a study with this scene and these variations, validated as a study is. Raises InputError."""
     tree, text = read_yaml(vary) if vary else ({"schema": 1}, "")
     if vary:
@@ -146,10 +160,15 @@ def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mappi
         raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")
     settings = settings | {key: parse_yaml(value)[1] for key, value in overrides.items()}
     tree = {
-        **{"title": "dataset", "factors": AS_IT_IS, "design": {"kind": "lhs", "points": 2}},
-        **{"responses": ["identified"], **tree},
-        **{"scene": scene, "seed": 0 if seed is None else seed},
-        **{"trial": {**trial, "kind": "frames"}, "set": settings},
+        "title": "dataset",
+        "factors": AS_IT_IS,
+        "design": {"kind": "lhs", "points": 2},
+        "responses": ["identified"],
+        **tree,
+        "scene": scene,
+        "seed": 0 if seed is None else seed,
+        "trial": {**trial, "kind": "frames"},
+        "set": settings,
     }
     # Scenes are found from the folder of the command, not from that of the variations.
     return loader.plan_of(tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset")

@@ -27,8 +27,12 @@ from skysim.experiments.study.execution.setups import Setup, code_version, prepa
 from skysim.experiments.study.execution.trials import Segment
 from skysim.experiments.study.plan import resolve_trial
 
-MANIFEST, FORMAT = "dataset.json", 1
-INDEX, SOURCES, SHARDS, COCO = "index", "sources", "shards", "coco"
+MANIFEST = "dataset.json"
+FORMAT = 1
+INDEX = "index"
+SOURCES = "sources"
+SHARDS = "shards"
+COCO = "coco"
 FOLDERS = {"webdataset": SHARDS, "coco": COCO}  # of the formats that have one
 
 
@@ -76,7 +80,9 @@ class ShardQueue:
 # On the workers.
 
 
-def labelled_frames(plan: DatasetPlan, shard: int) -> Iterator[tuple[int, dict[str, Any], Setup, LabelledFrame]]:
+def labelled_frames(
+    plan: DatasetPlan, shard: int
+) -> Iterator[tuple[int, dict[str, Any], Setup, LabelledFrame]]:
     """The frames of a shard: number, level of each factor, lab, frame with labels."""
     known = None  # settings of the frame before
     for frame in plan.frames_of(shard):
@@ -85,13 +91,18 @@ def labelled_frames(plan: DatasetPlan, shard: int) -> Iterator[tuple[int, dict[s
             setup = prepared_setup(plan.spec, settings)
             by = labeller(setup.lab.scene)
         if settings != known:
-            setup, known = setup._replace(trial=resolve_trial(plan.spec, settings)), settings
+            setup = setup._replace(trial=resolve_trial(plan.spec, settings))
+            known = settings
         yield frame, levels, setup, label_frame(setup, plan.seed(frame), by)
 
 
 def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     """Render a shard's frames and write all of its files, the index last."""
-    frames, rows, sources, images, coco = plan.frames_of(shard), list[dict[str, Any]](), [], [], []
+    frames = plan.frames_of(shard)
+    rows = list[dict[str, Any]]()
+    sources = []
+    images = []
+    coco = []
     name = shard_name(SHARDS, shard, "tar")
     with storage.writer(name) if "webdataset" in plan.formats else nullcontext() as file:
         tar = TarWriter(file) if file else None
@@ -99,7 +110,9 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
             row = shards.frame_labels(one, setup.lab.scene, numbers)
             row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
-            row["position"] = shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
+            row["position"] = (
+                shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
+            )
             rows.append(row | {"levels": json.dumps(levels, default=str)})
             sources.append(one.sources)
             if "zarr" in plan.formats:
@@ -111,8 +124,13 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     if images:
         shards.write_zarr(storage, frames.start, images, shard)
     if "coco" in plan.formats:
-        storage.write(shard_name(COCO, shard, "json"), shards.coco_file(list(map(shards.coco_image, rows)), coco))
-    storage.write(shard_name(SOURCES, shard, "parquet"), shards.sources_table(list(frames), sources))
+        storage.write(
+            shard_name(COCO, shard, "json"),
+            shards.coco_file(list(map(shards.coco_image, rows)), coco),
+        )
+    storage.write(
+        shard_name(SOURCES, shard, "parquet"), shards.sources_table(list(frames), sources)
+    )
     storage.write(shard_name(INDEX, shard, "parquet"), shards.index_table(rows))
     return ShardResult(shard, len(rows))
 
@@ -122,7 +140,12 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
 
 def prepare(plan: DatasetPlan, storage: Storage) -> None:
     """Write the manifest of a new dataset, or check that the one that is there is the plan's. Raises InputError."""
-    described = {"made_by": "skysim", "format": FORMAT, "skysim": __version__, "code": code_version()}
+    described = {
+        "made_by": "skysim",
+        "format": FORMAT,
+        "skysim": __version__,
+        "code": code_version(),
+    }
     there = storage.names()
     if MANIFEST in there:
         check_manifest(storage, described | {"digest": plan.digest})
@@ -130,7 +153,9 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         raise InputError(storage.url, f"contains {min(there)}", "an empty folder, or this dataset")
     else:
         storage.prepare(())
-        text = json.dumps(described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str)
+        text = json.dumps(
+            described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str
+        )
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
     if "zarr" in plan.formats and not shards.zarr_is_there(storage):
@@ -149,11 +174,19 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
         stored = json.loads(storage.read_text(MANIFEST))
         kept = {key: stored[key] for key in own}
     except (LookupError, TypeError, ValueError, RecursionError):
-        raise InputError(storage.url, f"{MANIFEST} is not that of a dataset", "an empty folder") from None
+        raise InputError(
+            storage.url, f"{MANIFEST} is not that of a dataset", "an empty folder"
+        ) from None
     if kept["format"] != FORMAT:
-        raise InputError(storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder")
+        raise InputError(
+            storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder"
+        )
     if kept["digest"] != own["digest"]:
-        raise InputError(storage.url, "contains another dataset or an earlier version of this one", "another folder")
+        raise InputError(
+            storage.url,
+            "contains another dataset or an earlier version of this one",
+            "another folder",
+        )
     if kept["code"] != own["code"]:
         raise InputError(
             storage.url,
@@ -165,10 +198,14 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
 def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
     """The shards whose index is not there."""
     there = storage.names(INDEX)
-    return [shard for shard in range(plan.shards) if shard_name("", shard, "parquet")[1:] not in there]
+    return [
+        shard for shard in range(plan.shards) if shard_name("", shard, "parquet")[1:] not in there
+    ]
 
 
-def run(plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress], Any] | None = None) -> Progress:
+def run(
+    plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress], Any] | None = None
+) -> Progress:
     """Make the missing shards. Progress counts frames, and as failed those of shards that killed their workers."""
     storage = Storage(url)
     prepare(plan, storage)
@@ -182,5 +219,7 @@ def run(plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress],
             progress.failed += len(plan.frames_of(result.shard)) if result.error else 0
         if watch:
             watch(progress)
-    storage.prepare(folders_of(plan))  # workers of a killed run may have been writing when this one began
+    storage.prepare(
+        folders_of(plan)
+    )  # workers of a killed run may have been writing when this one began
     return progress

@@ -21,7 +21,8 @@ from skysim.experiments.dataset.storage import EXTRA, Storage
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 
-ZARR, ZARR_ARRAY = "images.zarr", "images"
+ZARR = "images.zarr"
+ZARR_ARRAY = "images"
 BLOCK = 512  # bytes of a block of a tar file
 COCO_SNR = 3.0  # sources below are no annotations; they are in the other labels
 CATEGORIES = ("source", *MASKS)
@@ -44,7 +45,8 @@ class TarWriter:
     """A tar file in the POSIX ustar format, without times and owners, so that the same frames give the same bytes."""
 
     def __init__(self, file: IO[bytes]) -> None:
-        self.file, self.position = file, 0
+        self.file = file
+        self.position = 0
 
     def add(self, name: str, *parts: bytes | memoryview) -> int:
         """Append a file that is made of some parts; return the position of the last part in the tar."""
@@ -78,24 +80,37 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
 
 def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str, Any]) -> int:
     """Append a frame with its labels; return the position of its first pixel."""
-    key, image = key_of(number), np.ascontiguousarray(one.frame.image_dn)
+    key = key_of(number)
+    image = np.ascontiguousarray(one.frame.image_dn)
     position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
     tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
-    masks = {name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()}
-    more = {"masks": masks, "unmatched_px": one.unmatched_px.tolist(), "hidden": one.truth.hidden.tolist()}
+    masks = {
+        name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()
+    }
+    more = {
+        "masks": masks,
+        "unmatched_px": one.unmatched_px.tolist(),
+        "hidden": one.truth.hidden.tolist(),
+    }
     tar.add(f"{key}.frame.json", json.dumps(labels | more).encode())
     return position
 
 
 def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> dict[str, Any]:
     """The labels of a frame that are one number each, by column of the index; `numbers` come first."""
-    truth, frame = one.truth, one.frame
+    truth = one.truth
+    frame = one.frame
     labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
     labels |= {"exposure_s": frame.exposure_s, "saturation_dn": frame.saturation_dn}
     for name in ("lab_from_body", "cam_from_lab"):
         rotation: Rotation = getattr(truth, name)
-        labels |= {f"{name}_q{end}": float(q) for end, q in zip("xyzw", rotation.as_quat(), strict=True)}
-    labels |= {f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)}
+        labels |= {
+            f"{name}_q{end}": float(q) for end, q in zip("xyzw", rotation.as_quat(), strict=True)
+        }
+    labels |= {
+        f"rate_cam_{end}_rad_s": float(rate)
+        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    }
     if isinstance(scene.light, StarsConfig):
         angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
         labels |= dict(zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True))
@@ -110,7 +125,12 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
 def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
     """The entry of an image; its file is that in the tar of the shard."""
     name = f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
-    return {"id": labels["frame"], "file_name": name, "height": labels["height"], "width": labels["width"]}
+    return {
+        "id": labels["frame"],
+        "file_name": name,
+        "height": labels["height"],
+        "width": labels["width"],
+    }
 
 
 def coco_annotations(one: LabelledFrame, number: int) -> bytes:
@@ -119,18 +139,39 @@ def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     Ids are unique in the dataset. A source is written as `json.dumps` would write it, ten times as fast.
     """
     seen = one.sources["snr"] >= COCO_SNR
-    rows, first = one.sources[seen], number * 100_000 + 1
+    rows = one.sources[seen]
+    first = number * 100_000 + 1
     boxes, corners = outlines(one.extents.of(seen))
-    ids, detected = rows["id"].tolist(), (("false", "true")[one] for one in rows["detected"].tolist())
+    ids = rows["id"].tolist()
+    detected = (("false", "true")[one] for one in rows["detected"].tolist())
     areas = (boxes[:, 2] * boxes[:, 3]).tolist()
-    columns = hundredths(boxes), areas, hundredths(corners), ids, rows["electrons"].tolist(), detected
-    found = [SOURCE_JSON % (first + n, number, *each) for n, each in enumerate(zip(*columns, strict=True))]
+    columns = (
+        hundredths(boxes),
+        areas,
+        hundredths(corners),
+        ids,
+        rows["electrons"].tolist(),
+        detected,
+    )
+    found = [
+        SOURCE_JSON % (first + n, number, *each)
+        for n, each in enumerate(zip(*columns, strict=True))
+    ]
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
         if len(counts) > 1:
             code = {"size": [height, width], "counts": counts}
-            mask = {"bbox": mask_box(counts, height), "area": sum(counts[1::2]), "segmentation": code, "iscrowd": 1}
-            numbers = {"id": first + len(found), "image_id": number, "category_id": 1 + CATEGORIES.index(name)}
+            mask = {
+                "bbox": mask_box(counts, height),
+                "area": sum(counts[1::2]),
+                "segmentation": code,
+                "iscrowd": 1,
+            }
+            numbers = {
+                "id": first + len(found),
+                "image_id": number,
+                "category_id": 1 + CATEGORIES.index(name),
+            }
             found.append(json.dumps(numbers | mask))
     return ", ".join(found).encode()
 
@@ -141,9 +182,13 @@ def outlines(extents: Extents) -> tuple[Floats, Floats]:
     COCO's origin is the corner of the first pixel, half a pixel from its center.
     """
     across = extents.along[:, ::-1] * [-1, 1]
-    a, b = extents.along * extents.half_px[:, :1], across * extents.half_px[:, 1:]
-    corners = np.round(extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2)
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    a = extents.along * extents.half_px[:, :1]
+    b = across * extents.half_px[:, 1:]
+    corners = np.round(
+        extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2
+    )
+    low = corners.min(axis=1)
+    high = corners.max(axis=1)
     return np.round(np.column_stack([low, high - low]), 2), corners.reshape(-1, 8)
 
 
@@ -156,19 +201,25 @@ def hundredths(numbers: Floats) -> list[str]:
 
 
 @jit
-def _hundredths(steps: NDArray[np.int64], negative: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def _hundredths(
+    steps: NDArray[np.int64], negative: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The ASCII of numbers of hundredths with their signs, and where each row ends in it, after a first 0."""
-    digits, ends = np.empty(20, np.uint8), np.zeros(len(steps) + 1, np.int64)
-    text, at = np.empty(steps.size * 25, np.uint8), 0
+    digits = np.empty(20, np.uint8)
+    ends = np.zeros(len(steps) + 1, np.int64)
+    text = np.empty(steps.size * 25, np.uint8)
+    at = 0
     for n in range(len(steps)):
         for k in range(steps.shape[1]):
             if k:
-                text[at], text[at + 1] = COMMA, SPACE
+                text[at] = COMMA
+                text[at + 1] = SPACE
                 at += 2
             if negative[n, k]:
                 text[at] = MINUS
                 at += 1
-            left, count = steps[n, k] // 100, 0
+            left = steps[n, k] // 100
+            count = 0
             while left or count == 0:
                 digits[count] = ZERO + left % 10
                 left //= 10
@@ -176,7 +227,8 @@ def _hundredths(steps: NDArray[np.int64], negative: NDArray[np.bool_]) -> tuple[
             for i in range(count):
                 text[at + i] = digits[count - 1 - i]
             at += count
-            text[at], text[at + 1] = POINT, ZERO + steps[n, k] // 10 % 10
+            text[at] = POINT
+            text[at + 1] = ZERO + steps[n, k] // 10 % 10
             at += 2
             if steps[n, k] % 10:
                 text[at] = ZERO + steps[n, k] % 10
@@ -188,9 +240,13 @@ def _hundredths(steps: NDArray[np.int64], negative: NDArray[np.bool_]) -> tuple[
 def mask_box(counts: list[int], height: int) -> list[float]:
     """The box about the pixels of a mask."""
     ends = np.cumsum(counts)
-    first, last = ends[:-1:2], ends[1::2] - 1
-    x0, x1 = int(first[0] // height), int(last[-1] // height)
-    whole = first // height != last // height  # a run over the end of a column has its first and its last row
+    first = ends[:-1:2]
+    last = ends[1::2] - 1
+    x0 = int(first[0] // height)
+    x1 = int(last[-1] // height)
+    whole = (
+        first // height != last // height
+    )  # a run over the end of a column has its first and its last row
     y0 = 0 if whole.any() else int((first % height).min())
     y1 = height - 1 if whole.any() else int((last % height).max())
     return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]
@@ -198,7 +254,9 @@ def mask_box(counts: list[int], height: int) -> list[float]:
 
 def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
     """A COCO file of one shard, from the annotations of each frame."""
-    categories = json.dumps([{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]).encode()
+    categories = json.dumps(
+        [{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]
+    ).encode()
     parts = (json.dumps(images).encode(), b", ".join(filter(None, annotations)), categories)
     return b'{"images": %b, "annotations": [%b], "categories": %b}' % parts
 
@@ -227,7 +285,12 @@ def sources_table(frames: list[int], sources: list[NDArray[Any]]) -> bytes:
     """The sources of a shard: a row for each source of each frame."""
     rows = np.concatenate(sources)
     number = np.repeat(frames, [len(one) for one in sources])
-    return parquet({"frame": number, **{name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()}})
+    return parquet(
+        {
+            "frame": number,
+            **{name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()},
+        }
+    )
 
 
 # Zarr.

@@ -76,7 +76,11 @@ class Storage:
         """The store of a Zarr group."""
         from zarr.storage import FsspecStore, LocalStore
 
-        return LocalStore(self.path(name)) if self.is_local else FsspecStore.from_url(f"{self.url.rstrip('/')}/{name}")
+        return (
+            LocalStore(self.path(name))
+            if self.is_local
+            else FsspecStore.from_url(f"{self.url.rstrip('/')}/{name}")
+        )
 
     @contextmanager
     def errors(self) -> Iterator[None]:

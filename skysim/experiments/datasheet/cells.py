@@ -23,16 +23,25 @@ from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 
-SCAN_PX = 3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
+SCAN_PX = (
+    3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
+)
 STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of the rates
 SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
 SEQUENCE_RATES = 4  # beside rest, the slowest ones
 FAINTER = (-1.0, -0.5, 0.5)  # magnitudes by which the limit of the tracker's catalog is varied
-FALSE_STARS_PX, TRUE_STARS = 0.05, 20  # error and number of the centroids beside which false ones are drawn
+# error and number of the centroids beside which false ones are drawn
+FALSE_STARS_PX = 0.05
+TRUE_STARS = 20
 BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the exposure time's square
 TRACKED = 2  # frames that are followed before one in tracking mode: the second has a rate
 TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # of the rates in tracking mode
-MISSED_PX = (3.0, 6.0, 12.0, 24.0)  # acceleration times the square of the time between frames, in tracking mode
+MISSED_PX = (
+    3.0,
+    6.0,
+    12.0,
+    24.0,
+)  # acceleration times the square of the time between frames, in tracking mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +76,9 @@ class Cell(NamedTuple):
     @property
     def name(self) -> str:
         """The name of its level in the study."""
-        return " ".join([self.experiment, *(f"{key} {value}" for key, value in self.levels.items())])
+        return " ".join(
+            [self.experiment, *(f"{key} {value}" for key, value in self.levels.items())]
+        )
 
 
 class Draw(NamedTuple):
@@ -100,7 +111,9 @@ def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that make another unit: chip, survey, LEDs."""
     chip = scene.camera.detector
     seeds = (
-        ["camera.detector.hardware_seed"] if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e else []
+        ["camera.detector.hardware_seed"]
+        if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e
+        else []
     )
     seeds += ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
     layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
@@ -130,8 +143,10 @@ class Designer:
     """Makes the cells of a scene."""
 
     def __init__(self, scene: Scene, size: Size) -> None:
-        self.scene, self.size = scene, size
-        self.seeds, self.temperatures_c = unit_seeds(scene), states_c(scene, size.states)
+        self.scene = scene
+        self.size = size
+        self.seeds = unit_seeds(scene)
+        self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
         self.under_stars = isinstance(scene.light, StarsConfig)
         self.noise = 0
@@ -169,7 +184,9 @@ class Designer:
         combinations = self.units * self.states
         yield from self.draws("total", math.ceil(self.size.draws / combinations) * combinations)
         for number in range(self.size.sky):
-            settings = self.settings(Draw(100 + number, number)) | {"trial.attitude_seed": 1 + number}
+            settings = self.settings(Draw(100 + number, number)) | {
+                "trial.attitude_seed": 1 + number
+            }
             yield Cell("sky", {"draw": number}, settings)
         yield from self.rates()
         yield from self.sequences()
@@ -187,10 +204,17 @@ class Designer:
             for state in range(self.states):
                 for attitude in range(self.size.attitudes):
                     for frame in range(self.size.frames):
-                        levels = {"unit": unit, "state": state, "attitude": attitude, "frame": frame}
+                        levels = {
+                            "unit": unit,
+                            "state": state,
+                            "attitude": attitude,
+                            "frame": frame,
+                        }
                         yield Cell("terms", levels, self.settings(Draw(unit, state, attitude)))
 
-    def draws(self, experiment: str, count: int, change: Settings | None = None, **levels: str) -> Iterator[Cell]:
+    def draws(
+        self, experiment: str, count: int, change: Settings | None = None, **levels: str
+    ) -> Iterator[Cell]:
         """Frames of other attitudes; with a change the same as without it, noise included, for a comparison."""
         for number in range(count):
             settings = self.settings(self.in_turn(number)) | {"trial.noise_seed": 10_000 + number}
@@ -209,7 +233,9 @@ class Designer:
         for rate in self.rates_deg_s(STREAKS_PX):
             for frame in range(2):
                 yield Cell(
-                    "rate", {"rate_deg_s": rate, "frame": frame}, self.settings(Draw()) | {"trial.rate_deg_s": rate}
+                    "rate",
+                    {"rate_deg_s": rate, "frame": frame},
+                    self.settings(Draw()) | {"trial.rate_deg_s": rate},
                 )
 
     def sequences(self) -> Iterator[Cell]:
@@ -217,7 +243,11 @@ class Designer:
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
                 settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
-                yield Cell("sequence", {"rate_deg_s": rate, "step": step}, settings | {"trial.rate_deg_s": rate})
+                yield Cell(
+                    "sequence",
+                    {"rate_deg_s": rate, "step": step},
+                    settings | {"trial.rate_deg_s": rate},
+                )
 
     def accelerations(self) -> Iterator[Cell]:
         """Two frames of each attitude at accelerations with no rate at mid-exposure."""
@@ -243,7 +273,9 @@ class Designer:
         for key, value in motions:
             for frame in range(2):
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
-                yield Cell(f"tracked {key}", {key: value, "frame": frame}, self.settings(Draw()) | change)
+                yield Cell(
+                    f"tracked {key}", {key: value, "frame": frame}, self.settings(Draw()) | change
+                )
 
     def magnitudes(self) -> Iterator[Cell]:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
@@ -257,8 +289,11 @@ class Designer:
 
     def causes(self) -> dict[str, Settings]:
         """What would lower the error, as changes of the scene; those that it has no use for are left out."""
-        camera, chip, survey = self.scene.camera, self.scene.camera.detector, self.scene.tracker.survey
-        exposure, period_s = self.scene.exposure, 1 / self.scene.exposure.rate_hz
+        camera = self.scene.camera
+        chip = self.scene.camera.detector
+        survey = self.scene.tracker.survey
+        exposure = self.scene.exposure
+        period_s = 1 / self.scene.exposure.rate_hz
         changes: dict[str, Settings] = {
             "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
         }
@@ -270,23 +305,32 @@ class Designer:
             none = ("prnu", "dsnu", "hot_pixels", "column_offset_e")
             changes["no fixed pattern"] = {f"camera.detector.{key}": 0 for key in none}
         if chip.cti_parallel or chip.cti_serial:
-            changes["no transfer loss"] = {"camera.detector.cti_parallel": 0, "camera.detector.cti_serial": 0}
+            changes["no transfer loss"] = {
+                "camera.detector.cti_parallel": 0,
+                "camera.detector.cti_serial": 0,
+            }
         if survey.lever_sigma_m:
             changes["the lever known"] = {"tracker.survey.lever_sigma": "0 mm"}
         if survey.led_sigma_m or survey.instrument:
-            changes["the LEDs' map known"] = {"tracker.survey.led_sigma": "0 mm", "tracker.survey.instrument": None}
+            changes["the LEDs' map known"] = {
+                "tracker.survey.led_sigma": "0 mm",
+                "tracker.survey.instrument": None,
+            }
         if survey.focal_length_sigma_m:
             changes["the focal length known"] = {"tracker.survey.focal_length_sigma": "0 mm"}
         if self.scene.thermal:
             reference = {"kind": "steady", "temperature_c": self.scene.thermal.reference_c}
             changes["the temperature held"] = {"thermal.temperature": reference}
         if self.under_stars:
-            changes["half a magnitude more stars known"] = {"tracker.limit_mag": self.scene.tracker.limit_mag + 0.5}
+            changes["half a magnitude more stars known"] = {
+                "tracker.limit_mag": self.scene.tracker.limit_mag + 0.5
+            }
         return changes
 
     def disturbances(self) -> dict[str, Settings]:
         """Disturbances that the scene supports, beyond its own."""
-        chip, exposure_s = self.scene.camera.detector, self.scene.exposure.time_s
+        chip = self.scene.camera.detector
+        exposure_s = self.scene.exposure.time_s
         hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
         own = self.scene.model_dump(mode="json", by_alias=True)["background"]
         found: dict[str, Settings] = {
@@ -294,16 +338,28 @@ class Designer:
             "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
             "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,
             "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
-            "stray light, 100 e- a pixel": {"background": [*own, {"kind": "uniform", "e_s": 100 / exposure_s}]},
-            "stray light, 1000 e- a pixel": {"background": [*own, {"kind": "uniform", "e_s": 1000 / exposure_s}]},
+            "stray light, 100 e- a pixel": {
+                "background": [*own, {"kind": "uniform", "e_s": 100 / exposure_s}]
+            },
+            "stray light, 1000 e- a pixel": {
+                "background": [*own, {"kind": "uniform", "e_s": 1000 / exposure_s}]
+            },
         }
         if not self.under_stars:
             return found
         for count in (5, 20):
-            centroids = {"trial.kind": "centroids", "trial.noise_px": FALSE_STARS_PX, "trial.lights": TRUE_STARS}
-            found[f"false stars, {count} among {TRUE_STARS} true"] = centroids | {"trial.false_lights": count}
+            centroids = {
+                "trial.kind": "centroids",
+                "trial.noise_px": FALSE_STARS_PX,
+                "trial.lights": TRUE_STARS,
+            }
+            found[f"false stars, {count} among {TRUE_STARS} true"] = centroids | {
+                "trial.false_lights": count
+            }
         if BODIES_YEARS[0] <= self.scene.start_time.year <= BODIES_YEARS[1]:
-            near = {"trial.near": {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}}
+            near = {
+                "trial.near": {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}
+            }
             found["Moon in the field"] = near | {"light.bodies": {}}
         return found
 

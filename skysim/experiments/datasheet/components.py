@@ -71,10 +71,14 @@ def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
         effect = np.zeros_like(means)
         for part in subsets(list(subset)):
             others = tuple(axis for axis in range(means.ndim) if axis not in part)
-            effect = effect + (-1) ** (len(subset) - len(part)) * means.mean(axis=others, keepdims=True)
+            effect = effect + (-1) ** (len(subset) - len(part)) * means.mean(
+                axis=others, keepdims=True
+            )
         freedom = np.prod([counts[axis] - 1 for axis in subset])
         square = float(np.sum(np.broadcast_to(effect, means.shape) ** 2) / freedom)
-        shared = {one: float(np.prod(np.delete(counts, one))) for one in found if set(subset) < set(one)}
+        shared = {
+            one: float(np.prod(np.delete(counts, one))) for one in found if set(subset) < set(one)
+        }
         rest = sum(found[one] * count for one, count in shared.items())
         found[subset] = (square - rest) / float(np.prod(np.delete(counts, subset)))
     return found
@@ -91,7 +95,8 @@ def components(errors: Floats) -> Components:
     """
     temporal = float(np.mean(np.var(errors, axis=-1, ddof=1)))
     cells = errors.mean(axis=-1)
-    frames, attitudes = errors.shape[-1], errors.shape[-2]
+    frames = errors.shape[-1]
+    attitudes = errors.shape[-2]
     between = float(np.mean(np.var(cells, axis=-1, ddof=1)))
     means = cells.mean(axis=-1)
     present = [axis for axis in (FIELD, UNIT, STATE) if means.shape[axis] > 1]
@@ -99,7 +104,9 @@ def components(errors: Floats) -> Components:
     # What attitudes and noise leave in a mean is in the smallest of the crossed effects.
     found[tuple(present)] -= between / attitudes
     by_state = sum(value for subset, value in found.items() if STATE in subset)
-    by_field = sum(value for subset, value in found.items() if FIELD in subset and STATE not in subset)
+    by_field = sum(
+        value for subset, value in found.items() if FIELD in subset and STATE not in subset
+    )
     bias = sum(value for subset, value in found.items() if not {FIELD, STATE} & set(subset))
     return Components(bias, by_state, by_field, between - temporal / frames, temporal)
 
@@ -150,8 +157,11 @@ def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
     """
     squares = mean_known(at_once**2, (0, 2))
     known = np.isfinite(squares)
-    errors, squares = errors[:, known], squares[known]
-    drawn = [of_axes(errors[:, rows]).total / squares[rows].mean() for rows in resamples(len(squares))]
+    errors = errors[:, known]
+    squares = squares[known]
+    drawn = [
+        of_axes(errors[:, rows]).total / squares[rows].mean() for rows in resamples(len(squares))
+    ]
     return bounded(of_axes(errors).total / float(squares.mean()), np.array(drawn))
 
 
@@ -161,7 +171,8 @@ def mean_square_ratio(numerator: Floats, denominator: Floats) -> Bounded:
     numerator, denominator : (fields,) mean squares; fields without one of them are left out
     """
     known = np.isfinite(numerator) & np.isfinite(denominator)
-    top, bottom = numerator[known], denominator[known]
+    top = numerator[known]
+    bottom = denominator[known]
     if not len(top):
         return Bounded(math.nan, math.nan, math.nan)
     drawn = [top[rows].mean() / bottom[rows].mean() for rows in resamples(len(top))]

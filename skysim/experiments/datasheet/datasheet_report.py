@@ -26,7 +26,9 @@ def command(sheet: Sheet, quick: bool) -> str:
     options = ["--quick"] * quick
     for key, value in sheet.overrides.items():
         options += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
-    return shlex.join(["skysim", "datasheet", sheet.scene_name, *options, "--fields", str(sheet.size.fields)])
+    return shlex.join(
+        ["skysim", "datasheet", sheet.scene_name, *options, "--fields", str(sheet.size.fields)]
+    )
 
 
 def datasheet_report(statement: Statement, quick: bool) -> Report:
@@ -37,7 +39,11 @@ def datasheet_report(statement: Statement, quick: bool) -> Report:
         for n, one in enumerate(statements.sections(statement))
     ]
     text = Text(f"{STANDARD} {sheet.columns['trial'].size} frames.", on_terminal=False)
-    return Report(f"Datasheet: {sheet.scene.title}", [verdict(statement), text, *sections], command(sheet, quick))
+    return Report(
+        f"Datasheet: {sheet.scene.title}",
+        [verdict(statement), text, *sections],
+        command(sheet, quick),
+    )
 
 
 def verdict(statement: Statement) -> Verdict:
@@ -55,7 +61,10 @@ def verdict(statement: Statement) -> Verdict:
 def section_blocks(section: statements.Section, statement: Statement) -> list[Block]:
     """A section's texts, figures and table."""
     texts = [Text(text) for text in section.texts]
-    figures = [Figure(figure_png(name, statement), FIGURES[name].caption, name=name) for name in section.figures]
+    figures = [
+        Figure(figure_png(name, statement), FIGURES[name].caption, name=name)
+        for name in section.figures
+    ]
     first, *others = section.headers
     columns = [Column(head, kind="aside" if head == "what it is" else "number") for head in others]
     return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]

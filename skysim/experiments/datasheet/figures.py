@@ -24,10 +24,16 @@ class Drawing(NamedTuple):
 
 def draw_terms(fig: Any, statement: Statement) -> None:
     """Terms as bars with their intervals, across and about the boresight."""
-    shown = [name for name in Components._fields if name != "thermal" or statement.sheet.designer.states > 1]
+    shown = [
+        name
+        for name in Components._fields
+        if name != "thermal" or statement.sheet.designer.states > 1
+    ]
     for axes, (group, table) in zip(fig.subplots(1, 2), statement.terms.items(), strict=True):
         for n, name in enumerate(shown):
-            low, value, high = (math.sqrt(max(x, 0)) for x in np.array(table.squares[name])[[1, 0, 2]])
+            low, value, high = (
+                math.sqrt(max(x, 0)) for x in np.array(table.squares[name])[[1, 0, 2]]
+            )
             axes.barh(n, value, color=INK[n], height=0.6)
             axes.plot([low, high], [n, n], color="#222222")
         axes.set_yticks(range(len(shown)), [NAMES[name] for name in shown])
@@ -42,7 +48,13 @@ def draw_causes(fig: Any, statement: Statement) -> None:
         for k, one in enumerate(statement.causes):
             value, low, high = (100 * part for part in one[group])
             axes.plot([low, high], [k + 0.2 * n] * 2, color=INK[n])
-            axes.plot(value, k + 0.2 * n, "o", color=INK[n], label=f"{group} the boresight" if k == 0 else None)
+            axes.plot(
+                value,
+                k + 0.2 * n,
+                "o",
+                color=INK[n],
+                label=f"{group} the boresight" if k == 0 else None,
+            )
     axes.axvline(100, color="#888888")
     axes.set_yticks(range(len(statement.causes)), [one["cause"] for one in statement.causes])
     axes.invert_yaxis()
@@ -60,8 +72,12 @@ def draw_sky(fig: Any, statement: Statement) -> None:
         place = -longitude, np.radians(sheet.column("boresight_dec_deg", rows))
     else:
         axes = fig.add_subplot(projection="polar")
-        place = np.radians(sheet.column("body_azimuth_deg", rows)), sheet.column("body_tilt_deg", rows)
-    right, false = sheet.right(rows), sheet.false(rows)
+        place = (
+            np.radians(sheet.column("body_azimuth_deg", rows)),
+            sheet.column("body_tilt_deg", rows),
+        )
+    right = sheet.right(rows)
+    false = sheet.false(rows)
     kinds = {"right": right, "refused": ~right & ~false, "false": false}
     for n, (name, chosen) in enumerate(kinds.items()):
         if chosen.any() or name == "right":
@@ -75,8 +91,12 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
-        errors.plot(x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}")
-        errors.plot(x, [row[f"rms_{group}"] for row in rows], "s--", color=INK[n], label=f"rms {group}")
+        errors.plot(
+            x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
+        )
+        errors.plot(
+            x, [row[f"rms_{group}"] for row in rows], "s--", color=INK[n], label=f"rms {group}"
+        )
     errors.set_yscale("log")
     errors.yaxis.set_major_formatter("{x:g}")
     errors.set_ylabel("one axis [″]")
@@ -101,15 +121,27 @@ def draw_magnitudes(fig: Any, statement: Statement) -> None:
 
 
 FIGURES = {
-    "terms": Drawing(draw_terms, (9, 2.6), "The terms of the error, with 95 % intervals over the fields (ensemble)."),
-    "causes": Drawing(
-        draw_causes, (9, 3.4), "What each change of the scene leaves of the error's mean square (ensemble)."
+    "terms": Drawing(
+        draw_terms,
+        (9, 2.6),
+        "The terms of the error, with 95 % intervals over the fields (ensemble).",
     ),
-    "sky": Drawing(draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."),
+    "causes": Drawing(
+        draw_causes,
+        (9, 3.4),
+        "What each change of the scene leaves of the error's mean square (ensemble).",
+    ),
+    "sky": Drawing(
+        draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."
+    ),
     "rates": Drawing(
-        draw_rates, (9, 3), "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds."
+        draw_rates,
+        (9, 3),
+        "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
     ),
     "magnitudes": Drawing(
-        draw_magnitudes, (9, 3), "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes."
+        draw_magnitudes,
+        (9, 3),
+        "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
     ),
 }

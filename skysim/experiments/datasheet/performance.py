@@ -43,7 +43,8 @@ class Counts(NamedTuple):
 
 def counts(sheet: Sheet, rows: list[int]) -> Counts:
     """The outcomes of some cells."""
-    right, false = sheet.right(rows), sheet.false(rows)
+    right = sheet.right(rows)
+    false = sheet.false(rows)
     return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
 
 
@@ -65,11 +66,14 @@ def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CON
         return low
     high = low
     while metrics.exact_bounds(failures, high, confidence)[1] > 1 - share:
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (
-            (middle, high) if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share else (low, middle)
+            (middle, high)
+            if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share
+            else (low, middle)
         )
     return high
 
@@ -96,7 +100,10 @@ def quantiles(sheet: Sheet) -> list[dict[str, Any]]:
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     sizes = {"across": np.hypot(errors[0], errors[1]), "about": np.abs(errors[2])}
     return [
-        {"level": level, **{name: metrics.quantile(values, level) for name, values in sizes.items()}}
+        {
+            "level": level,
+            **{name: metrics.quantile(values, level) for name, values in sizes.items()},
+        }
         for level in LEVELS
     ]
 
@@ -114,7 +121,10 @@ def consistency(sheet: Sheet) -> dict[str, Any]:
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
         "nees": metrics.resampled(nees, np.mean),
-        "within": [{"level": level, "share": metrics.proportion(hits, total)} for level, hits, total in within],
+        "within": [
+            {"level": level, "share": metrics.proportion(hits, total)}
+            for level, hits, total in within
+        ],
         "y_over_x": mean_square_ratio(y, x),
     }
 
@@ -129,7 +139,10 @@ def pair_row(sheet: Sheet, rows: list[int]) -> dict[str, Any]:
     first, second = (sheet.errors([row]) for row in rows[:2])
     return {
         "counts": counts_of_fields(sheet, rows),
-        **{f"nea_{name}": noise_equivalent_angle(first[axes], second[axes]) for name, axes in GROUPS.items()},
+        **{
+            f"nea_{name}": noise_equivalent_angle(first[axes], second[axes])
+            for name, axes in GROUPS.items()
+        },
         **{f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()},
     }
 
@@ -197,7 +210,8 @@ def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
     """The limit in a rate or an acceleration, from rows in rising order of it."""
     fewest = min(row["counts"].frames for row in rows)
     share = next((one for one in LIMITS if runs_needed(one) <= fewest), LIMITS[-1])
-    above, below = math.nan, math.inf
+    above = math.nan
+    below = math.inf
     for row in rows:
         if row["counts"].share("right").low < share:
             break
@@ -216,7 +230,8 @@ def solution_times_s(sheet: Sheet) -> Floats:
     """
     setup = setups.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
     seeds = (setups.seed_of(sheet.spec, 0, replicate) for replicate in range(TIMED))
-    frames, found = [trials.render_trial_frame(setup, seed)[0] for seed in seeds], []
+    frames = [trials.render_trial_frame(setup, seed)[0] for seed in seeds]
+    found = []
     for frame in frames * 2:
         begin_s = time.perf_counter()
         factory.solve_frame(setup.estimator, frame)
@@ -228,7 +243,10 @@ def disturbances(sheet: Sheet) -> list[dict[str, Any]]:
     """Outcomes and errors under each disturbance, the undisturbed frames first."""
     undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
     cases = {"none": undisturbed}
-    cases |= {name: sheet.rows("disturbance", disturbance=name) for name in sheet.levels("disturbance", "disturbance")}
+    cases |= {
+        name: sheet.rows("disturbance", disturbance=name)
+        for name in sheet.levels("disturbance", "disturbance")
+    }
     return [
         {
             "disturbance": name,

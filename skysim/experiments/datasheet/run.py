@@ -52,7 +52,9 @@ class Sheet:
 
     def levels(self, experiment: str, name: str) -> list[Any]:
         """The levels of an experiment, in order."""
-        return list(dict.fromkeys(cell.levels[name] for cell in self.cells if cell.experiment == experiment))
+        return list(
+            dict.fromkeys(cell.levels[name] for cell in self.cells if cell.experiment == experiment)
+        )
 
     def column(self, name: str, rows: list[int]) -> NDArray[Any]:
         """(cells, fields) of some cells."""
@@ -129,7 +131,9 @@ def measure(
         with store.writing(folder / store.STORE) as kept:
             runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
             runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
-            return Sheet(scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec)
+            return Sheet(
+                scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec
+            )
     finally:
         engine.close()
 

@@ -180,12 +180,20 @@ def sections(statement: Statement) -> list[Section]:
 
 def term_section(statement: Statement) -> Section:
     """The terms, and their sum beside the total measured at once."""
-    sheet, tables = statement.sheet, statement.terms
+    sheet = statement.sheet
+    tables = statement.terms
     rows = []
     for name in (*Components._fields, "total"):
         if name == "thermal" and sheet.designer.states < 2:
             rows.append(
-                [NAMES[name], "not in the scene", "-", "not in the scene", "-", "a scene with section thermal has it"]
+                [
+                    NAMES[name],
+                    "not in the scene",
+                    "-",
+                    "not in the scene",
+                    "-",
+                    "a scene with section thermal has it",
+                ]
             )
             continue
         row = [NAMES[name]]
@@ -208,7 +216,13 @@ def term_section(statement: Statement) -> Section:
     ]
     if sheet.designer.units > 1:
         texts.insert(2, unit_text(sheet.designer.units))
-    return Section("Error terms", texts, ["term", "across ″", "%", "about ″", "%", "what it is"], rows, ["terms"])
+    return Section(
+        "Error terms",
+        texts,
+        ["term", "across ″", "%", "about ″", "%", "what it is"],
+        rows,
+        ["terms"],
+    )
 
 
 def unit_text(units: int) -> str:
@@ -236,11 +250,18 @@ def lowering_section(statement: Statement) -> Section:
         " percent, with 95 % intervals. Below 100 the change lowers the error."
     )
     rows = [
-        [one["cause"], *(bounded(Bounded(*(100 * part for part in one[name]))) for name in terms.GROUPS)]
+        [
+            one["cause"],
+            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in terms.GROUPS),
+        ]
         for one in statement.causes
     ]
     return Section(
-        "What dominates, and what would lower it", texts, ["change", "across %", "about %"], rows, ["causes"]
+        "What dominates, and what would lower it",
+        texts,
+        ["change", "across %", "about %"],
+        rows,
+        ["causes"],
     )
 
 
@@ -248,7 +269,9 @@ def probability_section(statement: Statement) -> Section:
     """Probabilities of right, refused and false attitudes, and what may be claimed."""
     counts = statement.counts
     where = "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
-    shares = ", ".join(f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false"))
+    shares = ", ".join(
+        f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false")
+    )
     texts = [
         f"{counts.frames} frames lost in space at rest, each with its own attitude from {where}, unit and noise"
         f" ({ENSEMBLE}). Shares with exact one-sided bounds, each at 95 %: {shares}. A false attitude"
@@ -256,7 +279,9 @@ def probability_section(statement: Statement) -> Section:
         "A claim needs so many runs without a failure that the upper bound of the failures' probability is below its"
         " complement: n = ln(1 - c) / ln(p), rounded up.",
     ]
-    median_ms, high_ms = (1000 * quantile for quantile in np.quantile(statement.times_s, (0.5, 0.95)))
+    median_ms, high_ms = (
+        1000 * quantile for quantile in np.quantile(statement.times_s, (0.5, 0.95))
+    )
     texts.append(
         f"Time of a solution lost in space, from pixels to attitude, on the machine that wrote this: median"
         f" {median_ms:.3g} ms, 95 % within {high_ms:.3g} ms ({len(statement.times_s)} frames, one process)."
@@ -298,12 +323,16 @@ def quantile_section(statement: Statement) -> Section:
         [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
         for one in statement.quantiles
     ]
-    return Section("Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows)
+    return Section(
+        "Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows
+    )
 
 
 def consistency_text(found: dict[str, Any]) -> str:
     """What the covariances of the attitudes are worth, and whether x and y err alike."""
-    shares = ", ".join(f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"])
+    shares = ", ".join(
+        f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
+    )
     return (
         f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
         f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}."
@@ -319,7 +348,11 @@ def quantile_text(found: Summary) -> str:
 
 def outcome_cells(row: dict[str, Any]) -> list[str]:
     """Cells of a row's outcomes."""
-    return [percent(row["counts"].share("right")), str(row["counts"].refused), str(row["counts"].false)]
+    return [
+        percent(row["counts"].share("right")),
+        str(row["counts"].refused),
+        str(row["counts"].false),
+    ]
 
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
@@ -348,7 +381,9 @@ def rate_section(statement: Statement) -> Section:
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE})."
         f" Shares are of attitudes that are right in both frames. {precision_text(statement.sheet)}",
-        bracket_text("acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"),
+        bracket_text(
+            "acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"
+        ),
     ]
     rows = [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row), *outcome_cells(row)]
@@ -374,7 +409,9 @@ def acceleration_section(statement: Statement) -> Section:
         f" ({ENSEMBLE}). All lights move to one side, so their mean is a T² / 24 from where they are at mid-exposure:"
         " predicted, with the error at rest.",
         bracket_text(
-            "acquisition in acceleration", performance.bracket(statement.accelerations, "acceleration_deg_s2"), "°/s²"
+            "acquisition in acceleration",
+            performance.bracket(statement.accelerations, "acceleration_deg_s2"),
+            "°/s²",
         ),
     ]
     rows = [
@@ -393,18 +430,31 @@ def acceleration_section(statement: Statement) -> Section:
 
 def tracking_section(statement: Statement) -> Section:
     """Error and outcomes in tracking mode."""
-    rates, accelerations = statement.tracked_rates, statement.tracked_accelerations
+    rates = statement.tracked_rates
+    accelerations = statement.tracked_accelerations
     texts = [
         f"Two frames of each attitude that differ in their noise, solved in tracking mode after {TRACKED} frames of the"
         " same motion, without a gyro: stars are detected in windows of 8 pixels around their predicted places. A frame"
         " that only the lost-in-space search would solve counts as refused. The prediction extrapolates the rate"
         " between the last two frames, so an acceleration a misses by a t².",
         bracket_text("tracking in rate", performance.bracket(rates, "rate_deg_s"), "°/s"),
-        bracket_text("tracking in acceleration", performance.bracket(accelerations, "acceleration_deg_s2"), "°/s²"),
+        bracket_text(
+            "tracking in acceleration",
+            performance.bracket(accelerations, "acceleration_deg_s2"),
+            "°/s²",
+        ),
     ]
     rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates]
-    rows += [["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)] for row in accelerations]
-    return Section("In tracking mode", texts, ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS], rows)
+    rows += [
+        ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
+        for row in accelerations
+    ]
+    return Section(
+        "In tracking mode",
+        texts,
+        ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS],
+        rows,
+    )
 
 
 def magnitude_section(statement: Statement) -> Section:
@@ -415,10 +465,20 @@ def magnitude_section(statement: Statement) -> Section:
     ]
     own = statement.sheet.scene.tracker.limit_mag
     rows = [
-        [f"{row['limit_mag']:g}{' (of the scene)' * (row['limit_mag'] == own)}", *pair_cells(row), *outcome_cells(row)]
+        [
+            f"{row['limit_mag']:g}{' (of the scene)' * (row['limit_mag'] == own)}",
+            *pair_cells(row),
+            *outcome_cells(row),
+        ]
         for row in statement.magnitudes
     ]
-    return Section("By magnitude limit", texts, ["limit V", *PAIR_HEADERS, *FIELD_HEADERS], rows, ["magnitudes"])
+    return Section(
+        "By magnitude limit",
+        texts,
+        ["limit V", *PAIR_HEADERS, *FIELD_HEADERS],
+        rows,
+        ["magnitudes"],
+    )
 
 
 def disturbance_section(statement: Statement) -> Section:
@@ -429,9 +489,17 @@ def disturbance_section(statement: Statement) -> Section:
         " may be those of the fields with the brightest stars. False stars are added to centroids, not to frames."
     ]
     rows = [
-        [row["disturbance"], *outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
+        [
+            row["disturbance"],
+            *outcome_cells(row),
+            arcsec(row["rms_across"]),
+            arcsec(row["rms_about"]),
+        ]
         for row in statement.disturbances
     ]
     return Section(
-        "Under disturbances", texts, ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"], rows
+        "Under disturbances",
+        texts,
+        ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"],
+        rows,
     )

@@ -52,7 +52,9 @@ def term_errors(sheet: Sheet) -> tuple[Floats, np.ndarray]:
 
     Raises InputError where they are too few for a statement.
     """
-    rows, designer, size = sheet.rows("terms"), sheet.designer, sheet.size
+    rows = sheet.rows("terms")
+    designer = sheet.designer
+    size = sheet.size
     errors = sheet.errors(rows)
     shape = (3, designer.units, designer.states, size.attitudes, size.frames, size.fields)
     errors = np.moveaxis(errors.reshape(shape), -1, 1)
@@ -83,8 +85,13 @@ def mean_errors(sheet: Sheet) -> list[Bounded]:
 
     errors, _ = term_errors(sheet)
     means = errors.reshape(*errors.shape[:2], -1).mean(axis=2)
-    half = stdtrit(means.shape[1] - 1, 0.975) * means.std(axis=1, ddof=1) / math.sqrt(means.shape[1])
-    return [Bounded(float(m), float(m - h), float(m + h)) for m, h in zip(means.mean(axis=1), half, strict=True)]
+    half = (
+        stdtrit(means.shape[1] - 1, 0.975) * means.std(axis=1, ddof=1) / math.sqrt(means.shape[1])
+    )
+    return [
+        Bounded(float(m), float(m - h), float(m + h))
+        for m, h in zip(means.mean(axis=1), half, strict=True)
+    ]
 
 
 def squares_by_field(sheet: Sheet, rows: list[int], axes: slice) -> Floats:
@@ -99,7 +106,9 @@ def causes(sheet: Sheet) -> list[dict[str, Any]]:
         rows = sheet.rows("cause", cause=name)
         before = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] < len(rows)]
         left = {
-            group: mean_square_ratio(squares_by_field(sheet, rows, axes), squares_by_field(sheet, before, axes))
+            group: mean_square_ratio(
+                squares_by_field(sheet, rows, axes), squares_by_field(sheet, before, axes)
+            )
             for group, axes in GROUPS.items()
         }
         found.append({"cause": name, **left})

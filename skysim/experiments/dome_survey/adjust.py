@@ -26,7 +26,13 @@ from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
 from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, assumed
-from skysim.experiments.dome_survey.survey_run import SurveyRun, identified, led_sigma_m, light_table, stray_lights
+from skysim.experiments.dome_survey.survey_run import (
+    SurveyRun,
+    identified,
+    led_sigma_m,
+    light_table,
+    stray_lights,
+)
 from skysim.tracking.dome_map_file import DomeMap
 
 MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
@@ -42,7 +48,8 @@ MIN_MATCHED = 0.5
 MIN_OF_MEDIAN = 0.8
 # Standard deviations by which a parameter may move from the assumed one, and the least of these, as a share of that
 # of the assumed one.
-PLAUSIBLE, LEAST_SHARE = 6.0, 0.1
+PLAUSIBLE = 6.0
+LEAST_SHARE = 0.1
 MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
 
 
@@ -61,16 +68,22 @@ def run_survey(
     Raises InputError if the frames do not determine the unknowns, or the result contradicts the prior.
     """
 
-    def adjusted(rows: list[int], matches: list[Correspondences], prior: CalibrationPrior) -> SurveyRun:
+    def adjusted(
+        rows: list[int], matches: list[Correspondences], prior: CalibrationPrior
+    ) -> SurveyRun:
         pairs = [
-            (replace(frames[row], body_from_lab=start[row]), match) for row, match in zip(rows, matches, strict=True)
+            (replace(frames[row], body_from_lab=start[row]), match)
+            for row, match in zip(rows, matches, strict=True)
         ]
         selected, survey = adjust_connected(pairs, prior, uncertainty, before, fit_distortion)
-        rows, matches = [rows[k] for k in selected], [matches[k] for k in selected]
+        rows = [rows[k] for k in selected]
+        matches = [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
         return with_names(SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty))
 
-    listed, before, total = prior.leds, assumed(prior, uncertainty), ROUNDS + MOVED_ROUNDS
+    listed = prior.leds
+    before = assumed(prior, uncertainty)
+    total = ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
     run = adjusted(*identified_by_imu(frames, prior, uncertainty), prior)
     for completed in range(1, total):
@@ -97,16 +110,23 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
     after (the innovation of a linear estimate). A value moves by more than PLAUSIBLE standard deviations only by such
     an error. For frames that add next to nothing the variance is at least LEAST_SHARE^2 P0.
     """
-    found, accuracy = run.survey, run.accuracy
-    lever = zip(before.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True)
+    found = run.survey
+    accuracy = run.accuracy
+    lever = zip(
+        before.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True
+    )
     lever_sigma_m, focal_sigma_px = before.weight[2:] ** -0.5
-    rows = [(before.focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")]
+    rows = [
+        (before.focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")
+    ]
     rows += [
         (1e3 * then, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
         for then, now, sigma, axis in lever
     ]
     for then, now, sigma, known, name in rows:
-        if abs(now - then) > PLAUSIBLE * math.sqrt(max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)):
+        if abs(now - then) > PLAUSIBLE * math.sqrt(
+            max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)
+        ):
             raise InputError(
                 "survey",
                 f"{name} {now:.5g} ± {sigma:.2g} contradicts the assumed {then:.5g} ± {known:.2g}: lights are"
@@ -120,7 +140,9 @@ def identified_by_imu(
 ) -> tuple[list[int], list[Correspondences]]:
     """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
-    shares = [matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)]
+    shares = [
+        matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)
+    ]
     least = max(MIN_MATCHED, MIN_OF_MEDIAN * float(np.median(shares)))
     rows = np.flatnonzero(np.array(shares) >= least).tolist()
     if not rows:
@@ -146,13 +168,17 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     A frame that is not tied, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
     matched with the IMU's attitude again, now that lever and lens are known better.
     """
-    survey, prior = run.survey, run.prior
+    survey = run.survey
+    prior = run.prior
     model = replace(prior, camera=survey.camera, leds=survey.leds, lever=survey.lever)
     # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
-    tied = {row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok}
-    rows, matches = [], []
+    tied = {
+        row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok
+    }
+    rows = []
+    matches = []
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
         if match is None or matched_share(tied[row], match, model) < MIN_MATCHED:
@@ -170,25 +196,25 @@ def with_names(run: SurveyRun) -> SurveyRun:
 
     An LED that is not measured keeps its name, or gets one that is free if another LED has it now.
     """
-    survey, listed_m = run.survey, run.listed.position_m
-    old, new = survey_faults.names(light_table(run), listed_m, survey.leds.position_m, survey.led_covariance_m2)
+    survey = run.survey
+    listed_m = run.listed.position_m
+    old, new = survey_faults.names(
+        light_table(run), listed_m, survey.leds.position_m, survey.led_covariance_m2
+    )
     if (old == new).all():
         return run
     every = np.arange(len(listed_m))
-    others, free = np.setdiff1d(every, old), np.setdiff1d(every, new)
+    others = np.setdiff1d(every, old)
+    free = np.setdiff1d(every, new)
     name = every.copy()
     name[old] = new
     name[np.setdiff1d(others, free)] = np.setdiff1d(free, others)
-    position_m, covariance_m2, surveyed = (
-        run.prior.leds.position_m.copy(),
-        np.empty_like(survey.led_covariance_m2),
-        np.empty_like(survey.surveyed),
-    )
-    position_m[new], covariance_m2[name], surveyed[name] = (
-        survey.leds.position_m[old],
-        survey.led_covariance_m2,
-        survey.surveyed,
-    )
+    position_m = run.prior.leds.position_m.copy()
+    covariance_m2 = np.empty_like(survey.led_covariance_m2)
+    surveyed = np.empty_like(survey.surveyed)
+    position_m[new] = survey.leds.position_m[old]
+    covariance_m2[name] = survey.led_covariance_m2
+    surveyed[name] = survey.surveyed
     leds = replace(survey.leds, position_m=position_m)
     return replace(
         run,
@@ -200,7 +226,9 @@ def with_names(run: SurveyRun) -> SurveyRun:
 def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
     """Rows and places of the LEDs that are far from those in the list: measured ones, and stray lights with a name."""
     survey = run.survey
-    rows, _ = survey_faults.displaced(run.listed.position_m, survey.leds.position_m, survey.led_covariance_m2)
+    rows, _ = survey_faults.displaced(
+        run.listed.position_m, survey.leds.position_m, survey.led_covariance_m2
+    )
     places = {int(row): survey.leds.position_m[row] for row in rows}
     strays = stray_lights(run)
     missing = np.flatnonzero(~run.seen.any(axis=0))
@@ -217,8 +245,13 @@ def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
             position_m[row] = place_m
         return replace(leds, position_m=position_m)
 
-    prior, survey = run.prior, run.survey
-    return replace(run, prior=replace(prior, leds=moved(prior.leds)), survey=replace(survey, leds=moved(survey.leds)))
+    prior = run.prior
+    survey = run.survey
+    return replace(
+        run,
+        prior=replace(prior, leds=moved(prior.leds)),
+        survey=replace(survey, leds=moved(survey.leds)),
+    )
 
 
 def adjust_connected(
@@ -264,14 +297,18 @@ def adjust_connected(
             selected = np.array(selected)[~is_wrong].tolist()
 
 
-def led_visibility(pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior) -> NDArray[np.bool_]:
+def led_visibility(
+    pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior
+) -> NDArray[np.bool_]:
     """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
 
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
     arm_m = prior.lever.camera_body_m
-    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(-1, 3)
+    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(
+        -1, 3
+    )
     angle_rad = dome_survey.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
     return visible & (angle_rad > dome_survey.CONNECTING_RAD)
 
@@ -286,7 +323,8 @@ def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list
     grows from the frame with the most LEDs, adding connected frames until none is left.
     """
     n_frames = len(visible)
-    remaining, best = np.ones(n_frames, dtype=bool), np.zeros(n_frames, dtype=bool)
+    remaining = np.ones(n_frames, dtype=bool)
+    best = np.zeros(n_frames, dtype=bool)
     while remaining.any():
         group = np.zeros(n_frames, dtype=bool)
         group[np.argmax(remaining * (1 + visible.sum(axis=1)))] = True
@@ -331,4 +369,6 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
 def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
     """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
     lights = frame.lights
-    return DomeFrame(match.led, lights.xy_px[match.light], lights.sigma_px[match.light], frame.body_from_lab)
+    return DomeFrame(
+        match.led, lights.xy_px[match.light], lights.sigma_px[match.light], frame.body_from_lab
+    )

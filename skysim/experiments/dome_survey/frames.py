@@ -44,7 +44,9 @@ class SurveyFrame:
     index: int = 0
 
 
-def render_stops(lab: Lab, lab_from_body: Rotation, first: int = 0) -> Iterator[tuple[Frame, Truth]]:
+def render_stops(
+    lab: Lab, lab_from_body: Rotation, first: int = 0
+) -> Iterator[tuple[Frame, Truth]]:
     """Render a frame at each attitude with the vehicle at rest. `first` is the index of the first frame, which also
     selects its noise."""
     for n, attitude in enumerate(lab_from_body):
@@ -65,7 +67,9 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
     Raises InputError if they show too few lights.
     """
     errors = []
-    for _, truth, lights in take_frames(lab, stop_attitudes(lab.scene, "noise", NOISE_FRAMES, tilt_deg)):
+    for _, truth, lights in take_frames(
+        lab, stop_attitudes(lab.scene, "noise", NOISE_FRAMES, tilt_deg)
+    ):
         if len(truth.sources.id) and len(lights):
             distance_px, nearest = cKDTree(truth.sources.flux_xy_px).query(lights.xy_px)
             same = distance_px < SAME_LIGHT_PX
@@ -82,7 +86,9 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
 
 def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:
     """body_from_lab at each stop from an IMU with independent Gaussian errors about each body axis."""
-    error_rad = sigma_rad * random_stream(scene.seed, STREAM_KEYS["imu"]).standard_normal((len(lab_from_body), 3))
+    error_rad = sigma_rad * random_stream(scene.seed, STREAM_KEYS["imu"]).standard_normal(
+        (len(lab_from_body), 3)
+    )
     return Rotation.from_rotvec(error_rad) * lab_from_body.inv()
 
 

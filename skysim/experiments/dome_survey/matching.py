@@ -20,7 +20,9 @@ from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncerta
 
 Ints = NDArray[np.int64]
 GATE_SIGMAS = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
-ANCHOR_LIGHTS = 10  # number of central lights that are paired with every LED to find the common shift
+ANCHOR_LIGHTS = (
+    10  # number of central lights that are paired with every LED to find the common shift
+)
 
 
 class Correspondences(NamedTuple):
@@ -44,7 +46,10 @@ def prediction_sigmas_px(
     """
     camera = prior.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
-    common = np.hypot(uncertainty.imu_sigma_rad * prior.nearest_m, uncertainty.lever_sigma_m) * prior.px_per_m
+    common = (
+        np.hypot(uncertainty.imu_sigma_rad * prior.nearest_m, uncertainty.lever_sigma_m)
+        * prior.px_per_m
+    )
     roll_and_scale = corner_px * np.hypot(uncertainty.imu_sigma_rad, uncertainty.focal_error)
     if map_px is None:
         map_px = np.full(len(prior.leds.id), uncertainty.led_sigma_m * prior.px_per_m)
@@ -52,7 +57,10 @@ def prediction_sigmas_px(
 
 
 def match_by_imu(
-    frame: SurveyFrame, prior: CalibrationPrior, uncertainty: SurveyUncertainty, map_px: Floats | None = None
+    frame: SurveyFrame,
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    map_px: Floats | None = None,
 ) -> Correspondences:
     """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment.
 
@@ -65,14 +73,19 @@ def match_by_imu(
     detected = frame.lights.xy_px
     if not len(visible) or not len(detected):
         return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    predicted, individual_px = predicted[visible], individual_px[visible]
+    predicted = predicted[visible]
+    individual_px = individual_px[visible]
     shift = common_shift_px(detected, predicted, common_px, individual_px, prior.camera.center_px)
     light, led = assign_lights(detected, predicted + shift, GATE_SIGMAS * individual_px)
     return Correspondences(light, visible[led])
 
 
 def common_shift_px(
-    detected_px: Floats, predicted_px: Floats, common_px: float, individual_px: Floats, center_px: tuple[float, float]
+    detected_px: Floats,
+    predicted_px: Floats,
+    common_px: float,
+    individual_px: Floats,
+    center_px: tuple[float, float],
 ) -> Floats:
     """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
 
@@ -89,13 +102,17 @@ def common_shift_px(
     candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is a candidate too
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
     sigma_px = individual_px[nearest]
-    cost = np.minimum((distance_px / sigma_px) ** 2 + 4 * np.log(sigma_px / individual_px.max()), GATE_SIGMAS**2)
+    cost = np.minimum(
+        (distance_px / sigma_px) ** 2 + 4 * np.log(sigma_px / individual_px.max()), GATE_SIGMAS**2
+    )
     best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost, axis=1)))
     is_close = cost[best] < GATE_SIGMAS**2
     if not is_close.any():
         return candidates[best]
     led = nearest[best, is_close]
-    return np.average(detected_px[is_close] - predicted_px[led], axis=0, weights=individual_px[led] ** -2.0)
+    return np.average(
+        detected_px[is_close] - predicted_px[led], axis=0, weights=individual_px[led] ** -2.0
+    )
 
 
 def assign_lights(detected_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:
@@ -110,12 +127,16 @@ def assign_lights(detected_px: Floats, predicted_px: Floats, gate_px: Floats) ->
     return rows[inside].astype(np.int64), column[inside].astype(np.int64)
 
 
-def match_by_survey(frame: SurveyFrame, prior: CalibrationPrior, sigma_px: Floats) -> Correspondences:
+def match_by_survey(
+    frame: SurveyFrame, prior: CalibrationPrior, sigma_px: Floats
+) -> Correspondences:
     """Match detections to LEDs with the attitudes and map of an adjustment.
 
     sigma_px : (N,) standard deviation of each LED's predicted coordinates
     """
     predicted = prior.pixels(frame.body_from_lab)
     visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max())))
-    light, led = assign_lights(frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible])
+    light, led = assign_lights(
+        frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible]
+    )
     return Correspondences(light, visible[led])

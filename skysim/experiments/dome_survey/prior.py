@@ -87,7 +87,9 @@ class CalibrationPrior:
     @property
     def px_per_m(self) -> float:
         """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
-        return float(self.camera.focal_px / (self.nearest_m - np.linalg.norm(self.lever.camera_body_m)))
+        return float(
+            self.camera.focal_px / (self.nearest_m - np.linalg.norm(self.lever.camera_body_m))
+        )
 
     def pixels(self, body_from_lab: Rotation) -> Floats:
         """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
@@ -97,7 +99,10 @@ class CalibrationPrior:
 
 
 def survey_uncertainty(
-    imu_sigma: str = "0.5 deg", led_sigma: str = "2 mm", lever_sigma: str = "5 mm", focal_error: str = "1%"
+    imu_sigma: str = "0.5 deg",
+    led_sigma: str = "2 mm",
+    lever_sigma: str = "5 mm",
+    focal_error: str = "1%",
 ) -> SurveyUncertainty:
     """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = imu_sigma, led_sigma, lever_sigma, focal_error
@@ -114,7 +119,8 @@ def calibration_prior(lab: Lab) -> CalibrationPrior:
 def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
     """The model of a dome as its list has it, without the errors of the scene's simulation, and this camera."""
     light = require_dome(lab.scene)
-    inside, design = surface.build_surface(light.surface), design_of(lab)
+    inside = surface.build_surface(light.surface)
+    design = design_of(lab)
     board = registry.board_of(light.layout, design.id)
     leds = LedMap(design.id, design.place[:, :3], *inside.as_ellipsoid(), board)
     return prior_of(lab, camera, leds)
@@ -122,13 +128,15 @@ def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
 
 def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     """The prior with these LEDs, their nominal brightness and code, and the lever that the tracker assumes."""
-    scene, design = lab.scene, design_of(lab)
+    scene = lab.scene
+    design = design_of(lab)
     order = np.argsort(design.id)
     levels = design.strength[order][np.searchsorted(design.id[order], leds.id)]
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = onboard_model.assumed_code(light, lab.camera.sources, leds) if light.led.code else None
-    floor_px, disk_m = scene.tracker.centroid_sigma_px, light.led.disk_diameter_m
+    floor_px = scene.tracker.centroid_sigma_px
+    disk_m = light.led.disk_diameter_m
     return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
 
 
@@ -145,16 +153,25 @@ def require_dome(scene: Scene) -> DomeConfig:
     return scene.light
 
 
-def survey_model(known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float) -> SurveyModel:
+def survey_model(
+    known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float
+) -> SurveyModel:
     """The model by which the estimator plans and predicts. known : before a survey, or from it"""
-    sigmas = uncertainty.led_sigma_m, uncertainty.lever_sigma_m, uncertainty.focal_sigma_px(known.camera)
+    sigmas = (
+        uncertainty.led_sigma_m,
+        uncertainty.lever_sigma_m,
+        uncertainty.focal_sigma_px(known.camera),
+    )
     return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
 
 
 def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
     """Lever and focal length before a survey, which enter its adjustment as measurements."""
-    camera, arm_m = prior.camera, prior.lever.camera_body_m
-    return Assumed(arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera))
+    camera = prior.camera
+    arm_m = prior.lever.camera_body_m
+    return Assumed(
+        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +191,9 @@ def image_sizes(prior: CalibrationPrior) -> ImageSizes:
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
     focal_length_m = scene.camera.focal_length_m * (1 + uncertainty.focal_error)
-    return with_onboard_model(scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_length_m, None)
+    return with_onboard_model(
+        scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_length_m, None
+    )
 
 
 def as_listed(scene: Scene) -> Scene:
@@ -189,8 +208,20 @@ def with_map(scene: Scene, path: str) -> Scene:
 
 
 def with_onboard_model(
-    scene: Scene, led_sigma_m: float, lever_sigma_m: float, focal_length_m: float | None, path: str | None
+    scene: Scene,
+    led_sigma_m: float,
+    lever_sigma_m: float,
+    focal_length_m: float | None,
+    path: str | None,
 ) -> Scene:
     """The scene whose tracker has survey errors of this size, and assumes this focal length or map file."""
-    scene = with_config(scene, "tracker.survey", led_sigma_m=led_sigma_m, lever_sigma_m=lever_sigma_m)
-    return with_config(scene, "tracker", assumed_focal_length_m=focal_length_m, assumed_camera_body_m=None, map=path)
+    scene = with_config(
+        scene, "tracker.survey", led_sigma_m=led_sigma_m, lever_sigma_m=lever_sigma_m
+    )
+    return with_config(
+        scene,
+        "tracker",
+        assumed_focal_length_m=focal_length_m,
+        assumed_camera_body_m=None,
+        map=path,
+    )

@@ -25,7 +25,12 @@ from skysim.experiments.dome_survey.folder.images import (
     frames_with_attitude,
     write_attitudes,
 )
-from skysim.experiments.dome_survey.frames import SurveyFrame, centroid_noise_px, imu_attitudes, take_frames
+from skysim.experiments.dome_survey.frames import (
+    SurveyFrame,
+    centroid_noise_px,
+    imu_attitudes,
+    take_frames,
+)
 from skysim.experiments.dome_survey.prior import (
     CalibrationPrior,
     SurveyUncertainty,
@@ -34,14 +39,19 @@ from skysim.experiments.dome_survey.prior import (
     survey_model,
     with_survey_errors,
 )
-from skysim.experiments.dome_survey.results.findings import accuracy_statistics, find_faults, predicted
+from skysim.experiments.dome_survey.results.findings import (
+    accuracy_statistics,
+    find_faults,
+    predicted,
+)
 from skysim.experiments.dome_survey.results.report import led_errors
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results.files import frames as frame_files
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab
 
-PLANNED, RANDOM = "plan", "random"
+PLANNED = "plan"
+RANDOM = "random"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +87,22 @@ def plan_survey(
 
 
 def make_plan(
-    lab: Lab, prior: CalibrationPrior, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str
+    lab: Lab,
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    count: int,
+    tilt_deg: float,
+    kind: str,
 ) -> Plan:
     """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
     random = stops.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
     model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
     margin_px = image_sizes(prior).margin_px
-    held = random if kind == RANDOM else stops.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
+    held = (
+        random
+        if kind == RANDOM
+        else stops.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
+    )
     return Plan(held, model.visible(held.inv(), margin_px), model, margin_px)
 
 
@@ -101,7 +120,9 @@ def simulated_frames(
     if folder is not None:
         names = [FRAME.format(n) for n in range(len(lab_from_body))]
         write_attitudes(files.make_folder(folder) / ATTITUDES, names, measured.inv())
-    for (frame, truth, lights), body_from_lab in zip(take_frames(lab, lab_from_body), measured, strict=True):
+    for (frame, truth, lights), body_from_lab in zip(
+        take_frames(lab, lab_from_body), measured, strict=True
+    ):
         if folder is not None:
             frame_files.write_fits(folder / FRAME.format(frame.index), frame, truth, lab.scene)
         yield SurveyFrame(lights, body_from_lab, frame.index)
@@ -133,7 +154,10 @@ def survey_images(
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)]
         more = frames_with_attitude(
-            named, model, replace(run.uncertainty_after, led_sigma_m=run.accuracy.led_rms_m), settings
+            named,
+            model,
+            replace(run.uncertainty_after, led_sigma_m=run.accuracy.led_rms_m),
+            settings,
         )
         if len(more) == len(frames):
             break
@@ -157,7 +181,9 @@ class Errors:
     false_alarms: int
 
 
-def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors | InputError]:
+def repeat_survey(
+    lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int
+) -> Iterator[Errors | InputError]:
     """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
 
     Of a survey that does not determine the dome, why.
@@ -176,7 +202,9 @@ def in_survey(lab: Lab, n: int) -> Lab:
     """The lab in another survey: other noise, and other errors of the list, the lever and the IMU."""
     scene = lab.scene
     again = lab.in_run(scene.seed + n)
-    return replace(again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n))
+    return replace(
+        again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n)
+    )
 
 
 def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Errors:
@@ -206,7 +234,8 @@ def comparison(plan: Plan, errors: list[Errors]) -> list[dict[str, Any]]:
 def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
     """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
     mean = float(squares.mean())
-    simulated, relative = float(np.sqrt(mean)), float(squares.std() / (2 * mean * np.sqrt(len(squares))))
+    simulated = float(np.sqrt(mean))
+    relative = float(squares.std() / (2 * mean * np.sqrt(len(squares))))
     ratio = simulated / sigma if sigma else None
     return {
         "what": what,

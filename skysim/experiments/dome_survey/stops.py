@@ -26,11 +26,17 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
     """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
-        raise InputError("survey.tilt_deg", f"{tilt_deg:g}", f"above 0, up to {stop_deg:g} degrees, the vehicle's stop")
+        raise InputError(
+            "survey.tilt_deg",
+            f"{tilt_deg:g}",
+            f"above 0, up to {stop_deg:g} degrees, the vehicle's stop",
+        )
     rng = random_stream(scene.seed, STREAM_KEYS[stream_name])
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, (2, count))
-    rotation_vectors = np.column_stack([tilt * np.cos(azimuth), tilt * np.sin(azimuth), np.zeros(count)])
+    rotation_vectors = np.column_stack(
+        [tilt * np.cos(azimuth), tilt * np.sin(azimuth), np.zeros(count)]
+    )
     return Rotation.from_rotvec(rotation_vectors) * Rotation.from_euler("z", yaw[:, None])
 
 
@@ -73,4 +79,6 @@ def from_angles(roll_pitch_yaw_deg: Floats) -> Rotation:
 
 def from_rows(rows: Sequence[Mapping[str, float]]) -> Rotation:
     """lab_from_body of rows with roll_deg, pitch_deg and yaw_deg."""
-    return from_angles(np.array([[row[f"{name}_deg"] for name in ("roll", "pitch", "yaw")] for row in rows]))
+    return from_angles(
+        np.array([[row[f"{name}_deg"] for name in ("roll", "pitch", "yaw")] for row in rows])
+    )

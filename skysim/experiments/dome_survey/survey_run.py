@@ -56,7 +56,9 @@ class SurveyRun:
         keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
         for frame, row in self.survey.outliers.tolist():
             keep[frame][row] = False
-        return [Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)]
+        return [
+            Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)
+        ]
 
     @property
     def seen(self) -> Mask:
@@ -84,7 +86,8 @@ class SurveyRun:
     @property
     def uncertainty_after(self) -> SurveyUncertainty:
         """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
-        accuracy, before = self.accuracy, self.uncertainty
+        accuracy = self.accuracy
+        before = self.uncertainty
         lever_m = float(np.sqrt(np.mean(accuracy.lever_sigma_m**2)))
         focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
         return replace(before, lever_sigma_m=lever_m, focal_error=focal)
@@ -106,7 +109,8 @@ def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
 
 def stray_lights(run: SurveyRun) -> list[StrayLight]:
     """Lights at rest in the lab that are no known LED."""
-    frame, xy_px = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    frame = [np.zeros(0, np.int64)]
+    xy_px = [np.zeros((0, 2))]
     for k, match in enumerate(run.inliers):
         if run.survey.tied[k]:
             lights = run.frames[k].lights.xy_px
@@ -119,10 +123,13 @@ def stray_lights(run: SurveyRun) -> list[StrayLight]:
 
 def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
     """(M, 2) pixels of all correspondences without outliers, and their residuals: found minus predicted."""
-    survey, found, residual = run.survey, [np.zeros((0, 2))], [np.zeros((0, 2))]
+    survey = run.survey
+    found = [np.zeros((0, 2))]
+    residual = [np.zeros((0, 2))]
     for frame, match, tied in zip(run.frames, run.inliers, survey.tied, strict=True):
         used = survey.surveyed[match.led] & tied
-        xy_px, place_m = frame.lights.xy_px[match.light[used]], survey.leds.position_m[match.led[used]]
+        xy_px = frame.lights.xy_px[match.light[used]]
+        place_m = survey.leds.position_m[match.led[used]]
         found.append(xy_px)
         residual.append(xy_px - project(frame.body_from_lab, place_m, survey.lever, survey.camera))
     return np.concatenate(found), np.concatenate(residual)
@@ -131,7 +138,9 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
 def light_table(run: SurveyRun) -> LightTable:
     """What the frames show of each LED, and what each must show."""
     index = np.array([frame.index for frame in run.frames])
-    return LightTable(light_at_unit_distance(run), run.held.shown(*margins(run)), run.prior.expected_light(index))
+    return LightTable(
+        light_at_unit_distance(run), run.held.shown(*margins(run)), run.prior.expected_light(index)
+    )
 
 
 def margins(run: SurveyRun) -> tuple[Floats, float]:

@@ -51,7 +51,9 @@ class RowResult(NamedTuple):
     cause: Cause | None = None
 
 
-def with_cause(cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any, *, note: str = "") -> RowResult:
+def with_cause(
+    cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any, *, note: str = ""
+) -> RowResult:
     """A statistic of our baseline's values, and of the values that were simulated with a cause too."""
     return RowResult(statistic(ours), note, Cause(cause, statistic(theirs)))
 
@@ -91,7 +93,8 @@ class Comparison(NamedTuple):
     @property
     def weakness(self) -> str:
         """Why the interval leaves the verdict open, or "": it is wider than the band, or contains a one-sided bound."""
-        cause, (low, high) = self.result.cause, self.row.band
+        cause = self.result.cause
+        (low, high) = self.row.band
         if self.verdict == "disagrees":
             return ""
         ours = cause.ours if cause and self.verdict == "explained" else self.result.ours
@@ -102,7 +105,8 @@ class Comparison(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON. A bound is published as [least, most], an open end as null."""
-        row, ours = self.row, self.result.ours
+        row = self.row
+        ours = self.result.ours
         bounds = [row.at_least, row.at_most]
         return {
             "id": self.id,
@@ -130,20 +134,25 @@ class Reproduction:
     def counts(self) -> dict[str, int]:
         """Number of rows by verdict, of rows with a derived number (`derived`), and of open verdicts (`open`)."""
         counts: dict[str, int] = {
-            verdict: sum(comparison.verdict == verdict for comparison in self.comparisons) for verdict in VERDICTS
+            verdict: sum(comparison.verdict == verdict for comparison in self.comparisons)
+            for verdict in VERDICTS
         }
         counts["derived"] = sum(comparison.row.derived for comparison in self.comparisons)
         counts["open"] = sum(bool(comparison.weakness) for comparison in self.comparisons)
         return counts
 
 
-def compare(id: str, published: Experiment, experiment: ExperimentResult, seconds: float) -> Reproduction:
+def compare(
+    id: str, published: Experiment, experiment: ExperimentResult, seconds: float
+) -> Reproduction:
     """Compare every published row with our result.
 
     Raises ValueError if the experiment has no result for a row, or a result for a row that is not published.
     """
     if unmatched := published.rows.keys() ^ experiment.results.keys():
-        raise ValueError(f"{id}: rows that are only published or only computed: {', '.join(sorted(unmatched))}")
+        raise ValueError(
+            f"{id}: rows that are only published or only computed: {', '.join(sorted(unmatched))}"
+        )
     comparisons = tuple(
         Comparison(id, row, experiment.results[key], verdict(row, experiment.results[key]))
         for key, row in published.rows.items()
@@ -155,7 +164,9 @@ def verdict(row: Row, result: RowResult) -> Verdict:
     """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
     if intervals_overlap(row, result.ours):
         return "agrees"
-    return "explained" if result.cause and intervals_overlap(row, result.cause.ours) else "disagrees"
+    return (
+        "explained" if result.cause and intervals_overlap(row, result.cause.ours) else "disagrees"
+    )
 
 
 def intervals_overlap(row: Row, ours: Summary) -> bool:
@@ -185,5 +196,9 @@ def format_published(row: Row) -> str:
     elif row.at_least is None:
         text = f"≤ {row.at_most:.6g}"
     else:
-        text = f"≥ {row.at_least:.6g}" if row.at_most is None else f"{row.at_least:.6g}..{row.at_most:.6g}"
+        text = (
+            f"≥ {row.at_least:.6g}"
+            if row.at_most is None
+            else f"{row.at_least:.6g}..{row.at_most:.6g}"
+        )
     return f"{text} ± {row.tolerance:.3g}" if row.tolerance else text

@@ -19,7 +19,9 @@ def confidence_interval(values: Sequence[float] | Floats) -> Summary:
     return prediction_interval(values, own_variance=0.0)
 
 
-def prediction_interval(values: Sequence[float] | Floats, count: int = 0, own_variance: float = 1.0) -> Summary:
+def prediction_interval(
+    values: Sequence[float] | Floats, count: int = 0, own_variance: float = 1.0
+) -> Summary:
     """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n), t for n - 1 degrees of freedom.
 
     For a published number that is itself a single draw.
@@ -27,8 +29,11 @@ def prediction_interval(values: Sequence[float] | Floats, count: int = 0, own_va
     own_variance : of the predicted draw in units of s^2, in place of 1
     """
     draws = np.asarray(values, float)
-    count, mean = count or len(draws), float(np.mean(draws))
-    half = float(stdtrit(count - 1, 0.975) * np.std(draws, ddof=1) * np.sqrt(own_variance + 1 / count))
+    count = count or len(draws)
+    mean = float(np.mean(draws))
+    half = float(
+        stdtrit(count - 1, 0.975) * np.std(draws, ddof=1) * np.sqrt(own_variance + 1 / count)
+    )
     return symmetric_interval(mean, half, count)
 
 
@@ -60,8 +65,12 @@ def widen_interval(summary: Summary) -> Summary:
     """
     if summary.trials < 2:
         return summary
-    factor = stdtrit(summary.trials - 1, 0.975) / 1.96 * np.sqrt(summary.trials / (summary.trials - 1))
-    low, high = (summary.value + factor * (end - summary.value) for end in (summary.low, summary.high))
+    factor = (
+        stdtrit(summary.trials - 1, 0.975) / 1.96 * np.sqrt(summary.trials / (summary.trials - 1))
+    )
+    low, high = (
+        summary.value + factor * (end - summary.value) for end in (summary.low, summary.high)
+    )
     return summary._replace(low=float(low), high=float(high))
 
 

@@ -8,7 +8,18 @@ from collections.abc import Sequence
 from skysim.experiments.papers import compare
 from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction
 from skysim.results.plots import png
-from skysim.results.report import Cell, Column, Figure, Items, Report, Section, Table, Text, Tone, Verdict
+from skysim.results.report import (
+    Cell,
+    Column,
+    Figure,
+    Items,
+    Report,
+    Section,
+    Table,
+    Text,
+    Tone,
+    Verdict,
+)
 
 KINDS = (*VERDICTS, "derived", "open")
 TONES: dict[compare.Verdict, Tone] = {"agrees": "good", "explained": "warning", "disagrees": "bad"}
@@ -27,7 +38,9 @@ MEANINGS = (
 )
 
 
-def papers_report(reproductions: Sequence[Reproduction], ids: Sequence[str], quick: bool, seed: int) -> Report:
+def papers_report(
+    reproductions: Sequence[Reproduction], ids: Sequence[str], quick: bool, seed: int
+) -> Report:
     """The report of some experiments. ids, quick, seed : as the command names them"""
     papers = dict.fromkeys(one.published.paper for one in reproductions)
     blocks = [
@@ -35,10 +48,15 @@ def papers_report(reproductions: Sequence[Reproduction], ids: Sequence[str], qui
         Text(INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")),
         Items(MEANINGS),
         Section("Experiments", [contents(reproductions)]),
-        *(Section(paper, [section(one) for one in reproductions if one.published.paper == paper]) for paper in papers),
+        *(
+            Section(paper, [section(one) for one in reproductions if one.published.paper == paper])
+            for paper in papers
+        ),
     ]
     options = ["--quick"] * quick + (["--seed", str(seed)] if seed != 1 else [])
-    return Report("The papers, reproduced", blocks, shlex.join(["skysim", "reproduce", *ids, *options]))
+    return Report(
+        "The papers, reproduced", blocks, shlex.join(["skysim", "reproduce", *ids, *options])
+    )
 
 
 def total_counts(reproductions: Sequence[Reproduction]) -> dict[str, int]:
@@ -53,7 +71,9 @@ def verdict(reproductions: Sequence[Reproduction]) -> Verdict:
         sum(counts[kind] for kind in VERDICTS), **counts
     )
     tone: Tone = "bad" if counts["disagrees"] else "good"
-    return Verdict(f"{text}; {counts['derived']} are derived, {counts['open']} verdicts are open.", tone)
+    return Verdict(
+        f"{text}; {counts['derived']} are derived, {counts['open']} verdicts are open.", tone
+    )
 
 
 def contents(reproductions: Sequence[Reproduction]) -> Table:
@@ -62,10 +82,16 @@ def contents(reproductions: Sequence[Reproduction]) -> Table:
     rows = []
     for one in reproductions:
         counts = [
-            Cell(str(count), "bad" if kind == "disagrees" and count else "") for kind, count in one.counts.items()
+            Cell(str(count), "bad" if kind == "disagrees" and count else "")
+            for kind, count in one.counts.items()
         ]
         rows.append([Cell(one.id, link=f"#{one.id}"), one.published.title, *counts, one.seconds])
-    total = ["all", "", *total_counts(reproductions).values(), sum(one.seconds for one in reproductions)]
+    total = [
+        "all",
+        "",
+        *total_counts(reproductions).values(),
+        sum(one.seconds for one in reproductions),
+    ]
     return Table([*columns, Column("time", "s", ".0f")], [*rows, total])
 
 

@@ -7,7 +7,12 @@ from collections.abc import Callable
 
 from skysim.core.errors import InputError
 from skysim.experiments.papers.afit import attitude, bump, led_tests, surface, test1, test2, test3
-from skysim.experiments.papers.compare import ExperimentOptions, ExperimentResult, Reproduction, compare
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    Reproduction,
+    compare,
+)
 from skysim.experiments.papers.other_domes import apl, nps, oled
 from skysim.experiments.papers.ptase import ground, monte_carlo
 from skysim.experiments.papers.published import experiments

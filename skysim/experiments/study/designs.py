@@ -49,11 +49,19 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     if sampled != (design.points is not None):
         allowed = "a number of points" if sampled else "none (the levels define the points)"
         raise InputError("design.points", f"{design.points} for {design.kind}", allowed)
-    if design.kind in ("sobol", "saltelli") and design.points is not None and design.points & (design.points - 1):
+    if (
+        design.kind in ("sobol", "saltelli")
+        and design.points is not None
+        and design.points & (design.points - 1)
+    ):
         raise InputError("design.points", f"{design.points} for {design.kind}", "a power of two")
     for name, factor in factors.items():
         if not sampled and not factor.options():
-            raise InputError(f"factors.{name}", "a distribution has no levels", "design.kind lhs, sobol, saltelli")
+            raise InputError(
+                f"factors.{name}",
+                "a distribution has no levels",
+                "design.kind lhs, sobol, saltelli",
+            )
     return list(DESIGNS[design.kind](design, factors, seed))
 
 
@@ -83,7 +91,9 @@ def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point
 def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
     """The points at (P, D) coordinates in the unit cube."""
     for row in coordinates.tolist():
-        yield make_point({name: factors[name].value_at(u) for name, u in zip(factors, row, strict=True)})
+        yield make_point(
+            {name: factors[name].value_at(u) for name, u in zip(factors, row, strict=True)}
+        )
 
 
 def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
@@ -99,9 +109,11 @@ def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
 
     A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
     """
-    count, width = design.points or 0, len(factors)
+    count = design.points or 0
+    width = len(factors)
     coordinates = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
-    a, b = coordinates[:, :width], coordinates[:, width:]
+    a = coordinates[:, :width]
+    b = coordinates[:, width:]
     yield from points_at(factors, a)
     yield from points_at(factors, b)
     for n in range(width):

@@ -30,7 +30,9 @@ def split_quantity(value: Value) -> tuple[float, str]:
         return float(value), ""
     match = QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:
-        raise InputError("", f"{value!r} is not a number", 'a number, or one with its unit such as "48 in"')
+        raise InputError(
+            "", f"{value!r} is not a number", 'a number, or one with its unit such as "48 in"'
+        )
     return float(match[1]), match[2] or ""
 
 
@@ -102,7 +104,9 @@ class Range(KeyedFactor):
     def check_bounds(self) -> Range:
         (low, unit), (high, other) = split_quantity(self.from_), split_quantity(self.to)
         if unit != other:
-            raise InputError("", f"from {self.from_!r} and to {self.to!r} have different units", "one unit")
+            raise InputError(
+                "", f"from {self.from_!r} and to {self.to!r} have different units", "one unit"
+            )
         if not low < high:
             raise InputError("", f"from is {self.from_!r}", f"below to, {self.to!r}")
         if self.scale == "log" and low <= 0:
@@ -143,7 +147,9 @@ class Distribution(KeyedFactor):
         provided = [name for name in ALL_PARAMETERS if getattr(self, name) is not None]
         if sorted(provided) != sorted(required):
             raise InputError(
-                "", f"{self.distribution}: parameters {', '.join(provided) or 'none'}", ", ".join(required)
+                "",
+                f"{self.distribution}: parameters {', '.join(provided) or 'none'}",
+                ", ".join(required),
             )
         self.parameters()
         return self
@@ -151,13 +157,19 @@ class Distribution(KeyedFactor):
     def parameters(self) -> tuple[list[float], str]:
         """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""
         quantities = [split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]]
-        units = {unit for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)}
+        units = {
+            unit for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)
+        }
         if len(units) > 1:
-            raise InputError("", f"different units {', '.join(repr(unit) for unit in sorted(units))}", "one unit")
+            raise InputError(
+                "", f"different units {', '.join(repr(unit) for unit in sorted(units))}", "one unit"
+            )
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
             raise InputError("", f"sigma is {self.sigma!r}", "above 0")
-        ascending = [name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")]
+        ascending = [
+            name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")
+        ]
         values = [parameters[PARAMETERS[self.distribution].index(name)] for name in ascending]
         if values and not (values == sorted(values) and values[0] < values[-1]):
             raise InputError("", f"{', '.join(ascending)} are not in ascending order")
@@ -185,7 +197,9 @@ PARAMETERS = {
 QUANTILES: dict[str, Callable[..., Any]] = {
     "normal": lambda u, mean, sigma: scipy.stats.norm.ppf(u, mean, sigma),
     "lognormal": lambda u, median, sigma: median * np.exp(sigma * scipy.stats.norm.ppf(u)),
-    "triangular": lambda u, low, mode, high: scipy.stats.triang.ppf(u, (mode - low) / (high - low), low, high - low),
+    "triangular": lambda u, low, mode, high: scipy.stats.triang.ppf(
+        u, (mode - low) / (high - low), low, high - low
+    ),
     "truncated_normal": lambda u, mean, sigma, low, high: scipy.stats.truncnorm.ppf(
         u, (low - mean) / sigma, (high - mean) / sigma, mean, sigma
     ),

@@ -41,8 +41,12 @@ from skysim.tracking.external.interface import OWN, TRACKERS
 SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
 FLIGHT_QUANTITIES = (
-    *("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"),
-    *("pointing_arcsec", "pointing_worst_arcsec"),
+    "availability",
+    "filter_arcsec",
+    "filter_worst_arcsec",
+    "drift_arcsec",
+    "pointing_arcsec",
+    "pointing_worst_arcsec",
 )
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
@@ -52,7 +56,9 @@ MEASURED_BY: dict[str, tuple[str, ...]] = {
 
 
 def load(
-    name: str | Path, overrides: Mapping[str, str] | None = None, programs: Mapping[str, str] | None = None
+    name: str | Path,
+    overrides: Mapping[str, str] | None = None,
+    programs: Mapping[str, str] | None = None,
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
@@ -111,10 +117,14 @@ def check(plan: Plan, to_run: bool) -> None:
     if study.optimize:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
-        raise InputError("budget.trials", study.budget.trials, f"at least {plan.trials}, the trials of the study")
+        raise InputError(
+            "budget.trials", study.budget.trials, f"at least {plan.trials}, the trials of the study"
+        )
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
-            raise InputError(f"factors.{name}", "the name is that of a column of the trials", "another name")
+            raise InputError(
+                f"factors.{name}", "the name is that of a column of the trials", "another name"
+            )
     check_hardware(study)
     points = []
     for name, level, own, settings in each_level(study.factors):
@@ -135,14 +145,17 @@ def check_figures(plan: Plan) -> None:
     from skysim.experiments.study.analysis import axes, thresholds
     from skysim.experiments.study.analysis.table import PointRow
 
-    study, rows = plan.study, [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
+    study = plan.study
+    rows = [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
     for where, one in named_sections(study):
         for key, factor in one.axes.items():
             if factor is not None and factor not in study.factors:
                 raise InputError(f"{where}.{key}", *unknown_name("factor", factor, study.factors))
         metrics.response(one.response, where)
         if isinstance(one, Map) and study.trial.kind == "flight":
-            raise InputError(f"{where}.kind", "a map of flights, which have no single attitude", "curve, heat")
+            raise InputError(
+                f"{where}.kind", "a map of flights, which have no single attitude", "curve, heat"
+            )
         if isinstance(one, Threshold):
             thresholds.check(one, where, study, rows)
         if plan.points:
@@ -164,10 +177,14 @@ def check_hardware(study: Study) -> None:
     """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
     for n, key in enumerate(study.hardware):
         if key.startswith(TRIAL):
-            raise InputError(f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware")
+            raise InputError(
+                f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware"
+            )
         for name, factor in study.factors.items():
             if key in dict(factor.value_at(0.5)[1]):
-                raise InputError(f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two")
+                raise InputError(
+                    f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two"
+                )
     for name, factor in study.factors.items():
         keys = [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
         if keys and all(HARDWARE_SEED.search(key) for key in keys):
@@ -184,7 +201,9 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
         raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
     if scene.tracker.decoder and isinstance(trial, FrameTrial):
-        raise InputError("trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight")
+        raise InputError(
+            "trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight"
+        )
     if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
         raise InputError(
             "hardware",
@@ -198,21 +217,34 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         raise InputError("trial.near.body", "zenith requires site.longitude_deg in the scene")
     if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
         first, last = BODIES_YEARS
-        raise InputError("trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none")
+        raise InputError(
+            "trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none"
+        )
     if to_run:
         tracker = scene.tracker.name
         TRACKERS.check_name(tracker, plan.spec.programs)
         if scene.motion.control:
             CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
         if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
-            raise InputError("tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind")
+            raise InputError(
+                "tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind"
+            )
 
 
 def has_survey_errors(scene: Scene) -> bool:
     """Whether the survey of a scene has errors that `tracker.survey.seed` draws."""
-    survey, dome = scene.tracker.survey, scene.light if isinstance(scene.light, DomeConfig) else None
+    survey = scene.tracker.survey
+    dome = scene.light if isinstance(scene.light, DomeConfig) else None
     error_m = dome.surface.error_m if dome else 0.0
-    return any((survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument, error_m))
+    return any(
+        (
+            survey.led_sigma_m,
+            survey.lever_sigma_m,
+            survey.focal_length_sigma_m,
+            survey.instrument,
+            error_m,
+        )
+    )
 
 
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
@@ -221,7 +253,9 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
     seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
     seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
-    varied = {*study.hardware, *study.set}.union(*(factor.value_at(0.5)[1] for factor in study.factors.values()))
+    varied = {*study.hardware, *study.set}.union(
+        *(factor.value_at(0.5)[1] for factor in study.factors.values())
+    )
     return [seed for seed in seeds if seed not in varied]
 
 
@@ -229,7 +263,11 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
     """A level's error with the factor that sets the key at fault, and its value; one of `hardware` unchanged."""
     if error.key == "hardware":
         return error
-    owners = [other for other, factor in study.factors.items() if error.key in dict(factor.value_at(0.5)[1])]
+    owners = [
+        other
+        for other, factor in study.factors.items()
+        if error.key in dict(factor.value_at(0.5)[1])
+    ]
     owner = name if name in owners or not owners else owners[0]
     value = level if owner == name else study.factors[owner].value_at(0.5)[0]
     return error.within(f"{value!r}").within(f"factors.{owner}")
@@ -242,10 +280,14 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
     for name, key in where.items():
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):
-            raise InputError(key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}")
+            raise InputError(
+                key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}"
+            )
         if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
             raise InputError(
-                key, "no tracker of this study reports ambiguity", "under a dome, with the default identifier"
+                key,
+                "no tracker of this study reports ambiguity",
+                "under a dome, with the default identifier",
             )
 
 
@@ -253,24 +295,35 @@ def may_report_ambiguity(scene: Scene) -> bool:
     """Whether the tracker of a scene can refuse a frame as ambiguous."""
     from estimator.trackers.dome_tracker import SETTINGS
 
-    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (None, SETTINGS.identifier)
+    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (
+        None,
+        SETTINGS.identifier,
+    )
     return own or scene.tracker.name != OWN
 
 
 def check_random_start(scene: Scene, start: AttitudeRange) -> None:
     """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
     if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
-        where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+        where = (
+            "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+        )
         raise InputError("trial.start", f"random with {where}", "scene")
     dome = isinstance(scene.light, DomeConfig)
     for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
         if unused in start.model_fields_set:
-            raise InputError(f"trial.start.{unused}", f"has no effect with light of kind {scene.light.kind}", "none")
+            raise InputError(
+                f"trial.start.{unused}",
+                f"has no effect with light of kind {scene.light.kind}",
+                "none",
+            )
     greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
     vehicle = scene.vehicle
     if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(
-            "trial.start.tilt_deg", f"{greatest_deg:g}", f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+            "trial.start.tilt_deg",
+            f"{greatest_deg:g}",
+            f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}",
         )
 
 
@@ -278,6 +331,8 @@ def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Sett
     """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
     middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():
-        others = make_point({other: chosen for other, chosen in middle.items() if other != name}).settings
+        others = make_point(
+            {other: chosen for other, chosen in middle.items() if other != name}
+        ).settings
         for level, settings in factor.options() or [middle[name]]:
             yield name, level, settings, others | settings

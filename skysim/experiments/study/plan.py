@@ -11,7 +11,15 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from skysim.core.errors import InputError
 from skysim.core.io import yaml_reader
@@ -31,7 +39,9 @@ Declination = Annotated[Number, Field(ge=-90, le=90)]
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 Angle = Annotated[Number, Field(ge=0, le=180)]
-BodyName = Literal["zenith", "sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"]
+BodyName = Literal[
+    "zenith", "sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"
+]
 
 
 def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
@@ -95,7 +105,8 @@ def axis_tag(value: Any) -> str:
 
 
 RateAxis = Annotated[
-    Annotated[Literal["perpendicular", "boresight"], Tag("name")] | Annotated[AxisConfig, Tag("AxisConfig")],
+    Annotated[Literal["perpendicular", "boresight"], Tag("name")]
+    | Annotated[AxisConfig, Tag("AxisConfig")],
     Discriminator(axis_tag),
 ]
 
@@ -160,7 +171,9 @@ class FlightTrial(ConfigModel):
     kind: Literal["flight"]
     start: Annotated[
         AttitudeRange | None,
-        BeforeValidator(expand_start, json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None),
+        BeforeValidator(
+            expand_start, json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None
+        ),
     ] = None
     settle_s: Annotated[Time, Field(ge=0)] = 0.0
 
@@ -306,7 +319,9 @@ class Search(ConfigModel):
     @property
     def responses(self) -> list[str]:
         """The responses of all objectives and constraints, each once."""
-        names = [one.response for one in self.objectives] + [one.response for one in self.constraints]
+        names = [one.response for one in self.objectives] + [
+            one.response for one in self.constraints
+        ]
         return list(dict.fromkeys(names))
 
 
@@ -326,7 +341,9 @@ class Study(ConfigModel):
     seed: Annotated[int, Field(ge=0)]
     set: Settings = Field(default_factory=dict)
     trial: Trial
-    factors: Annotated[dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor], Field(min_length=1)]
+    factors: Annotated[
+        dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor], Field(min_length=1)
+    ]
     design: Design = Design()
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()
@@ -367,7 +384,9 @@ class TrialSpec:
         """
         if not self.hardware:
             return settings
-        seeds = np.random.SeedSequence(self.seed, spawn_key=(HARDWARE, replicate, 0)).generate_state(len(self.hardware))
+        seeds = np.random.SeedSequence(
+            self.seed, spawn_key=(HARDWARE, replicate, 0)
+        ).generate_state(len(self.hardware))
         return settings | dict(zip(self.hardware, seeds.tolist(), strict=True))
 
 
@@ -398,7 +417,18 @@ class Plan:
     def digest(self) -> str:
         """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
         tree = self.study.model_dump(mode="json", by_alias=True)
-        keys = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "hardware", "optimize")
+        keys = (
+            "scene",
+            "seed",
+            "set",
+            "trial",
+            "factors",
+            "design",
+            "replicates",
+            "paired",
+            "hardware",
+            "optimize",
+        )
         parts = {"prices": self.prices.parts} if self.prices else {}
         return digest({key: tree[key] for key in keys} | parts)
 
@@ -418,9 +448,20 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     chosen = [] if study.optimize else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
-    spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, study.hardware, dict(programs))
+    spec = TrialSpec(
+        study.scene,
+        folder,
+        study.seed,
+        study.set,
+        trial,
+        study.paired,
+        study.hardware,
+        dict(programs),
+    )
     parts = study.optimize.cost.parts if study.optimize else None
-    return Plan(path, study, spec, chosen, prices_of(parts, path.resolve().parent) if parts else None)
+    return Plan(
+        path, study, spec, chosen, prices_of(parts, path.resolve().parent) if parts else None
+    )
 
 
 def prices_of(parts: str, folder: Path) -> Prices:
@@ -433,12 +474,15 @@ def prices_of(parts: str, folder: Path) -> Prices:
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
-    trial, values = resolve_trial(spec, settings), spec.base | settings
+    trial = resolve_trial(spec, settings)
+    values = spec.base | settings
     name = str(values.pop("scene", spec.scene))
     local = Path(spec.folder) / name
     path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
     overrides = {key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)}
-    return load_scene(path, overrides, refuses_unused=False), trial  # `unused_options` refuses, for the whole study
+    return load_scene(
+        path, overrides, refuses_unused=False
+    ), trial  # `unused_options` refuses, for the whole study
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:

@@ -29,10 +29,23 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.scene.unused import Rule
 from skysim.tracking import settings
 
-STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro
+STREAK_ALGORITHMS = (
+    "default",
+    "streak",
+)  # detectors and centroiders that use the streak measured by a gyro
 DYNAMICS = (
-    *("motion", "filter", "heads", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
-    *("vehicle.disturbances", "vehicle.mass", "vehicle.inertia", "vehicle.center_of_mass", "vehicle.torque_limit"),
+    "motion",
+    "filter",
+    "heads",
+    "vehicle.imu",
+    "vehicle.wheels",
+    "vehicle.fans",
+    "vehicle.drag",
+    "vehicle.disturbances",
+    "vehicle.mass",
+    "vehicle.inertia",
+    "vehicle.center_of_mass",
+    "vehicle.torque_limit",
     "vehicle.tilt_stop_deg",
 )
 
@@ -46,10 +59,29 @@ def on_ground(scene: Scene, trial: Trial) -> bool:
 DETECTOR = tuple(
     f"camera.detector.{key}"
     for key in (
-        *("hardware_seed", "prnu", "dark_e_s", "dark_temperature_c", "dark_doubling_c", "temperature_c", "dsnu"),
-        *("hot_pixels", "hot_e_s", "particles", "full_well_e", "blooming", "anti_blooming", "cti_parallel"),
-        *("cti_serial", "read_noise_e", "reset_noise_e", "column_offset_e", "gain_e_dn", "offset_dn", "nonlinearity"),
-        *("bits", "noise"),
+        "hardware_seed",
+        "prnu",
+        "dark_e_s",
+        "dark_temperature_c",
+        "dark_doubling_c",
+        "temperature_c",
+        "dsnu",
+        "hot_pixels",
+        "hot_e_s",
+        "particles",
+        "full_well_e",
+        "blooming",
+        "anti_blooming",
+        "cti_parallel",
+        "cti_serial",
+        "read_noise_e",
+        "reset_noise_e",
+        "column_offset_e",
+        "gain_e_dn",
+        "offset_dn",
+        "nonlinearity",
+        "bits",
+        "noise",
     )
 )
 
@@ -100,7 +132,9 @@ RULES = (
         "the boresight is drawn from the sphere",
         "trial.dec_deg, or a scene with light of kind dome",
     ),
-    Rule(("trial.dec_deg", "trial.near"), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"),
+    Rule(
+        ("trial.dec_deg", "trial.near"), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"
+    ),
     Rule(
         ("trial.dec_deg",),
         lambda scene, trial: getattr(trial, "near", None) is not None,
@@ -144,8 +178,17 @@ RULES = (
     ),
     Rule(
         (
-            *("background", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
-            *("tracker.threshold_sigma", "tracker.min_area_px", "light.reflection", "camera.ghosts", "camera.glare"),
+            "background",
+            "camera.psf",
+            "camera.shutter",
+            *DETECTOR,
+            "tracker.detector",
+            "tracker.centroider",
+            "tracker.threshold_sigma",
+            "tracker.min_area_px",
+            "light.reflection",
+            "camera.ghosts",
+            "camera.glare",
             "camera.chromatic.focus",
         ),
         lambda scene, trial: isinstance(trial, CentroidTrial),
@@ -154,8 +197,15 @@ RULES = (
     ),
     Rule(
         (
-            *("exposure.time", "exposure.first", "exposure.trigger_jitter", "camera.transmission", "camera.f_number"),
-            *("light.led.intensity", "light.led.radiant_intensity", "light.led.pwm_period", "light.led.clock"),
+            "exposure.time",
+            "exposure.first",
+            "exposure.trigger_jitter",
+            "camera.transmission",
+            "camera.f_number",
+            "light.led.intensity",
+            "light.led.radiant_intensity",
+            "light.led.pwm_period",
+            "light.led.clock",
         ),
         lambda scene, trial: isinstance(trial, CentroidTrial) and scene.tracker.decoder is None,
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
@@ -203,7 +253,9 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
     resolve : makes the scene and the trial from the settings of all factors
     """
     written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
-    faults: dict[tuple[str, str, str], Fault | None] = {}  # by factor and level ("" for `set` and `trial`), and key
+    faults: dict[
+        tuple[str, str, str], Fault | None
+    ] = {}  # by factor and level ("" for `set` and `trial`), and key
     for point in points:
         keys = [("", "", key) for key in written if key not in point.settings]
         keys += [(point.factor, repr(point.level), key) for key in point.own]
@@ -226,17 +278,24 @@ def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -
     scene : with the overrides
     """
     keys = {key: unused.override_keys({key: text}) for key, text in overrides.items()}
-    return {key for key, below in keys.items() if all(unused.find(RULES, [one], scene, scene, trial) for one in below)}
+    return {
+        key
+        for key, below in keys.items()
+        if all(unused.find(RULES, [one], scene, scene, trial) for one in below)
+    }
 
 
 def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
     """The first key, of those that a key of the study sets at a point, that has no effect."""
-    scene, trial = point.scene, point.trial
+    scene = point.scene
+    trial = point.trial
     if key.startswith(TRIAL):
         found = unused.find(RULES, [key], TrialSection.model_construct(trial=trial), scene, trial)
     else:
         keys = list(unused.set_keys({key: (plan.spec.base | point.settings)[key]}))
-        found = unused.find(unused.RULES, keys, scene) or unused.find(RULES, keys, scene, scene, trial)
+        found = unused.find(unused.RULES, keys, scene) or unused.find(
+            RULES, keys, scene, scene, trial
+        )
     return Fault(*found, point) if found else None
 
 
@@ -248,6 +307,9 @@ def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Res
         for option in factor.options():
             everything = make_point(middle | {name: option}).settings | point.own
             scene, trial = resolve(everything)
-            if find(key, plan, point._replace(settings=everything, scene=scene, trial=trial)) is None:
+            if (
+                find(key, plan, point._replace(settings=everything, scene=scene, trial=trial))
+                is None
+            ):
                 return True
     return False

@@ -14,7 +14,9 @@ from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import BODY, CAMERA, ICRF, LAB
 
 MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard
-ORIGINATOR = "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
+ORIGINATOR = (
+    "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
+)
 MEANING = {
     ICRF: "axes of the ICRS",
     LAB: "the laboratory: origin in the bearing's center, z up; known to this file's users only",
@@ -24,7 +26,11 @@ MEANING = {
 
 
 def message(
-    name: str, notes: Sequence[str], frames: tuple[str, str], utc: Sequence[datetime.datetime], a_from_b: Rotation
+    name: str,
+    notes: Sequence[str],
+    frames: tuple[str, str],
+    utc: Sequence[datetime.datetime],
+    a_from_b: Rotation,
 ) -> str:
     """The text of an AEM file with one segment of type QUATERNION.
 
@@ -42,7 +48,9 @@ def message(
         raise InputError(name, "no attitude to write")
     late = [n for n in range(1, len(utc)) if utc[n] <= utc[n - 1]]
     if late:
-        raise InputError(name, f"epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}")
+        raise InputError(
+            name, f"epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}"
+        )
     head = {
         "CCSDS_AEM_VERS": "2.0",
         "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
@@ -67,7 +75,10 @@ def message(
         *(f"{key} = {value}" for key, value in meta.items()),
         "META_STOP",
         "DATA_START",
-        *(f"{epoch(when)} " + " ".join(f"{component:.15f}" for component in xyzw) for when, xyzw in rows),
+        *(
+            f"{epoch(when)} " + " ".join(f"{component:.15f}" for component in xyzw)
+            for when, xyzw in rows
+        ),
         "DATA_STOP",
     ]
     return "".join(f"{ascii_line(line)}\n" for line in lines)

@@ -28,13 +28,27 @@ SAMPLED_FRAMES = 9  # about this many frames determine the black and white level
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
 PROBE_BYTES = 1 << 20
 
-Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]  # progress bar over items: items, count, label
+Bar = Callable[
+    [Iterable[Any], int, str], Iterator[Any]
+]  # progress bar over items: items, count, label
 
 # Unit by the ending of a column's name; the longest matching ending applies.
 UNITS = {
-    **{"_deg_s": "deg/s", "_deg_h": "deg/h", "_deg": "deg", "_rad_s": "rad/s", "_rad": "rad", "_arcsec": "arcsec"},
-    **{"_px": "px", "_ms": "ms", "_m_s": "m/s", "_s": "s", "_rpm": "rpm", "_nms": "N m s", "_nm": "N m"},
-    **{"_e": "electron", "electrons": "electron"},
+    "_deg_s": "deg/s",
+    "_deg_h": "deg/h",
+    "_deg": "deg",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_arcsec": "arcsec",
+    "_px": "px",
+    "_ms": "ms",
+    "_m_s": "m/s",
+    "_s": "s",
+    "_rpm": "rpm",
+    "_nms": "N m s",
+    "_nm": "N m",
+    "_e": "electron",
+    "electrons": "electron",
 }
 
 
@@ -47,12 +61,20 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """
     stars = run.is_celestial
     frames = (ccsds_aem.ICRF, ccsds_aem.CAMERA) if stars else (ccsds_aem.LAB, ccsds_aem.BODY)
-    true = [(truth.frame, truth.mid_utc, truth.t_mid_s, attitude(truth, stars)) for truth in truths(run, bar)]
-    name, seed = str(run.meta["scene"]), run.meta["seed"]
+    true = [
+        (truth.frame, truth.mid_utc, truth.t_mid_s, attitude(truth, stars))
+        for truth in truths(run, bar)
+    ]
+    name = str(run.meta["scene"])
+    seed = run.meta["seed"]
     epochs = {frame: utc for frame, utc, _, _ in true}
 
     def write(
-        stem: str, content: str, utc: list[datetime.datetime], a_from_b: Rotation, between: tuple[str, str] = frames
+        stem: str,
+        content: str,
+        utc: list[datetime.datetime],
+        a_from_b: Rotation,
+        between: tuple[str, str] = frames,
     ) -> Path:
         comments = [f"{content} of skysim, scene {name}, seed {seed}"]
         path = out / f"{stem}.aem"
@@ -65,9 +87,15 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
         if unknown:
-            raise InputError(run.folder / "solutions.ecsv", f"unknown frame {unknown[0]}", "frames with truth")
+            raise InputError(
+                run.folder / "solutions.ecsv", f"unknown frame {unknown[0]}", "frames with truth"
+            )
         utc = [epochs[frame] for frame in solved[0].tolist()]
-        written.append(write("solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]))
+        written.append(
+            write(
+                "solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]
+            )
+        )
     motion = run.motion()
     if motion is not None:
         start = true[0][1] - datetime.timedelta(seconds=true[0][2])
@@ -98,12 +126,21 @@ def truth_table(run: Recording, bar: Bar) -> Any:
 
 
 def truth_row(truth: FrameTruth) -> dict[str, Any]:
-    row: dict[str, Any] = {"frame": truth.frame, "mid_utc": truth.mid_utc.isoformat(timespec="microseconds")}
+    row: dict[str, Any] = {
+        "frame": truth.frame,
+        "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
+    }
     row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
     for name in ("lab_from_body", "cam_from_lab"):
         quaternion = getattr(truth, f"{name}_xyzw")
-        row |= {f"{name}_q{end}": float(component) for end, component in zip("xyzw", quaternion, strict=True)}
-    return row | {f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)}
+        row |= {
+            f"{name}_q{end}": float(component)
+            for end, component in zip("xyzw", quaternion, strict=True)
+        }
+    return row | {
+        f"rate_cam_{end}_rad_s": float(rate)
+        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    }
 
 
 def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
@@ -122,7 +159,11 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
     except ImportError:
         raise InputError("export.formats", f"parquet {EXTRA}") from None
     tables = {"truth": truth_table(run, bar)}
-    tables |= {name: table for name in ("solutions", "telemetry", "imu") if (table := run.table(name)) is not None}
+    tables |= {
+        name: table
+        for name in ("solutions", "telemetry", "imu")
+        if (table := run.table(name)) is not None
+    }
     written = []
     for name, table in tables.items():
         path = out / f"{name}.parquet"
@@ -143,7 +184,10 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
 
     tables = map(frame_table, truths(run, bar))
     batch = [next(tables)]
-    with files.atomic_file(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, batch[0].schema) as writer:
+    with (
+        files.atomic_file(path) as temporary,
+        pyarrow.parquet.ParquetWriter(temporary, batch[0].schema) as writer,
+    ):
         for table in tables:
             if sum(len(part) for part in batch) >= BATCH_ROWS:
                 writer.write_table(pyarrow.concat_tables(batch))
@@ -157,11 +201,14 @@ def to_arrow(table: Any, run: Recording) -> Any:
     """Convert an astropy table to an Arrow table; masked values become null. Units and run metadata are kept."""
     import pyarrow
 
-    fields, columns = [], []
+    fields = []
+    columns = []
     for name in table.colnames:
         values = pyarrow.array(
             table[name].tolist(),
-            type=pyarrow.from_numpy_dtype(table[name].dtype) if table[name].dtype.kind in "biuf" else pyarrow.string(),
+            type=pyarrow.from_numpy_dtype(table[name].dtype)
+            if table[name].dtype.kind in "biuf"
+            else pyarrow.string(),
         )
         unit = unit_of(name)
         fields.append(pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None))
@@ -194,11 +241,14 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
         import zarr
     except ImportError:
         raise InputError("export.formats", f"zarr {EXTRA}") from None
-    path, count = out / frame_files.ZARR, len(run.stems)
+    path = out / frame_files.ZARR
+    count = len(run.stems)
     frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])
     with files.atomic_folder(path) as temporary:
-        group = zarr.create_group(temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"})
+        group = zarr.create_group(
+            temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"}
+        )
         frames = group.create_array(
             "frames",
             shape=(count, *first.shape),
@@ -212,7 +262,10 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
         for name, values, axis, unit in frame_arrays(frame_truths):
             dimensions = ("frame", axis) if axis else ("frame",)
             group.create_array(
-                name, data=values, dimension_names=dimensions, attributes={"units": unit} if unit else {}
+                name,
+                data=values,
+                dimension_names=dimensions,
+                attributes={"units": unit} if unit else {},
             )
     return [path]
 
@@ -221,10 +274,18 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
     yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
-    yield ("mid_utc", np.array(utc, dtype="datetime64[us]").astype(np.int64), "", "microseconds since 1970-01-01")
+    yield (
+        "mid_utc",
+        np.array(utc, dtype="datetime64[us]").astype(np.int64),
+        "",
+        "microseconds since 1970-01-01",
+    )
     for name, axis in (
-        *(("t_mid_s", ""), ("exposure_s", ""), ("rate_cam_rad_s", "xyz")),
-        *(("lab_from_body_xyzw", "xyzw"), ("cam_from_lab_xyzw", "xyzw")),
+        ("t_mid_s", ""),
+        ("exposure_s", ""),
+        ("rate_cam_rad_s", "xyz"),
+        ("lab_from_body_xyzw", "xyzw"),
+        ("cam_from_lab_xyzw", "xyzw"),
     ):
         yield name, np.array([getattr(truth, name) for truth in frame_truths]), axis, unit_of(name)
 
@@ -246,18 +307,24 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
     All frames share the same black and white levels. A side with an odd number of pixels is cropped by one pixel.
     Raises InputError if OpenCV cannot write the video, and OSError if the disk is full.
     """
-    path, first = out / "frames.mp4", run.image(run.stems[0])
+    path = out / "frames.mp4"
+    first = run.image(run.stems[0])
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
     rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([stretch.display_levels(run.image(stem)) for stem in sampled], axis=0)
     height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
     with files.atomic_file(path) as temporary:
-        film = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*FOURCC), rate_hz, (width, height), False)
+        film = cv2.VideoWriter(
+            str(temporary), cv2.VideoWriter.fourcc(*FOURCC), rate_hz, (width, height), False
+        )
         try:
             if not film.isOpened():
                 check_disk_space(temporary)
-                raise InputError(path, f"this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz")
+                raise InputError(
+                    path,
+                    f"this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz",
+                )
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = check_same_format(run.image(stem), first, stem)
                 gray = stretch.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
@@ -265,11 +332,14 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
                     film.write(np.ascontiguousarray(gray[:height, :width]))
         finally:
             film.release()
-        readable, count = count_frames(temporary), len(run.stems)
+        readable = count_frames(temporary)
+        count = len(run.stems)
         # OpenCV reports no write errors, so count the frames that can be read back.
         if readable != count:
             check_disk_space(temporary)
-            raise InputError(path, f"OpenCV wrote {readable} of {count} frames, without an error message")
+            raise InputError(
+                path, f"OpenCV wrote {readable} of {count} frames, without an error message"
+            )
     return [path]
 
 

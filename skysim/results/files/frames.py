@@ -14,12 +14,20 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 
 RESULT_FILES = (
-    *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),
-    *("annotated.png", "scene_3d.png", "scene_3d.gif", "report.html", "scoreboard.ecsv"),
+    "solutions.ecsv",
+    "telemetry.ecsv",
+    "imu.ecsv",
+    "annotated.png",
+    "scene_3d.png",
+    "scene_3d.gif",
+    "report.html",
+    "scoreboard.ecsv",
 )
 
 EXPORT_FILES = (
-    *("truth.aem", "solutions.aem", "truth.ecsv"),
+    "truth.aem",
+    "solutions.aem",
+    "truth.ecsv",
     *(f"{name}.parquet" for name in ("truth", "sources", "solutions", "telemetry", "imu")),
     "frames.mp4",
 )
@@ -61,7 +69,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if isinstance(scene.light, StarsConfig):
         header.update(wcs.header(scene.camera, truth.cam_from_lab))
-        header["COMMENT"] = "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
+        header["COMMENT"] = (
+            "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
+        )
     else:
         header["COMMENT"] = "no WCS: the lights are in the laboratory"
     with atomic_file(path) as temporary:
@@ -96,7 +106,9 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "seed": scene.seed,
         "frame": frame.index,
         "t_mid_s": truth.t_s,
-        "mid_utc": utc_text(scene, truth.t_s),  # the true time; that of the FITS header is the camera's time tag
+        "mid_utc": utc_text(
+            scene, truth.t_s
+        ),  # the true time; that of the FITS header is the camera's time tag
         "exposure_s": frame.exposure_s,
         "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
         "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),

@@ -22,7 +22,8 @@ from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
-SKY_ANGLES, LAB_ANGLES = ("ra_deg", "dec_deg", "roll_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
+SKY_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
+LAB_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,9 @@ class Recording:
         header = files.read_table(self.stems[0].with_suffix(".ecsv")).meta
         missing = [key for key in ("scene", "seed", "lab") if key not in header]
         if missing:
-            raise InputError(f"{self.stems[0]}.ecsv", f"no {missing[0]} in the header", "a truth file of a run")
+            raise InputError(
+                f"{self.stems[0]}.ecsv", f"no {missing[0]} in the header", "a truth file of a run"
+            )
         return {key: header[key] for key in ("scene", "seed", "lab")}
 
     @property
@@ -88,12 +91,18 @@ class Recording:
         names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
         missing = [name for name in ("frame", *names) if name not in solutions.colnames]
         if missing:
-            raise InputError(self.folder / "solutions.ecsv", f"missing column {missing[0]}", "a table of a run")
-        angles = np.column_stack([np.ma.filled(solutions[name].astype(float), np.nan) for name in names])
+            raise InputError(
+                self.folder / "solutions.ecsv", f"missing column {missing[0]}", "a table of a run"
+            )
+        angles = np.column_stack(
+            [np.ma.filled(solutions[name].astype(float), np.nan) for name in names]
+        )
         valid = np.isfinite(angles).all(axis=1)
         if not valid.any():
             return None
-        return np.asarray(solutions["frame"], np.int64)[valid], attitudes(angles[valid], self.is_celestial)
+        return np.asarray(solutions["frame"], np.int64)[valid], attitudes(
+            angles[valid], self.is_celestial
+        )
 
     def motion(self) -> tuple[Floats, Rotation] | None:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
@@ -106,7 +115,9 @@ class Recording:
         columns = [f"true_{name}" for name in LAB_ANGLES]
         missing = [name for name in ("t_s", *columns) if name not in telemetry.colnames]
         if missing:
-            raise InputError(self.folder / "telemetry.ecsv", f"missing column {missing[0]}", "a table of a run")
+            raise InputError(
+                self.folder / "telemetry.ecsv", f"missing column {missing[0]}", "a table of a run"
+            )
         angles = np.column_stack([np.asarray(telemetry[name], dtype=float) for name in columns])
         return np.asarray(telemetry["t_s"], dtype=float), attitudes(angles, is_celestial=False)
 
@@ -130,7 +141,9 @@ def open_recording(folder: Path) -> Recording:
         if number and path.with_suffix(".ecsv").is_file():
             stems[int(number[1])] = path.with_suffix("")
     if not stems:
-        raise InputError(folder, "no frames with truth files", "a folder of a run, or of rendered frames")
+        raise InputError(
+            folder, "no frames with truth files", "a folder of a run, or of rendered frames"
+        )
     return Recording(folder, [stems[index] for index in sorted(stems)])
 
 
@@ -142,15 +155,22 @@ def read_truth(path: Path) -> FrameTruth:
     sources = files.read_table(path)
     counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
     counts |= {"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3}
-    numbers = {key: np.array(files.header_numbers(path, sources.meta, key, count)) for key, count in counts.items()}
+    numbers = {
+        key: np.array(files.header_numbers(path, sources.meta, key, count))
+        for key, count in counts.items()
+    }
     for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
         if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
-            raise InputError(path, f"{key} in the header is {sources.meta[key]}", "a unit quaternion")
+            raise InputError(
+                path, f"{key} in the header is {sources.meta[key]}", "a unit quaternion"
+            )
     try:
         utc = datetime.datetime.fromisoformat(str(sources.meta.get("mid_utc")))
     except ValueError:
         raise InputError(
-            path, f"mid_utc in the header is {sources.meta.get('mid_utc')!r}", "a time; run the scene again"
+            path,
+            f"mid_utc in the header is {sources.meta.get('mid_utc')!r}",
+            "a time; run the scene again",
         ) from None
     return FrameTruth(
         frame=int(numbers.pop("frame")[0]),

@@ -20,7 +20,9 @@ from skysim.core.errors import InputError
 from skysim.core.io.files import atomic_file
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
-KEPT_BYTES = 250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
+KEPT_BYTES = (
+    250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
+)
 
 Array = NDArray[Any]
 Source = Callable[[str], Array]  # the column of some rows by its name
@@ -35,9 +37,15 @@ class Rows(Mapping[str, Array]):
     """
 
     def __init__(
-        self, names: Sequence[str], sources: Sequence[Source], counts: Sequence[int], order: Array | None = None
+        self,
+        names: Sequence[str],
+        sources: Sequence[Source],
+        counts: Sequence[int],
+        order: Array | None = None,
     ) -> None:
-        self.names, self.sources, self.order = tuple(names), tuple(sources), order
+        self.names = tuple(names)
+        self.sources = tuple(sources)
+        self.order = order
         self.starts = np.cumsum([0, *counts])
         self._kept: dict[str, Array] = {}
 
@@ -52,7 +60,10 @@ class Rows(Mapping[str, Array]):
         return self._kept[name]
 
     def _keep(self, name: str, column: Array) -> None:
-        while self._kept and sum(one.nbytes for one in self._kept.values()) + column.nbytes > KEPT_BYTES:
+        while (
+            self._kept
+            and sum(one.nbytes for one in self._kept.values()) + column.nbytes > KEPT_BYTES
+        ):
             del self._kept[next(iter(self._kept))]
         self._kept[name] = column
 
@@ -73,7 +84,11 @@ class Rows(Mapping[str, Array]):
 def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
     """The columns of one row."""
     one = slice(number, number + 1)
-    return columns.row(number) if isinstance(columns, Rows) else {name: columns[name][one] for name in columns}
+    return (
+        columns.row(number)
+        if isinstance(columns, Rows)
+        else {name: columns[name][one] for name in columns}
+    )
 
 
 def subset(columns: Mapping[str, Array], rows: Array | slice) -> Rows:
@@ -96,7 +111,9 @@ def to_arrow(columns: Mapping[str, Array]) -> Any:
 
     return pyarrow.table(
         {
-            name: pyarrow.array(column, pyarrow.string() if column.dtype == object else None, from_pandas=True)
+            name: pyarrow.array(
+                column, pyarrow.string() if column.dtype == object else None, from_pandas=True
+            )
             for name, column in columns.items()
         }
     )
@@ -108,7 +125,9 @@ def write_part(path: Path, columns: Mapping[str, Array]) -> None:
 
     table = to_arrow(columns)
     with atomic_file(path) as temporary:
-        pyarrow.parquet.write_table(table, temporary, row_group_size=table.num_rows, **encoding(table.schema))
+        pyarrow.parquet.write_table(
+            table, temporary, row_group_size=table.num_rows, **encoding(table.schema)
+        )
         sync(temporary)
     sync(path.parent)
 
@@ -137,7 +156,11 @@ class Part:
     """A part: its file, its numbers of rows and of wrong attitudes, and the points of its first and its last row."""
 
     def __init__(self, path: Path, rows: int, wrong: int, first: int, last: int) -> None:
-        self.path, self.rows, self.wrong, self.first, self.last = path, rows, wrong, first, last
+        self.path = path
+        self.rows = rows
+        self.wrong = wrong
+        self.first = first
+        self.last = last
         self._trials: tuple[int, Array] = (0, np.empty(0, np.int64))
 
     def trials(self, replicates: int) -> Array:
@@ -145,7 +168,9 @@ class Part:
         if self._trials[0] != replicates:
             point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
             if not len(point) == len(replicate) == self.rows > 0:
-                raise InputError(self.path, f"has {len(point)} rows", f"{self.rows}, as the study store lists")
+                raise InputError(
+                    self.path, f"has {len(point)} rows", f"{self.rows}, as the study store lists"
+                )
             if not (are_below(point, self.last + 1) and are_below(replicate, replicates)):
                 raise InputError(
                     self.path,
@@ -158,15 +183,23 @@ class Part:
     def source(self, ranges: Sequence[tuple[int, int]], replicates: int) -> Source | None:
         """The columns of the trials in some ranges of numbers; None if there are none."""
         near = np.array(ranges)
-        near = near[(near[:, 0] < (self.last + 1) * replicates) & (near[:, 1] > self.first * replicates)]
+        near = near[
+            (near[:, 0] < (self.last + 1) * replicates) & (near[:, 1] > self.first * replicates)
+        ]
         if not len(near):
             return None
         trials = self.trials(replicates)
-        rows = [slice(first, end) for first, end in np.searchsorted(trials, near).tolist() if end > first]
+        rows = [
+            slice(first, end)
+            for first, end in np.searchsorted(trials, near).tolist()
+            if end > first
+        ]
 
         def column(name: str) -> Array:
             whole = trials if name == "trial" else read_column(self.path, name)
-            return whole[rows[0]] if len(rows) == 1 else np.concatenate([whole[one] for one in rows])
+            return (
+                whole[rows[0]] if len(rows) == 1 else np.concatenate([whole[one] for one in rows])
+            )
 
         return column if rows else None
 
@@ -197,5 +230,13 @@ def part_errors(path: Path) -> Iterator[None]:
         yield
     except ImportError:
         raise InputError(path, f"Parquet {EXTRA}") from None
-    except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's are among them
-        raise InputError(path, f"not a valid part of a study store: {' '.join(str(error).split())[:120]}") from None
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        NotImplementedError,
+        MemoryError,
+    ) as error:  # pyarrow's are among them
+        raise InputError(
+            path, f"not a valid part of a study store: {' '.join(str(error).split())[:120]}"
+        ) from None

@@ -18,7 +18,9 @@ def page(title: str, command: str, version: str, blocks: Sequence[Block]) -> str
     environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
     environment.tests["cell"] = lambda one: isinstance(one, Cell)
     environment.globals["kind"] = lambda block: type(block).__name__
-    return environment.get_template("page.html").render(title=title, command=command, version=version, blocks=blocks)
+    return environment.get_template("page.html").render(
+        title=title, command=command, version=version, blocks=blocks
+    )
 
 
 def parts(text: str) -> Iterator[tuple[bool, str]]:

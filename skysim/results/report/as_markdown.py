@@ -34,7 +34,9 @@ def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
     """A block's paragraphs. level : of a section's heading;  names : of the figures from this one on"""
     match block:
         case Section(title=title, folded=folded):
-            opened = '<details markdown="1"><summary>{}</summary>' if folded else "#" * level + " {}"
+            opened = (
+                '<details markdown="1"><summary>{}</summary>' if folded else "#" * level + " {}"
+            )
             yield opened.format(inline(title))
             for one in block.blocks:
                 yield from paragraphs(one, level + 1, names)
@@ -51,9 +53,15 @@ def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
             yield from [f"**{inline(title)}**"] if title else []
             yield "\n".join(f"- {inline(line)}" for line in lines)
         case Facts(rows=rows):
-            yield table(["", ""], [[cell(Cell(name)), "<br>".join(map(cell, lines))] for name, lines in rows])
+            yield table(
+                ["", ""],
+                [[cell(Cell(name)), "<br>".join(map(cell, lines))] for name, lines in rows],
+            )
         case Table():
-            yield table([inline(one.head) for one in block.columns], [list(map(cell, row)) for row in block.cells()])
+            yield table(
+                [inline(one.head) for one in block.columns],
+                [list(map(cell, row)) for row in block.cells()],
+            )
         case Code(text=text, language=language):
             fence = max(["```", *(found + "`" for found in FENCE.findall(text))], key=len)
             yield f"{fence}{language}\n{text}\n{fence}"

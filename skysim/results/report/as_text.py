@@ -7,7 +7,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from skysim.core.errors import printable
-from skysim.results.report.blocks import Block, Cell, Code, Facts, Items, Section, Table, Text, Verdict
+from skysim.results.report.blocks import (
+    Block,
+    Cell,
+    Code,
+    Facts,
+    Items,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 
 WIDE = 240  # characters in a line of a file
 NARROW = 40  # characters, below which no text is wrapped
@@ -48,7 +58,11 @@ def print_facts(facts: Facts) -> None:
     """Print facts, names at the left."""
     for name, lines in facts.rows:
         texts = [one.text if isinstance(one, Cell) else one for one in lines]
-        wrapped = [part for text in texts for part in textwrap.wrap(printable(text), FACT_WIDTH - FACT_COLUMN)]
+        wrapped = [
+            part
+            for text in texts
+            for part in textwrap.wrap(printable(text), FACT_WIDTH - FACT_COLUMN)
+        ]
         for head, line in zip([name, *[""] * (len(wrapped) - 1)], wrapped, strict=True):
             print(f"{head:{FACT_COLUMN}}{line}")
 
@@ -59,7 +73,12 @@ def print_table(table: Table, title: str = "") -> None:
 
     rows = table.cells()
     shown = fitting_columns(table, rows[:MAX_ROWS])
-    grid = Grid(box=None, header_style="bold", pad_edge=False, title=styled(Cell(title), "") if title else None)
+    grid = Grid(
+        box=None,
+        header_style="bold",
+        pad_edge=False,
+        title=styled(Cell(title), "") if title else None,
+    )
     grid.title_justify = "left"
     for n in shown:
         column = table.columns[n]
@@ -73,7 +92,11 @@ def print_table(table: Table, title: str = "") -> None:
             if column.kind == "aside" and one.text:
                 name = "" if one.text.startswith(row[0].text) else f"{row[0].text}: "
                 print_wrapped(name + one.text, first="  ", others="    ")
-    if left_out := [column.head for n, column in enumerate(table.columns) if n not in shown and column.kind != "aside"]:
+    if left_out := [
+        column.head
+        for n, column in enumerate(table.columns)
+        if n not in shown and column.kind != "aside"
+    ]:
         print_wrapped(f"in the report, or in a wider terminal: {', '.join(left_out)}")
     if len(rows) > MAX_ROWS:
         print(f"and {len(rows) - MAX_ROWS} more rows in the report")
@@ -82,7 +105,10 @@ def print_table(table: Table, title: str = "") -> None:
 def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
     """The columns that fit into the terminal, asides left out; all that are not optional."""
     shown = [n for n, column in enumerate(table.columns) if column.kind != "aside"]
-    texts = [[column.head for column in table.columns], *([one.text for one in row] for row in rows)]
+    texts = [
+        [column.head for column in table.columns],
+        *([one.text for one in row] for row in rows),
+    ]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     for group in table.optional:
         if sum(widths[n] for n in shown) + 2 * (len(shown) - 1) > terminal_width():
@@ -103,7 +129,15 @@ def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | N
     first, others : what the first line and the others begin with
     """
     width = width or max(terminal_width(), NARROW)
-    print(textwrap.fill(printable(text), width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False))
+    print(
+        textwrap.fill(
+            printable(text),
+            width,
+            initial_indent=first,
+            subsequent_indent=others,
+            break_on_hyphens=False,
+        )
+    )
 
 
 def console() -> Any:

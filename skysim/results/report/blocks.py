@@ -52,7 +52,9 @@ class Column(NamedTuple):
         if isinstance(value, str):
             return Cell(value)
         missing = value is None or math.isnan(value)
-        return Cell(MISSING if missing else format(value, self.format), key=math.nan if missing else value)
+        return Cell(
+            MISSING if missing else format(value, self.format), key=math.nan if missing else value
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +109,10 @@ class Table(Block):
 
     def cells(self) -> list[list[Cell]]:
         """The rows as cells."""
-        return [[column.cell(value) for column, value in zip(self.columns, row, strict=True)] for row in self.rows]
+        return [
+            [column.cell(value) for column, value in zip(self.columns, row, strict=True)]
+            for row in self.rows
+        ]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,15 @@ from skysim.results.report import as_html, as_markdown, as_text
 from skysim.results.report.blocks import Block, Cell, Column, Section, Verdict, figure_files, filled
 
 SUFFIXES = (".html", ".md", ".json")
-LOOKS = ("folded", "id", "image", "kind", "name", "on_terminal", "optional")  # fields that JSON leaves out
+LOOKS = (
+    "folded",
+    "id",
+    "image",
+    "kind",
+    "name",
+    "on_terminal",
+    "optional",
+)  # fields that JSON leaves out
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,12 @@ class Report:
 
     def json(self) -> dict[str, Any]:
         """Title, command, version and blocks as values for JSON; figures by their captions."""
-        return {"title": self.title, "command": self.command, "version": self.version, "blocks": plain(self.blocks)}
+        return {
+            "title": self.title,
+            "command": self.command,
+            "version": self.version,
+            "blocks": plain(self.blocks),
+        }
 
     def print(self) -> None:
         """Print it on the terminal, without figures; the answer comes last, above the prompt."""
@@ -84,7 +97,11 @@ class Report:
 def plain(value: Any) -> Any:
     """Blocks and what they hold as values for JSON."""
     if isinstance(value, Block):
-        held = {one.name: plain(getattr(value, one.name)) for one in fields(value) if one.name not in LOOKS}
+        held = {
+            one.name: plain(getattr(value, one.name))
+            for one in fields(value)
+            if one.name not in LOOKS
+        }
         return {"kind": type(value).__name__.lower()} | held
     if isinstance(value, Cell):
         return value.text

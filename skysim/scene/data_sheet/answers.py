@@ -77,7 +77,9 @@ def f_number(text: str) -> float:
 def gain(text: str) -> float:
     """Electrons a digital number; EMVA 1288 states the inverse, in DN/e-."""
     inverse = re.fullmatch(r"(.*?)\s*(?:DN|ADU)\s*/\s*e-?", text.strip(), re.IGNORECASE)
-    value = number(r"e-?\s*/\s*(?:DN|ADU)", '2.64, "2.64 e-/DN" or "0.379 DN/e-"')(inverse[1] if inverse else text)
+    value = number(r"e-?\s*/\s*(?:DN|ADU)", '2.64, "2.64 e-/DN" or "0.379 DN/e-"')(
+        inverse[1] if inverse else text
+    )
     return rounded(1 / value, 6) if inverse and value else value
 
 

@@ -6,7 +6,17 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from skysim.scene.data_sheet.answers import bits, f_number, gain, number, pixels, quantity_text, rounded, share, shutter
+from skysim.scene.data_sheet.answers import (
+    bits,
+    f_number,
+    gain,
+    number,
+    pixels,
+    quantity_text,
+    rounded,
+    share,
+    shutter,
+)
 
 Values = Mapping[str, Any]  # parsed answers, by the name of the question
 
@@ -63,11 +73,15 @@ def row_time(values: Values) -> Assumed:
 def full_well(values: Values) -> Assumed:
     """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
     if "gain" in values:
-        return Assumed(rounded(values["gain"] * range_dn(values)), "where the converter's range ends")
+        return Assumed(
+            rounded(values["gain"] * range_dn(values)), "where the converter's range ends"
+        )
     from skysim.core.units import in_si
 
     area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
-    return Assumed(rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264")
+    return Assumed(
+        rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
+    )
 
 
 def gain_of_well(values: Values) -> Assumed:

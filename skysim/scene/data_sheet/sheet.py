@@ -15,10 +15,20 @@ import yaml
 from skysim.core.errors import InputError, printable
 from skysim.scene.data_sheet.questions import QUESTIONS, REQUIRED, Values
 
-CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}  # shapes of the quantum efficiency by shutter
-PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}  # to check an answer before these two are given
+CURVES = {
+    "interline": "interline",
+    "frame_transfer": "thick_ccd",
+}  # shapes of the quantum efficiency by shutter
+PLACEHOLDERS = {
+    "pixels": "1000x1000",
+    "pitch": "5 um",
+}  # to check an answer before these two are given
 PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # to validate a camera without a lens
-SI = {"pixel": " m", "focal_length": " m", "shutter.row_time": " s"}  # units of the limits in messages
+SI = {
+    "pixel": " m",
+    "focal_length": " m",
+    "shutter.row_time": " s",
+}  # units of the limits in messages
 COMMENT_COLUMN = 34
 
 
@@ -48,7 +58,8 @@ class Sheet(NamedTuple):
 def fill(answers: Mapping[str, str]) -> Sheet:
     """The camera of some answers, with assumptions for the rest. Raises InputError; its key is `answers.NAME`."""
     values = {name: parsed(name, text) for name, text in answers.items()}
-    missing, comments = [], dict.fromkeys(values, "[S1]")
+    missing = []
+    comments = dict.fromkeys(values, "[S1]")
     for name, question in QUESTIONS.items():
         skipped = question.skipped(values)
         if skipped and name in values:
@@ -59,7 +70,8 @@ def fill(answers: Mapping[str, str]) -> Sheet:
             raise InputError(f"answers.{name}", f"missing; {question.ask}: {question.where}")
         guess = question.assume(values)
         if guess is not None:
-            values[name], comments[name] = guess.value, f"assumed: {guess.why}"
+            values[name] = guess.value
+            comments[name] = f"assumed: {guess.why}"
         text = f"{guess.value} ({guess.why})" if guess else ""
         missing.append(Missing(name, text, question.consequence))
     sheet = Sheet(list(lines_of(values, comments)), missing)
@@ -96,7 +108,10 @@ def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[Line]:
             curve = CURVES.get(values["shutter"], "cmos")
             yield Line("detector.quantum_efficiency.curve", curve, "assumed: the shape")
         several = values[name] if len(question.keys) > 1 else (values[name],)
-        yield from (Line(key, value, comments[name]) for key, value in zip(question.keys, several, strict=True))
+        yield from (
+            Line(key, value, comments[name])
+            for key, value in zip(question.keys, several, strict=True)
+        )
         if name == "dark_current":
             yield Line("detector.dark_temperature_c", 25, "assumed: room temperature")
 
@@ -138,7 +153,9 @@ def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
         for fault in faults:
             if fault.key in QUESTIONS[name].keys:
                 if fault.allowed:
-                    return InputError(f"answers.{name}", quoted(text), fault.allowed + SI.get(fault.key, ""))
+                    return InputError(
+                        f"answers.{name}", quoted(text), fault.allowed + SI.get(fault.key, "")
+                    )
                 return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
     return faults[0].under("camera")
 
@@ -148,7 +165,11 @@ def text(sheet: Sheet, name: str) -> str:
     lines = [
         f"# {printable(name)}. Written by `skysim camera new`.",
         "# [S1] the data sheets of camera and lens. A value marked `assumed` is not stated there.",
-        *(f"# Not stated: {one.name}; {one.consequence}." for one in sheet.missing if not one.assumed),
+        *(
+            f"# Not stated: {one.name}; {one.consequence}."
+            for one in sheet.missing
+            if not one.assumed
+        ),
         *yaml_lines(sheet.lines),
     ]
     return "\n".join(lines) + "\n"
@@ -158,16 +179,26 @@ def yaml_value(value: Any) -> str:
     """A value in one line of YAML; a text with spaces is quoted."""
     if isinstance(value, str):
         return f'"{value}"' if " " in value else value
-    return yaml.safe_dump(value, default_flow_style=True, width=math.inf).removesuffix("\n").removesuffix("\n...")
+    return (
+        yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+        .removesuffix("\n")
+        .removesuffix("\n...")
+    )
 
 
 def yaml_lines(camera: list[Line]) -> list[str]:
     """A section `camera` in YAML, with the comment of each value."""
-    lines, open_ = ["camera:"], list[str]()
+    lines = ["camera:"]
+    open_ = list[str]()
     for line in camera:
         *parents, last = line.key.split(".")
-        depth = next((n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]), len(open_))
-        lines += [f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))]
+        depth = next(
+            (n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]),
+            len(open_),
+        )
+        lines += [
+            f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))
+        ]
         open_ = parents
         written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
         lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")

@@ -6,7 +6,15 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
@@ -36,7 +44,9 @@ Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would f
 
 def focus_distance(value: Any) -> float:
     """A length in m; infinity for the word infinity."""
-    return math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
+    return (
+        math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
+    )
 
 
 class PsfConfig(ConfigModel):
@@ -122,9 +132,16 @@ class ChromaticConfig(ConfigModel):
         the distance from it
     """
 
-    wavelength_m: Annotated[tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)]
-    focus_m: Annotated[tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)] | None = None
-    corner_px: Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)] | None = None
+    wavelength_m: Annotated[
+        tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)
+    ]
+    focus_m: (
+        Annotated[tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)]
+        | None
+    ) = None
+    corner_px: (
+        Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)] | None
+    ) = None
 
     @model_validator(mode="after")
     def check_columns(self) -> ChromaticConfig:
@@ -133,7 +150,9 @@ class ChromaticConfig(ConfigModel):
             if column is not None:
                 check_table(self.wavelength_m, column, name, "wavelength")
         if not any(column and any(column) for column in columns.values()):
-            raise InputError("", "nothing depends on the wavelength", "focus or corner_px other than 0")
+            raise InputError(
+                "", "nothing depends on the wavelength", "focus or corner_px other than 0"
+            )
         return self
 
 
@@ -153,7 +172,9 @@ class GhostConfig(ConfigModel):
     @classmethod
     def check_magnification(cls, value: float) -> float:
         if abs(value) < 0.05:
-            raise InputError("", f"{value:g} images half of space on the chip", "from 0.05 or to -0.05")
+            raise InputError(
+                "", f"{value:g} images half of space on the chip", "from 0.05 or to -0.05"
+            )
         return value
 
 
@@ -274,7 +295,9 @@ def transmission_tag(value: Any) -> str:
 
 def curve_exists(value: str) -> str:
     if not Path(value).is_file():
-        raise InputError("", f"no file {value!r}", "a CSV file of wavelength_nm and response, or a number to 1")
+        raise InputError(
+            "", f"no file {value!r}", "a CSV file of wavelength_nm and response, or a number to 1"
+        )
     return value
 
 
@@ -331,7 +354,9 @@ class DetectorConfig(ConfigModel):
 
     @field_validator("quantum_efficiency")
     @classmethod
-    def check_efficiency(cls, value: float | str | EfficiencyConfig) -> float | str | EfficiencyConfig:
+    def check_efficiency(
+        cls, value: float | str | EfficiencyConfig
+    ) -> float | str | EfficiencyConfig:
         if isinstance(value, str):
             curve_file(value)
         return value
@@ -349,13 +374,17 @@ class DetectorConfig(ConfigModel):
     @property
     def doublings(self) -> float:
         """How many times the dark current doubles from dark_temperature_c to the chip's temperature."""
-        difference_c = 0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
+        difference_c = (
+            0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
+        )
         return difference_c / self.dark_doubling_c
 
     @model_validator(mode="after")
     def check_offset(self) -> DetectorConfig:
         if self.offset_dn >= 2**self.bits:
-            raise InputError("offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits")
+            raise InputError(
+                "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"
+            )
         return self
 
 
@@ -373,9 +402,13 @@ class CameraConfig(ConfigModel):
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
-    focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)] = math.inf
+    focus_m: Annotated[
+        float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)
+    ] = math.inf
     transmission: Transmission = 1.0
-    vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None = None
+    vignetting: (
+        Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None
+    ) = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsfConfig()
@@ -390,7 +423,8 @@ class CameraConfig(ConfigModel):
     def check_focus(self) -> CameraConfig:
         if self.focus_m <= 2 * self.focal_length_m:
             raise InputError(
-                "focus", f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m"
+                "focus",
+                f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m",
             )
         return self
 
@@ -421,13 +455,17 @@ class CameraConfig(ConfigModel):
 
     def calibration(self) -> Calibration:
         """The result of a perfect calibration of this camera."""
-        return Calibration(self.width_px, self.height_px, self.focal_px, self.center_px, self.distortion)
+        return Calibration(
+            self.width_px, self.height_px, self.focal_px, self.center_px, self.distortion
+        )
 
     @property
     def corner_px(self) -> float:
         """Distance from the principal point to the farthest corner of the chip."""
         x, y = self.center_px
-        return math.hypot(max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y))
+        return math.hypot(
+            max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y)
+        )
 
 
 CURVE_FOLDER = DATA / "qe"

@@ -25,7 +25,9 @@ FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
     """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
-    return tuple(10.0 ** (-0.4 * (float(magnitude) - float(min(magnitudes)))) for magnitude in magnitudes)
+    return tuple(
+        10.0 ** (-0.4 * (float(magnitude) - float(min(magnitudes)))) for magnitude in magnitudes
+    )
 
 
 class BoardConfig(ConfigModel):
@@ -78,7 +80,9 @@ class PatchBoardsConfig(ConfigModel):
     @classmethod
     def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
         if not 1 <= value[0] <= value[1] <= HOLES:
-            raise InputError("", f"{value} is not a range of LEDs on a 3x3 board", "1 <= least <= most <= 9")
+            raise InputError(
+                "", f"{value} is not a range of LEDs on a 3x3 board", "1 <= least <= most <= 9"
+            )
         return value
 
     @model_validator(mode="after")
@@ -87,7 +91,8 @@ class PatchBoardsConfig(ConfigModel):
             raise InputError("", "patch_boards takes spacing, or boards by list")
         if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:
             raise InputError(
-                "spacing", f"{self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
+                "spacing",
+                f"{self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap",
             )
         return self
 
@@ -118,7 +123,11 @@ class DimmedConfig(ConfigModel):
         if self.levels is not None and self.magnitudes is not None:
             raise InputError("", "a layout takes either levels or magnitudes")
         if self.unique_neighbors and len(set(self.dimming)) < 2:
-            raise InputError("unique_neighbors", "all LEDs are equally bright", "two levels or magnitudes, or more")
+            raise InputError(
+                "unique_neighbors",
+                "all LEDs are equally bright",
+                "two levels or magnitudes, or more",
+            )
         return self
 
 
@@ -268,13 +277,17 @@ class ListedConfig(DimmedConfig):
     """
 
     kind: Literal["listed"]
-    positions_m: Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None = None
+    positions_m: (
+        Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None
+    ) = None
     directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
     file: str | None = None
 
     @model_validator(mode="after")
     def check_positions(self) -> ListedConfig:
-        lists = [each for each in (self.positions_m, self.directions_deg, self.file) if each is not None]
+        lists = [
+            each for each in (self.positions_m, self.directions_deg, self.file) if each is not None
+        ]
         if len(lists) != 1:
             raise InputError("", "listed takes one of positions, directions_deg, file")
         dimmed = len(self.levels or self.magnitudes or ())
@@ -332,7 +345,9 @@ class FibersConfig(ConfigModel):
     @model_validator(mode="after")
     def check_aiming(self) -> FibersConfig:
         laser = self.aiming
-        if laser and not (self.radius_variation or laser.pointing_sigma_arcsec or laser.orientation_sigma_arcsec):
+        if laser and not (
+            self.radius_variation or laser.pointing_sigma_arcsec or laser.orientation_sigma_arcsec
+        ):
             raise InputError(
                 "aiming",
                 "the laser's place has no effect",
@@ -365,7 +380,11 @@ class PixelsConfig(ConfigModel):
     @model_validator(mode="after")
     def check_block(self) -> Self:
         if self.block > min(self.pixels):
-            raise InputError("block", f"{self.block} is wider than the display", f"up to {min(self.pixels)} pixels")
+            raise InputError(
+                "block",
+                f"{self.block} is wider than the display",
+                f"up to {min(self.pixels)} pixels",
+            )
         return self
 
 
@@ -426,7 +445,9 @@ class ProjectorConfig(PixelsConfig):
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
-            raise InputError("distortion", f"{self.distortion:g} folds the picture's corners back", "nearer to 0")
+            raise InputError(
+                "distortion", f"{self.distortion:g} folds the picture's corners back", "nearer to 0"
+            )
         return self
 
 

@@ -96,7 +96,9 @@ class RefreshConfig(ConfigModel):
     duty: Annotated[Number, Field(gt=0, le=1)] = 1.0
 
 
-Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, Field(discriminator="kind")]
+Drive = Annotated[
+    DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, Field(discriminator="kind")
+]
 
 
 class ClockConfig(ConfigModel):
@@ -137,7 +139,11 @@ class TriggeredCodeConfig(CodeConfig):
     @model_validator(mode="after")
     def check_levels(self) -> Self:
         if self.levels > 2 and self.depth == 1:
-            raise InputError("levels", f"{self.levels} with depth 1, equally spaced in magnitude", "depth below 1")
+            raise InputError(
+                "levels",
+                f"{self.levels} with depth 1, equally spaced in magnitude",
+                "depth below 1",
+            )
         return self
 
 
@@ -207,7 +213,11 @@ def spectrum_file(spectrum: str) -> Path:
     """The file of an LED's spectrum: data/led/white.csv, or a path. Raises InputError if there is none."""
     path = DATA / "led" / "white.csv" if spectrum == "white" else Path(spectrum)
     if not path.is_file():
-        raise InputError("", f"no file {spectrum!r}", "white, a CSV file of wavelength_nm and power, or a wavelength")
+        raise InputError(
+            "",
+            f"no file {spectrum!r}",
+            "white, a CSV file of wavelength_nm and power, or a wavelength",
+        )
     return path
 
 
@@ -218,11 +228,17 @@ def spectrum_exists(spectrum: str) -> str:
 
 def spectrum_tag(value: Any) -> str:
     """Tag of the kind of spectrum: white or a text that ends in .csv is measured, all else a wavelength."""
-    return "measured" if isinstance(value, str) and (value == "white" or value.endswith(".csv")) else "wavelength"
+    return (
+        "measured"
+        if isinstance(value, str) and (value == "white" or value.endswith(".csv"))
+        else "wavelength"
+    )
 
 
 Wavelength = Annotated[
-    Number, with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'), Field(ge=300e-9, le=1100e-9)
+    Number,
+    with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'),
+    Field(ge=300e-9, le=1100e-9),
 ]
 LedSpectrum = Annotated[
     Annotated[Annotated[str, AfterValidator(spectrum_exists)], Tag("measured")]
@@ -273,7 +289,9 @@ class LedConfig(ConfigModel):
     def check_color(self) -> LedConfig:
         if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
-            raise InputError(key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum")
+            raise InputError(
+                key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"
+            )
         return self
 
     @model_validator(mode="after")

@@ -6,12 +6,26 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    ModelWrapValidatorHandler,
+    field_validator,
+    model_validator,
+)
 
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError
-from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.core.units import (
+    Ascending,
+    ConfigModel,
+    Fraction,
+    Length,
+    Number,
+    SemiAxis,
+    check_table,
+)
 from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
@@ -39,10 +53,16 @@ class SurfaceConfig(ConfigModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def validate_by_kind(cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]) -> SurfaceConfig:
+    def validate_by_kind(
+        cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]
+    ) -> SurfaceConfig:
         """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is SurfaceConfig and isinstance(value, dict) else None
-        return SURFACE_CONFIGS[kind].model_validate(value) if kind in list(SURFACE_CONFIGS) else handler(value)
+        return (
+            SURFACE_CONFIGS[kind].model_validate(value)
+            if kind in list(SURFACE_CONFIGS)
+            else handler(value)
+        )
 
 
 class RimmedConfig(SurfaceConfig):
@@ -56,7 +76,9 @@ class RimmedConfig(SurfaceConfig):
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
         if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
-            raise InputError("rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex")
+            raise InputError(
+                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+            )
         return self
 
 
@@ -85,7 +107,9 @@ class SphereSurfaceConfig(RimmedConfig):
     def check_wall(self) -> Self:
         thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         if thickest > 0.1 * self.radius_m:
-            raise InputError("", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius")
+            raise InputError(
+                "", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius"
+            )
         return self
 
 
@@ -121,7 +145,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
         if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
-            raise InputError("rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex")
+            raise InputError(
+                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+            )
         return self
 
 
@@ -163,7 +189,11 @@ def check_surface_kind(value: Any) -> Any:
 
 
 AnySurface = Annotated[
-    SphereSurfaceConfig | EllipsoidSurfaceConfig | FlatSurfaceConfig | CylinderSurfaceConfig | SurveyedSurfaceConfig,
+    SphereSurfaceConfig
+    | EllipsoidSurfaceConfig
+    | FlatSurfaceConfig
+    | CylinderSurfaceConfig
+    | SurveyedSurfaceConfig,
     Field(discriminator="kind"),
     BeforeValidator(check_surface_kind),
 ]
@@ -195,7 +225,9 @@ class RoomConfig(ConfigModel):
     @model_validator(mode="after")
     def check_limits(self) -> RoomConfig:
         if self.height_m is not None and self.bearing_height_m is None:
-            raise InputError("", "height requires bearing_height, the bearing's center above the floor")
+            raise InputError(
+                "", "height requires bearing_height, the bearing's center above the floor"
+            )
         if self.segments > 1 and self.door_m is None:
             raise InputError("segments", "have no effect without a door", "door, or no segments")
         return self
@@ -234,9 +266,17 @@ class ReflectionConfig(ConfigModel):
         if self.specular and self.refractive_index is not None:
             raise InputError("", "specular and refractive_index conflict", "one of the two")
         if self.diffuse + self.specular >= 1:
-            raise InputError("", f"diffuse {self.diffuse:g} and specular {self.specular:g} leave no loss", "below 1")
+            raise InputError(
+                "",
+                f"diffuse {self.diffuse:g} and specular {self.specular:g} leave no loss",
+                "below 1",
+            )
         if not (self.diffuse or self.mirrors or self.floor):
-            raise InputError("", "nothing reflects", "diffuse, specular, refractive_index or floor, or no reflection")
+            raise InputError(
+                "",
+                "nothing reflects",
+                "diffuse, specular, refractive_index or floor, or no reflection",
+            )
         return self
 
     @property
@@ -263,21 +303,35 @@ class DomeConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:
-        if getattr(self.led.drive, "controller", None) == "board" and self.layout.kind != "patch_boards":
-            raise InputError("led.drive.controller", f"{self.layout.kind} has no boards", "dome, or a number of LEDs")
+        if (
+            getattr(self.led.drive, "controller", None) == "board"
+            and self.layout.kind != "patch_boards"
+        ):
+            raise InputError(
+                "led.drive.controller",
+                f"{self.layout.kind} has no boards",
+                "dome, or a number of LEDs",
+            )
         return self
 
     @model_validator(mode="after")
     def check_panel(self) -> DomeConfig:
-        layout, drive = self.layout.kind, self.led.drive.kind
+        layout = self.layout.kind
+        drive = self.led.drive.kind
         display = layout in ("lcd", "projector")
         if layout == "lcd" and self.surface.kind != "flat":
-            raise InputError("layout", f"lcd does not fit a surface of kind {self.surface.kind}", "flat")
+            raise InputError(
+                "layout", f"lcd does not fit a surface of kind {self.surface.kind}", "flat"
+            )
         if display and drive not in ("direct", "refresh"):
             article = "an" if layout == "lcd" else "a"
-            raise InputError("led.drive", f"{drive} cannot drive {article} {layout}", "direct, refresh")
+            raise InputError(
+                "led.drive", f"{drive} cannot drive {article} {layout}", "direct, refresh"
+            )
         if not display and drive == "refresh":
-            raise InputError("led.drive", f"refresh requires a layout of kind lcd or projector, not {layout}")
+            raise InputError(
+                "led.drive", f"refresh requires a layout of kind lcd or projector, not {layout}"
+            )
         return self
 
 

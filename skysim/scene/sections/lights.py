@@ -9,7 +9,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, get_args
 
-from pydantic import AfterValidator, ConfigDict, ModelWrapValidatorHandler, SerializeAsAny, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    SerializeAsAny,
+    model_validator,
+)
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
@@ -22,7 +28,9 @@ CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added
 def check_kind(kind: str) -> str:
     """The name of a kind. Raises InputError for an unknown one, with the known ones."""
     if kind not in CONFIGS:
-        raise InputError("", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()})))
+        raise InputError(
+            "", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()}))
+        )
     return kind
 
 
@@ -35,7 +43,9 @@ class LightConfig(ConfigModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def validate_by_kind(cls, value: Any, handler: ModelWrapValidatorHandler[LightConfig]) -> LightConfig:
+    def validate_by_kind(
+        cls, value: Any, handler: ModelWrapValidatorHandler[LightConfig]
+    ) -> LightConfig:
         """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
         if kind not in CONFIGS and kind in PLUGINS.entry_points():

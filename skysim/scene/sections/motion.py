@@ -143,7 +143,9 @@ class ChirpConfig(ConfigModel):
     @model_validator(mode="after")
     def check_frequencies(self) -> ChirpConfig:
         if self.from_hz == self.to_hz:
-            raise InputError("", f"from_hz and to_hz are both {self.from_hz:g}", "different ones, or kind: sine")
+            raise InputError(
+                "", f"from_hz and to_hz are both {self.from_hz:g}", "different ones, or kind: sine"
+            )
         if self.duration_s < 1 / self.from_hz + 1 / self.to_hz:
             raise InputError(
                 "duration",
@@ -166,7 +168,14 @@ class ProfileConfig(ConfigModel):
     file: Annotated[str, AfterValidator(existing_file)]
     begin: Literal["zero", "first_sample"] = "zero"
     rotation: (
-        Literal["lab_from_body", "body_from_lab", "icrs_from_body", "body_from_icrs", "icrs_from_cam", "cam_from_icrs"]
+        Literal[
+            "lab_from_body",
+            "body_from_lab",
+            "icrs_from_body",
+            "body_from_icrs",
+            "icrs_from_cam",
+            "cam_from_icrs",
+        ]
         | None
     ) = None
 
@@ -195,7 +204,9 @@ class BumpConfig(ConfigModel):
     @model_validator(mode="after")
     def check_catch_time(self) -> BumpConfig:
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
-            raise InputError("caught_after", f"{self.caught_after_s:g} s is before the impulse ends")
+            raise InputError(
+                "caught_after", f"{self.caught_after_s:g} s is before the impulse ends"
+            )
         return self
 
 
@@ -227,7 +238,9 @@ class DesaturationConfig(ConfigModel):
     @model_validator(mode="after")
     def check_thresholds(self) -> DesaturationConfig:
         if self.stop_nms >= self.start_nms:
-            raise InputError("stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s")
+            raise InputError(
+                "stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s"
+            )
         return self
 
 
@@ -262,8 +275,14 @@ class ControlConfig(ConfigModel):
         if self.law in BUILT_IN_LAWS:
             unused = ("options", "time_limit_s")
         elif self.law == PRESCRIBED:
-            unused = tuple(name for name in type(self).model_fields if name not in ("law", "rate_hz"))
-        given = [name.removesuffix("_s") for name in unused if getattr(self, name) != default_of(self, name)]
+            unused = tuple(
+                name for name in type(self).model_fields if name not in ("law", "rate_hz")
+            )
+        given = [
+            name.removesuffix("_s")
+            for name in unused
+            if getattr(self, name) != default_of(self, name)
+        ]
         if given:
             raise InputError("", f"{given[0]} has no effect with law {self.law}", "none")
         return self
@@ -305,7 +324,11 @@ class MotionConfig(ConfigModel):
     def check_controller(self) -> MotionConfig:
         driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
-            raise InputError("", "a maneuver requires a controller, such as control: pid", "maneuver: [] without one")
+            raise InputError(
+                "",
+                "a maneuver requires a controller, such as control: pid",
+                "maneuver: [] without one",
+            )
         return self
 
     @model_validator(mode="after")
@@ -313,7 +336,9 @@ class MotionConfig(ConfigModel):
         """A prescribed motion has no dynamics: nothing can hit the vehicle, and its attitude cannot jump."""
         refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
         if self.is_prescribed and refused:
-            raise InputError("maneuver", f"{refused[0]} is not possible with control: prescribed", "control: pid")
+            raise InputError(
+                "maneuver", f"{refused[0]} is not possible with control: prescribed", "control: pid"
+            )
         return self
 
     @model_validator(mode="after")
@@ -323,5 +348,7 @@ class MotionConfig(ConfigModel):
         if not self.maneuver or self.maneuver[0].kind != "profile":
             raise InputError("start", "profile requires a first maneuver of kind profile")
         if any(self.rate_deg_s):
-            raise InputError("rate_deg_s", "has no effect with start: profile, which gives the rate", "[0, 0, 0]")
+            raise InputError(
+                "rate_deg_s", "has no effect with start: profile, which gives the rate", "[0, 0, 0]"
+            )
         return self

@@ -124,4 +124,6 @@ class OemOrbitConfig(OrbitConfig):
     file: ElementsFile
 
 
-Orbit = Annotated[CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")]
+Orbit = Annotated[
+    CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
+]

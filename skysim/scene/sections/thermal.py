@@ -52,7 +52,10 @@ class TemperatureTableConfig(ConfigModel):
 
 
 Temperatures = Annotated[
-    SteadyTemperatureConfig | LinearTemperatureConfig | SineTemperatureConfig | TemperatureTableConfig,
+    SteadyTemperatureConfig
+    | LinearTemperatureConfig
+    | SineTemperatureConfig
+    | TemperatureTableConfig,
     Field(discriminator="kind"),
 ]
 
@@ -87,6 +90,8 @@ class ThermalConfig(ConfigModel):
     def check_effect(self) -> ThermalConfig:
         if not self.has_effect:
             raise InputError(
-                "", "nothing depends on the temperature", "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal"
+                "",
+                "nothing depends on the temperature",
+                "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal",
             )
         return self

@@ -84,7 +84,9 @@ class ExposureControlConfig(ConfigModel):
     @model_validator(mode="after")
     def check_limits(self) -> ExposureControlConfig:
         if self.shortest_s > self.longest_s:
-            raise InputError("shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s")
+            raise InputError(
+                "shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s"
+            )
         return self
 
 
@@ -153,9 +155,13 @@ class TrackerConfig(ConfigModel):
     @model_validator(mode="after")
     def check_assumed(self) -> TrackerConfig:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
-            raise InputError("survey.lever_sigma", "conflicts with assumed_camera_body", "0, or the survey alone")
+            raise InputError(
+                "survey.lever_sigma", "conflicts with assumed_camera_body", "0, or the survey alone"
+            )
         if self.assumed_focal_length_m is not None and self.survey.focal_length_sigma_m:
-            raise InputError("survey.focal_length_sigma", "conflicts with assumed_focal_length", "one of the two")
+            raise InputError(
+                "survey.focal_length_sigma", "conflicts with assumed_focal_length", "one of the two"
+            )
         return self
 
     @model_validator(mode="after")
@@ -171,7 +177,9 @@ class TrackerConfig(ConfigModel):
         }
         conflicts = [key for key, value in values.items() if value]
         if self.map and conflicts:
-            raise InputError(conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map")
+            raise InputError(
+                conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map"
+            )
         return self
 
 

@@ -27,7 +27,9 @@ from skysim.core.units import (
     Triple,
 )
 
-ActuatorsName = Literal["ideal", "wheels", "fans", "cmgs"]  # a key of `vehicle`, but for the ideal torques
+ActuatorsName = Literal[
+    "ideal", "wheels", "fans", "cmgs"
+]  # a key of `vehicle`, but for the ideal torques
 TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 
@@ -223,7 +225,9 @@ class VehicleConfig(ConfigModel):
     def check_inertia(cls, value: Triple | None) -> Triple | None:
         if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
             raise InputError(
-                "", f"{value} is not possible for a rigid body", "positive, none above the sum of the others"
+                "",
+                f"{value} is not possible for a rigid body",
+                "positive, none above the sum of the others",
             )
         return value
 
@@ -234,7 +238,9 @@ class VehicleConfig(ConfigModel):
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
             raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
         if self.mount == "free" and self.trim:
-            raise InputError("trim", "a free vehicle rotates about its center of mass", "mount: air_bearing")
+            raise InputError(
+                "trim", "a free vehicle rotates about its center of mass", "mount: air_bearing"
+            )
         return self
 
 

@@ -20,7 +20,9 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.lab import Lab
 
-MAX_FRAMES = 400  # frames at which the reference is evaluated to find the fastest and the most tilted one
+MAX_FRAMES = (
+    400  # frames at which the reference is evaluated to find the fastest and the most tilted one
+)
 FRAMES = 16  # frames that are checked
 DIRECTIONS = 48  # attitudes that the motion could reach
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
@@ -48,26 +50,40 @@ class Attitudes(NamedTuple):
 
 def of_frames(lab: Lab) -> Attitudes:
     """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
-    scene, count = lab.scene, lab.scene.exposure.frames
+    scene = lab.scene
+    count = lab.scene.exposure.frames
     exposure = scene.exposure
     index = np.unique(np.linspace(0, count - 1, min(count, MAX_FRAMES)).astype(int))
     t_s = exposure.first_s + index / exposure.rate_hz + exposure.time_s / 2
     every = attitudes_at(lab, t_s)
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
-    chosen |= {int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()), int(tilts_rad(every).argmax())}
+    chosen |= {
+        int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()),
+        int(tilts_rad(every).argmax()),
+    }
     rows = np.array(sorted(chosen))
     tilt_rad = tilts_rad(every)[rows]
     if scene.vehicle.mount == "air_bearing":
         check_stop(scene, t_s[rows], np.degrees(tilt_rad))
         rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
-    return Attitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows], every.accelerations()[rows])
+    return Attitudes(
+        every.lab_from_body[rows],
+        every.rate_body_rad_s[rows],
+        t_s[rows],
+        every.accelerations()[rows],
+    )
 
 
 def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
     """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
-    stop_deg, beyond = scene.vehicle.tilt_stop_deg, np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
+    stop_deg = scene.vehicle.tilt_stop_deg
+    beyond = np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
     if len(beyond) == len(tilt_deg):
-        raise InputError("motion.start", f"tilt of {tilt_deg[0]:.1f} deg", f"up to vehicle.tilt_stop_deg {stop_deg:g}")
+        raise InputError(
+            "motion.start",
+            f"tilt of {tilt_deg[0]:.1f} deg",
+            f"up to vehicle.tilt_stop_deg {stop_deg:g}",
+        )
     if len(beyond) and scene.motion.control is not None:
         raise InputError(
             "motion.maneuver",
@@ -78,10 +94,15 @@ def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
 
 def attitudes_at(lab: Lab, t_s: Floats) -> Attitudes:
     """The commanded attitudes at (N,) times; without a controller those of the initial rate, kept constant."""
-    scene, lab_from_start = lab.scene, lab.start
+    scene = lab.scene
+    lab_from_start = lab.start
     if scene.motion.control is None:
         rate = np.radians(scene.motion.rate_deg_s)
-        return Attitudes(lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)), np.tile(rate, (len(t_s), 1)), t_s)
+        return Attitudes(
+            lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)),
+            np.tile(rate, (len(t_s), 1)),
+            t_s,
+        )
     reference = guidance.plan(scene.motion, lab_from_start, lab.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
     lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
@@ -101,7 +122,9 @@ def greatest_tilt_rad(scene: Scene, frames: Attitudes) -> float:
     return float(tilts_rad(frames).max())
 
 
-def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float | None = None) -> Attitudes:
+def within_reach(
+    scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float | None = None
+) -> Attitudes:
     """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
     tilt_deg : the greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
@@ -112,12 +135,18 @@ def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float 
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
     if isinstance(scene.light, StarsConfig):
         zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
-        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad]))
+        lab_from_cam = Rotation.from_euler(
+            "ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad])
+        )
         lab_from_body = lab_from_cam * mount.cam_from_body
     else:
-        greatest_rad = greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
+        greatest_rad = (
+            greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
+        )
         cosine = math.cos(greatest_rad)
-        tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))  # the last one is the greatest tilt
+        tilt_rad = np.arccos(
+            1 - n / (DIRECTIONS - 1) * (1 - cosine)
+        )  # the last one is the greatest tilt
         azimuth_rad = n * GOLDEN_ANGLE_RAD
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
@@ -127,13 +156,17 @@ def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float 
 
 def describe(attitudes: Attitudes, n: int, scene: Scene, mount: Mount) -> str:
     """An attitude in words: RA and Dec of the boresight, or the vehicle's roll, pitch, yaw and tilt; and the time."""
-    lab_from_body, t_s = attitudes.lab_from_body[n], attitudes.t_s[n]
+    lab_from_body = attitudes.lab_from_body[n]
+    t_s = attitudes.t_s[n]
     if isinstance(scene.light, StarsConfig):
         x, y, z = (lab_from_body * mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-        ra_deg, dec_deg = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.asin(min(max(z, -1.0), 1.0)))
+        ra_deg = math.degrees(math.atan2(y, x)) % 360
+        dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))
         where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"
     else:
-        yaw, pitch, roll = (angle + 0.0 for angle in np.round(lab_from_body.as_euler("ZYX", degrees=True), 1))  # no -0
+        yaw, pitch, roll = (
+            angle + 0.0 for angle in np.round(lab_from_body.as_euler("ZYX", degrees=True), 1)
+        )  # no -0
         tilt_deg = float(multibody.tilt_deg(lab_from_body))
         where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
     return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"

@@ -72,12 +72,15 @@ class Beliefs:
 def of(lab: Lab, camera: CameraModel) -> Beliefs:
     """The beliefs of a lab's tracker. Raises InputError for a map or a catalog that cannot be read."""
     scene = lab.scene
-    tracker, believed = scene.tracker, assumed_camera(scene)
+    tracker = scene.tracker
+    believed = assumed_camera(scene)
     lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera)
     config = scene.camera.model_copy(update={"distortion": believed.distortion})
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
-    lever_error_m = np.zeros(3) if assumed_m is None else np.array(assumed_m) - lab.camera.mount.camera_body_m
+    lever_error_m = (
+        np.zeros(3) if assumed_m is None else np.array(assumed_m) - lab.camera.mount.camera_body_m
+    )
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
@@ -100,7 +103,9 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     return Beliefs(
         lights,
         direction_error,
-        survey.led_sigma_m if own_m2 is None else float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3)),
+        survey.led_sigma_m
+        if own_m2 is None
+        else float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3)),
         survey.lever_sigma_m,
         surface_m,
         np.radians(survey.rotation_deg),
@@ -115,7 +120,8 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
 
 def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
     """The sources that the tracker knows, (N, 3) errors of their directions, the faintest star, the catalog's epoch."""
-    scene, sources = lab.scene, lab.camera.sources
+    scene = lab.scene
+    sources = lab.camera.sources
     if isinstance(scene.light, DomeConfig):
         if scene.tracker.map:
             known = np.isin(sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id)
@@ -129,7 +135,9 @@ def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float,
 def believed_stars(lab: Lab) -> StarCatalog:
     """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
     scene = lab.scene
-    stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
+    stars = catalog.brighter_than(
+        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
+    )
     directions = catalog.apparent(stars, assumed_observer(scene, assumed_orbit(scene)))
     if isinstance(scene.light, CollimatedDisplayConfig):
         directions = display.lab_from_icrs(scene.light).apply(directions)
@@ -146,16 +154,21 @@ def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sour
     return sources.take(row), place[row] + shift - stars.vectors[star]
 
 
-def neighbor_shift(place: Floats, rate_e_s: Floats, row: NDArray[np.int64], camera: CameraModel) -> Floats:
+def neighbor_shift(
+    place: Floats, rate_e_s: Floats, row: NDArray[np.int64], camera: CameraModel
+) -> Floats:
     """(N, 3) displacement of the directions of some stars by the images of their neighbors.
 
     place : (M, 3) unit vectors of all sources;  rate_e_s : (M,) photo-electrons per second
     row   : (N,) the stars
     """
     focal_px = camera.optics.camera.focal_px
-    reach = cKDTree(place[row]).sparse_distance_matrix(cKDTree(place), REACH_PX / focal_px, output_type="ndarray")
+    reach = cKDTree(place[row]).sparse_distance_matrix(
+        cKDTree(place), REACH_PX / focal_px, output_type="ndarray"
+    )
     pairs = reach[row[reach["i"]] != reach["j"]]
-    first, second = row[pairs["i"]], pairs["j"]
+    first = row[pairs["i"]]
+    second = pairs["j"]
     apart = place[second] - place[first]
     apart_px = focal_px * np.linalg.norm(apart, axis=1)
     electrons = rate_e_s * camera.exposure_s
@@ -165,22 +178,33 @@ def neighbor_shift(place: Floats, rate_e_s: Floats, row: NDArray[np.int64], came
     return shift
 
 
-def response_px(apart_px: Floats, star_e: Floats, neighbor_e: Floats, camera: CameraModel) -> Floats:
+def response_px(
+    apart_px: Floats, star_e: Floats, neighbor_e: Floats, camera: CameraModel
+) -> Floats:
     """(P,) displacement of a star's fitted position toward a neighbor; see the module's description."""
-    x, y = (axis.ravel() for axis in np.mgrid[-WINDOW_PX : WINDOW_PX + 1, -WINDOW_PX : WINDOW_PX + 1])
+    x, y = (
+        axis.ravel() for axis in np.mgrid[-WINDOW_PX : WINDOW_PX + 1, -WINDOW_PX : WINDOW_PX + 1]
+    )
     s2 = camera.lens_px**2
 
     def image(offset_px: Floats) -> Floats:
         return np.asarray(np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2))
 
-    own, other = image(np.zeros(1)), image(apart_px[:, None])
+    own = image(np.zeros(1))
+    other = image(apart_px[:, None])
     slope = own * x / s2
     weight = 1 / (camera.noise_e**2 + star_e[:, None] * own)
     total_e = star_e + neighbor_e * np.exp(-(apart_px**2) / (4 * s2))
-    return np.asarray(neighbor_e * (weight * slope * other).sum(axis=1) / (total_e * (weight * slope**2).sum(axis=1)))
+    return np.asarray(
+        neighbor_e
+        * (weight * slope * other).sum(axis=1)
+        / (total_e * (weight * slope**2).sum(axis=1))
+    )
 
 
-def common(first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def common(
+    first: NDArray[np.int64], second: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The rows of equal numbers in two lists, in the order of the first."""
     _, a, b = np.intersect1d(first, second, return_indices=True)
     order = np.argsort(a)
@@ -192,13 +216,19 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
     lines = []
     if not math.isnan(beliefs.epoch_jyear):
         error_arcsec = np.degrees(np.linalg.norm(beliefs.direction_error, axis=1)) * 3600
-        differ = f"; its stars are {np.median(error_arcsec):.2g}″ (median) from the sky's" if len(error_arcsec) else ""
+        differ = (
+            f"; its stars are {np.median(error_arcsec):.2g}″ (median) from the sky's"
+            if len(error_arcsec)
+            else ""
+        )
         catalog = Path(scene.tracker.catalog).name.removesuffix(".ecsv")
         lines.append(
             f"{len(beliefs.lights)} stars to V {beliefs.faintest_mag:.2f} of {catalog}, epoch"
             f" J{beliefs.epoch_jyear:.2f} moved to {scene.start_time:%Y-%m-%d}{differ}"
         )
-    source = f"tracker.map {Path(scene.tracker.map).name}" if scene.tracker.map else "tracker.survey"
+    source = (
+        f"tracker.map {Path(scene.tracker.map).name}" if scene.tracker.map else "tracker.survey"
+    )
     sigmas = {
         "LEDs": beliefs.led_sigma_m,
         "the lever": beliefs.lever_sigma_m,
@@ -208,15 +238,23 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
     if known:
         lines.append(f"{', '.join(known)} about each axis ({source})")
     if instrument := scene.tracker.survey.instrument:
-        lines.append(f"LEDs measured by a {instrument.kind.replace('_', ' ')} (tracker.survey.instrument)")
+        lines.append(
+            f"LEDs measured by a {instrument.kind.replace('_', ' ')} (tracker.survey.instrument)"
+        )
     elif not known and isinstance(scene.light, DomeConfig):
         lines.append("every LED and the lever exactly (tracker.survey)")
     if beliefs.rotation_rad.any():
-        lines.append(f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″")
+        lines.append(
+            f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″"
+        )
     if beliefs.lever_error_m.any() and isinstance(scene.light, DomeConfig):
-        lines.append(f"the lever wrong by {1e3 * np.linalg.norm(beliefs.lever_error_m):.3g} mm (assumed_camera_body)")
+        lines.append(
+            f"the lever wrong by {1e3 * np.linalg.norm(beliefs.lever_error_m):.3g} mm (assumed_camera_body)"
+        )
     if beliefs.focal_error:
-        lines.append(f"the focal length wrong by {100 * beliefs.focal_error:+.3g} % (assumed_focal_length)")
+        lines.append(
+            f"the focal length wrong by {100 * beliefs.focal_error:+.3g} % (assumed_focal_length)"
+        )
     if beliefs.focal_sigma:
         lines.append(f"the focal length to {100 * beliefs.focal_sigma:.2g} % ({source})")
     if beliefs.camera.distortion != scene.camera.distortion:

@@ -56,16 +56,20 @@ def context_of(lab: Lab) -> Context:
     """The context of a lab. Raises InputError for a map or a catalog that cannot be read."""
     camera = CameraModel.of(lab)
     believed = beliefs.of(lab, camera)
-    light, lights = lab.scene.light, believed.lights
+    light = lab.scene.light
+    lights = believed.lights
     surface = build_surface(light.surface) if isinstance(light, DomeConfig) else None
     timing_s = timing_sigma_s(lights.period_s, lights.on_s, lab.scene.exposure.time_s)
     row = np.argsort(lights.id, kind="stable")
-    return Context(lab, assumed_settings(lab.scene), believed, camera, surface, lights.id[row], row, timing_s)
+    return Context(
+        lab, assumed_settings(lab.scene), believed, camera, surface, lights.id[row], row, timing_s
+    )
 
 
 def threshold_e(context: Context) -> float:
     """Electrons above the background from which a pixel, filtered by the binomial, belongs to a detection."""
-    settings, camera = context.settings, context.camera
+    settings = context.settings
+    camera = context.camera
     if settings.detector == "thesis":
         full_e = full_scale_e(context.lab.scene.camera.detector)
         return max(THESIS_THRESHOLD * full_e - camera.background_e, 1.0)
@@ -86,15 +90,21 @@ def detected_area_px(view: View, context: Context) -> Floats:
     blur2_px2 = view.blur2_px2 + BINOMIAL_VARIANCE_PX2
     share = peak_share(blur2_px2, view.disk_px, view.defocus_px, view.streak_length_px)
     ratio = np.maximum(view.electrons * share / threshold_e(context), 1e-9)
-    large, small = np.maximum(view.disk_px, view.defocus_px), np.minimum(view.disk_px, view.defocus_px)
+    large = np.maximum(view.disk_px, view.defocus_px)
+    small = np.minimum(view.disk_px, view.defocus_px)
     radius = large + np.sqrt((blur2_px2 + small**2 / 4) * 2 * np.maximum(np.log(ratio), 0))
-    return np.asarray(np.where(ratio > 1, np.pi * radius**2 + 2 * radius * view.streak_length_px, 0.0))
+    return np.asarray(
+        np.where(ratio > 1, np.pi * radius**2 + 2 * radius * view.streak_length_px, 0.0)
+    )
 
 
 def usable(view: View, context: Context) -> View:
     """The lights that the tracker detects whole on the chip, at most `tracker.brightest` of them."""
-    settings, config = context.settings, context.lab.scene.camera
-    edge = np.minimum(view.xy_px, np.array([config.width_px, config.height_px]) - 1 - view.xy_px).min(axis=1)
+    settings = context.settings
+    config = context.lab.scene.camera
+    edge = np.minimum(
+        view.xy_px, np.array([config.width_px, config.height_px]) - 1 - view.xy_px
+    ).min(axis=1)
     area = detected_area_px(view, context)
     found = np.flatnonzero((area >= settings.min_area_px) & (edge > np.sqrt(area / np.pi)))
     return view.take(found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs])
@@ -108,16 +118,20 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     varies by p from pixel to pixel, p^2 sum(I^2 x^2) / N^2, which is p^2 / (8 pi) for a Gaussian and p^2 / (4 pi) for a
     disk; the mean time of pulsed light, timing^2 v v'; and the plateau of a saturated image.
     """
-    lab, camera = context.lab, context.camera
-    noise_e2, n_e = camera.noise_e**2, np.maximum(view.electrons, 1e-9)
+    lab = context.lab
+    camera = context.camera
+    noise_e2 = camera.noise_e**2
+    n_e = np.maximum(view.electrons, 1e-9)
     along2 = view.sigma_px**2 + view.streak_length_px**2 / 12
     if context.settings.centroider == "cog":
         side = 2 * (np.sqrt(detected_area_px(view, context) / np.pi) + COG_MARGIN_PX)
         floor = noise_e2 * side**4 / (12 * n_e**2)
-        along, across = along2 / n_e + floor, view.sigma_px**2 / n_e + floor
+        along = along2 / n_e + floor
+        across = view.sigma_px**2 / n_e + floor
     else:
         loss = fit_loss(2 * np.pi * np.sqrt(along2) * view.sigma_px * noise_e2 / n_e)
-        along, across = along2 / n_e * loss, view.sigma_px**2 / n_e * loss
+        along = along2 / n_e * loss
+        across = view.sigma_px**2 / n_e * loss
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
     varies = lab.scene.camera.detector.prnu if prnu is None else prnu
     pattern = varies**2 / (8 * np.pi) * (1 + disk)
@@ -153,8 +167,11 @@ def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:
         count = int(exposure_s / period) + 2
         if on >= period or count > MAX_PULSES:
             continue
-        begin = (np.arange(PHASES) + 0.5)[:, None] / PHASES * period + (np.arange(count) - 1) * period
-        first, last = np.clip(begin, 0, exposure_s), np.clip(begin + on, 0, exposure_s)
+        begin = (np.arange(PHASES) + 0.5)[:, None] / PHASES * period + (
+            np.arange(count) - 1
+        ) * period
+        first = np.clip(begin, 0, exposure_s)
+        last = np.clip(begin + on, 0, exposure_s)
         lit = last - first
         total = lit.sum(axis=1)
         mean = (lit * (first + last) / 2).sum(axis=1)[total > 0] / total[total > 0]

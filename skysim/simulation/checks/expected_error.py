@@ -94,13 +94,20 @@ def mean_root(variance_rad2: Floats) -> float:
 
 
 def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
-    sigma_m, survey = context.beliefs.led_sigma_m, context.lab.scene.tracker.survey
+    sigma_m = context.beliefs.led_sigma_m
+    survey = context.lab.scene.tracker.survey
     place_m = context.beliefs.lights.place[view.row, :3]
     own_m2 = survey_errors.led_covariance_m2(place_m, survey)
     if own_m2 is not None:
-        gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()  # of the image with respect to a place in the lab
+        gradient_lab = (
+            view.gradient @ lab_from_cam.inv().as_matrix()
+        )  # of the image with respect to a place in the lab
         return Independent(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
-    return Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)) if sigma_m else None
+    return (
+        Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
+        if sigma_m
+        else None
+    )
 
 
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -108,7 +115,9 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     instrument = context.lab.scene.tracker.survey.instrument
     if instrument is None:
         return None
-    shifts_m = total_station.common_displacements_m(instrument, context.beliefs.lights.place[view.row, :3])
+    shifts_m = total_station.common_displacements_m(
+        instrument, context.beliefs.lights.place[view.row, :3]
+    )
     parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]
     return Common(np.concatenate(parts, axis=2)) if parts else None
 
@@ -119,7 +128,8 @@ def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common
 
 
 def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
-    sigma_m, surface = context.beliefs.surface_sigma_m, context.surface
+    sigma_m = context.beliefs.surface_sigma_m
+    surface = context.surface
     if not sigma_m or surface is None:
         return None
     normal = surface.inward(context.beliefs.lights.place[view.row, :3])
@@ -130,21 +140,27 @@ def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Com
     rotation_rad = context.beliefs.rotation_rad
     if not rotation_rad.any():
         return None
-    return displacement(view, np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3]), lab_from_cam)
+    return displacement(
+        view, np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3]), lab_from_cam
+    )
 
 
 def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     error_m = context.beliefs.lever_error_m
     if not error_m.any() or context.surface is None:
         return None
-    return Common(-(view.gradient @ context.lab.camera.mount.cam_from_body.apply(error_m))[:, :, None])
+    return Common(
+        -(view.gradient @ context.lab.camera.mount.cam_from_body.apply(error_m))[:, :, None]
+    )
 
 
 def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
     if not error:
         return None
-    return Common(error * (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None])
+    return Common(
+        error * (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
+    )
 
 
 def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -169,7 +185,9 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     if not error_s:
         return None
     delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
-    return Common((view.streak_px / context.lab.scene.exposure.time_s * delay_s[:, None])[:, :, None])
+    return Common(
+        (view.streak_px / context.lab.scene.exposure.time_s * delay_s[:, None])[:, :, None]
+    )
 
 
 def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -178,7 +196,9 @@ def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -
 
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes."""
-    return Common(np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None])
+    return Common(
+        np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None]
+    )
 
 
 CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
@@ -195,8 +215,13 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "angular acceleration": angular_acceleration,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
-OUTSIDE_OF_GATE = ("survey set-up", "surface survey")  # drawn once: in the tracker's covariance, not in its radius
-CENTROIDS, SOLVER = "centroid noise", "solver"  # the causes that are not displacements of all images
+OUTSIDE_OF_GATE = (
+    "survey set-up",
+    "surface survey",
+)  # drawn once: in the tracker's covariance, not in its radius
+# the causes that are not displacements of all images
+CENTROIDS = "centroid noise"
+SOLVER = "solver"
 EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 
 
@@ -230,11 +255,16 @@ def covariance(gain: Floats, errors: Independent | Common) -> Floats:
 
 def believed_sigma_px(view: View, noise: Independent, context: Context) -> Floats:
     """(n,) standard deviation of an image position as the tracker believes it: centroid, floor and LED survey."""
-    settings, beliefs = context.settings, context.beliefs
+    settings = context.settings
+    beliefs = context.beliefs
     own2 = np.trace(noise.covariance_px2, axis1=1, axis2=2) / 2
     survey_px = 0.0
     if beliefs.led_sigma_m:
-        survey_px = context.camera.optics.camera.focal_px * beliefs.led_sigma_m / float(view.distance_m.min())
+        survey_px = (
+            context.camera.optics.camera.focal_px
+            * beliefs.led_sigma_m
+            / float(view.distance_m.min())
+        )
     return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
 
 
@@ -261,7 +291,10 @@ def finds_focal_length(context: Context) -> bool:
     scene = context.lab.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
-    under_stars = isinstance(scene.light, StarsConfig) and (scene.tracker.identifier or "default") == "default"
+    under_stars = (
+        isinstance(scene.light, StarsConfig)
+        and (scene.tracker.identifier or "default") == "default"
+    )
     return under_stars and abs(context.beliefs.focal_error) < WRONG_FOCAL
 
 
@@ -273,8 +306,15 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     """
     if len(view) < MIN_EVIDENCE_MATCHES:
         return None
-    causes = {name: CAUSES[name](view, lab_from_cam, context) for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)}
-    shifts = {name: errors.displacement_px for name, errors in causes.items() if isinstance(errors, Common)}
+    causes = {
+        name: CAUSES[name](view, lab_from_cam, context)
+        for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)
+    }
+    shifts = {
+        name: errors.displacement_px
+        for name, errors in causes.items()
+        if isinstance(errors, Common)
+    }
     if context.beliefs.focal_sigma or finds_focal_length(context):
         shifts.pop("focal length", None)  # the tracker allows for it
     if not shifts:
@@ -284,9 +324,15 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         gain = gains(view, sigma_px)
     except np.linalg.LinAlgError:
         return None
-    left = {name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift) for name, shift in shifts.items()}
+    left = {
+        name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift)
+        for name, shift in shifts.items()
+    }
     rms = {name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()}
-    known = sum((shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER), np.zeros((len(view), 2, 1)))
+    known = sum(
+        (shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER),
+        np.zeros((len(view), 2, 1)),
+    )
     drawn = [shift for name, shift in left.items() if name in OUTSIDE_OF_GATE]
     residual_px = np.linalg.norm(np.concatenate([known, *drawn], axis=2), axis=(1, 2))
     return Mismatch(residual_px, GATE_SIGMA * sigma_px, rms)
@@ -295,7 +341,8 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
 def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """(3,) rotation vector in camera axes by which the dome's solver errs for exact rays; None if it is exact."""
     lab = context.lab
-    name, surface = context.settings.solver, context.surface
+    name = context.settings.solver
+    surface = context.surface
     if surface is None or name in EXACT_SOLVERS:
         return None
     place_m = context.beliefs.lights.place[view.row, :3]
@@ -305,21 +352,28 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
     body_from_lab = lab.camera.mount.cam_from_body.inv() * lab_from_cam.inv()
     try:
-        solved, _ = SOLVERS[name](rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab)
+        solved, _ = SOLVERS[name](
+            rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab
+        )
     except (ValueError, np.linalg.LinAlgError):
         return None
     cam_from_body = lab.camera.mount.cam_from_body
-    return np.asarray((cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()).as_rotvec())
+    return np.asarray(
+        (cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()).as_rotvec()
+    )
 
 
 def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expected:
     """The expected errors at some attitudes with the lights that the tracker uses there."""
-    cross, roll = ({name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2))
+    cross, roll = (
+        {name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2)
+    )
     cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
         variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
         for name, variance in variances.items():
-            cross[name][a], roll[name][a] = variance[:2].sum(), variance[2]
+            cross[name][a] = variance[:2].sum()
+            roll[name][a] = variance[2]
     return Expected(cross, roll)
 
 
@@ -337,7 +391,13 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
         gain = gains(view, believed_sigma_px(view, noise, context), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
-    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()} | {CENTROIDS: noise}
-    variances = {name: np.diag(covariance(gain, errors)) for name, errors in causes.items() if errors is not None}
+    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()} | {
+        CENTROIDS: noise
+    }
+    variances = {
+        name: np.diag(covariance(gain, errors))
+        for name, errors in causes.items()
+        if errors is not None
+    }
     bias = solver_error(view, lab_from_cam, context)
     return variances if bias is None else variances | {SOLVER: bias**2}

@@ -44,24 +44,48 @@ class Fact(NamedTuple):
 def field_of_view(context: Context, samples: Samples) -> Fact:
     """Angles between the centers of opposite edges and corners of the chip, without distortion."""
     lens = context.camera.optics.camera.calibration()
-    return Fact("field of view", [lens.field_text()], {"field_deg": list(lens.field_deg), "arcsec_px": lens.arcsec_px})
+    return Fact(
+        "field of view",
+        [lens.field_text()],
+        {"field_deg": list(lens.field_deg), "arcsec_px": lens.arcsec_px},
+    )
 
 
 def lights_in_field(context: Context, samples: Samples) -> Fact:
     """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
-    scene, mount = context.lab.scene, context.lab.camera.mount
-    lines, values = [], {}
-    reach = "in the whole sky" if isinstance(scene.light, StarsConfig) else reached(context, samples)
-    for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", reach, samples.reach)):
-        counts, seen = sampled.counts(), np.array([len(view) for view in sampled.seen])
+    scene = context.lab.scene
+    mount = context.lab.camera.mount
+    lines = []
+    values = {}
+    reach = (
+        "in the whole sky" if isinstance(scene.light, StarsConfig) else reached(context, samples)
+    )
+    for key, what, sampled in (
+        ("frames", "at the frames", samples.frames),
+        ("reach", reach, samples.reach),
+    ):
+        counts = sampled.counts()
+        seen = np.array([len(view) for view in sampled.seen])
         where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
         limit = context.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
-        missed = f" (of {seen.mean():.1f} on the chip{cut})" if seen.mean() > counts.mean() + 0.5 else ""
-        hidden = {name: count / len(counts) for name, count in sum(sampled.hidden, Counter[str]()).most_common()}
+        missed = (
+            f" (of {seen.mean():.1f} on the chip{cut})" if seen.mean() > counts.mean() + 0.5 else ""
+        )
+        hidden = {
+            name: count / len(counts)
+            for name, count in sum(sampled.hidden, Counter[str]()).most_common()
+        }
         behind = "".join(f"; {count:.1f} more are behind {name}" for name, count in hidden.items())
-        lines.append(f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}")
-        values[key] = {"mean": counts.mean(), "least": counts.min(), "least_at": where, "on_chip": seen.mean()}
+        lines.append(
+            f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}"
+        )
+        values[key] = {
+            "mean": counts.mean(),
+            "least": counts.min(),
+            "least_at": where,
+            "on_chip": seen.mean(),
+        }
         values[key] |= {"hidden": hidden} if hidden else {}
     return Fact("lights in the field", lines, values)
 
@@ -69,7 +93,10 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
 def other_lights(context: Context, samples: Samples) -> Fact | None:
     """Lights at the frames that the tracker detects and does not know, by their names; None if there are none."""
     others = samples.frames.others
-    most = {name: max(len(one.get(name, ())) for one in others) for name in {name for one in others for name in one}}
+    most = {
+        name: max(len(one.get(name, ())) for one in others)
+        for name in {name for one in others for name in one}
+    }
     if not most:
         return None
     frames = {name: sum(name in one for one in others) for name in most}
@@ -77,7 +104,9 @@ def other_lights(context: Context, samples: Samples) -> Fact | None:
         f"{name}: up to {most[name]} at {frames[name]} of {len(others)} frames, which the tracker does not know"
         for name in sorted(most)
     ]
-    values = {name: {"most": most[name], "share": frames[name] / len(others)} for name in sorted(most)}
+    values = {
+        name: {"most": most[name], "share": frames[name] / len(others)} for name in sorted(most)
+    }
     return Fact("other lights", lines, values)
 
 
@@ -93,8 +122,12 @@ def spot(context: Context, samples: Samples) -> Fact:
     sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
     lens_px = GAUSSIAN_WIDTH * context.camera.lens_px
     if not len(sigma):
-        return Fact("image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px})
-    width, disk_px, defocus_px = (float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus))
+        return Fact(
+            "image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px}
+        )
+    width, disk_px, defocus_px = (
+        float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
+    )
     led = f", LED {disk_px:.1f}" if isinstance(context.lab.scene.light, DomeConfig) else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
@@ -108,13 +141,19 @@ def fill(context: Context, samples: Samples) -> Floats:
 
 def peak(context: Context, samples: Samples) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
-    ratio, full_e = fill(context, samples), full_scale_e(context.lab.scene.camera.detector)
+    ratio = fill(context, samples)
+    full_e = full_scale_e(context.lab.scene.camera.detector)
     if not len(ratio):
         return Fact("peak", ["no light in the field"], {"full_e": full_e})
     full = float((ratio >= 1).mean())
     text = f"brightest light {ratio.max():.3g}, median {np.median(ratio):.2g} of saturation ({full_e:.0f} electrons)"
     full_text = f"; {100 * full:.0f} % saturated" if full else ""
-    values = {"brightest": ratio.max(), "median": np.median(ratio), "saturated": full, "full_e": full_e}
+    values = {
+        "brightest": ratio.max(),
+        "median": np.median(ratio),
+        "saturated": full,
+        "full_e": full_e,
+    }
     return Fact("peak", [text + full_text], values)
 
 
@@ -122,15 +161,23 @@ def smear(context: Context, samples: Samples) -> Fact:
     """Path of the images during an exposure at the rates of the frames."""
     frames = samples.frames
     rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
-    length_px = np.array([np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known])
+    length_px = np.array(
+        [np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known]
+    )
     fastest = int(rate_deg_s.argmax())
     text = (
         f"{length_px[fastest]:.2g} px at {rate_deg_s[fastest]:.3g} deg/s, the fastest frame; median"
         f" {np.median(length_px):.2g} px"
     )
-    values = {"largest_px": length_px[fastest], "median_px": np.median(length_px), "rate_deg_s": rate_deg_s[fastest]}
+    values = {
+        "largest_px": length_px[fastest],
+        "median_px": np.median(length_px),
+        "rate_deg_s": rate_deg_s[fastest],
+    }
     if length_px[fastest] > 0:
-        width_px = GAUSSIAN_WIDTH * float(np.median(np.concatenate([view.sigma_px for view in frames.known])))
+        width_px = GAUSSIAN_WIDTH * float(
+            np.median(np.concatenate([view.sigma_px for view in frames.known]))
+        )
         values["width_rate_deg_s"] = rate_deg_s[fastest] * width_px / length_px[fastest]
         text += f"; as long as the image is wide at {short(values['width_rate_deg_s'])} deg/s"
     return Fact("smear", [text], values)
@@ -160,7 +207,9 @@ class CapMargin(NamedTuple):
         )
 
 
-def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None) -> CapMargin | None:
+def cap_margin(
+    context: Context, samples: Samples, tilt_deg: float | None = None
+) -> CapMargin | None:
     """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
     tilt_deg : the greatest of the attitudes in reach if None
@@ -168,44 +217,64 @@ def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None
     from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
     `light.layout.cap_deg` is compared with.
     """
-    light, camera = context.lab.scene.light, context.camera.optics.camera
+    light = context.lab.scene.light
+    camera = context.camera.optics.camera
     if not isinstance(light, DomeConfig) or context.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
-    cap_deg = max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else float(points.cap_deg)
+    cap_deg = (
+        max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else float(points.cap_deg)
+    )
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     size_px = (camera.width_px, camera.height_px)
-    edge, corner = (field_reach_deg(context, radius_px, tilt_deg) for radius_px in (max(size_px) / 2, camera.corner_px))
+    edge, corner = (
+        field_reach_deg(context, radius_px, tilt_deg)
+        for radius_px in (max(size_px) / 2, camera.corner_px)
+    )
     return CapMargin(cap_deg, tilt_deg, edge, corner, float(points.cap_deg))
 
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
     """Greatest angle from the zenith, at the bearing, at which a circle of the field meets the dome at a tilt."""
-    mount, surface, azimuth = context.lab.camera.mount, context.surface, 2 * np.pi * np.arange(SIDES) / SIDES
+    mount = context.lab.camera.mount
+    surface = context.surface
+    azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
-    radius, tilt_rad = radius_px / context.camera.optics.camera.focal_px, math.radians(tilt_deg)
+    radius = radius_px / context.camera.optics.camera.focal_px
+    tilt_rad = math.radians(tilt_deg)
     rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
     needed_deg = 0.0
-    for lab_from_body in Rotation.from_euler("ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])):
+    for lab_from_body in Rotation.from_euler(
+        "ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])
+    ):
         rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
         # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
         met = np.where(np.isnan(met), rays, met)
-        needed_deg = max(needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max()))
+        needed_deg = max(
+            needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max())
+        )
     return needed_deg
 
 
 def cap(context: Context, samples: Samples) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
-    found, vehicle = cap_margin(context, samples), context.lab.scene.vehicle
+    found = cap_margin(context, samples)
+    vehicle = context.lab.scene.vehicle
     if found is None:
         return None
-    wider = f", shell and wires to cap_deg, {found.limit_deg:.3g}°" if found.limit_deg > found.cap_deg else ""
-    lines = [f"LEDs to {found.cap_deg:.3g}° from the zenith{wider}; at a tilt of {found.tilt_deg:.1f}° {found.text}"]
+    wider = (
+        f", shell and wires to cap_deg, {found.limit_deg:.3g}°"
+        if found.limit_deg > found.cap_deg
+        else ""
+    )
+    lines = [
+        f"LEDs to {found.cap_deg:.3g}° from the zenith{wider}; at a tilt of {found.tilt_deg:.1f}° {found.text}"
+    ]
     values = {**found._asdict(), "margin_deg": found.cap_deg - found.needed_deg}
     if vehicle.mount == "air_bearing" and vehicle.tilt_stop_deg > found.tilt_deg + 0.05:
         stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
@@ -217,20 +286,28 @@ def cap(context: Context, samples: Samples) -> Fact | None:
 
 def room(context: Context, samples: Samples) -> Fact | None:
     """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
-    light, surface = context.lab.scene.light, context.surface
+    light = context.lab.scene.light
+    surface = context.surface
     if not isinstance(light, DomeConfig) or light.room is None or surface is None:
         return None
-    limits, values = light.room, fit(light.room, surface, light.layout.cap_deg)
+    limits = light.room
+    values = fit(light.room, surface, light.layout.cap_deg)
     x_m, y_m, z_m = values["extent_m"]
-    floor = [f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)]
+    floor = [
+        f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)
+    ]
     text = f"{x_m:.2f} x {y_m:.2f} x {z_m:.2f} m along x, y, z (room: {floor[0]} x {floor[1]})"
     if limits.bearing_height_m is not None:
         ceiling = f" of {limits.height_m:.2f} m" if limits.height_m is not None else ""
         text = f"top {values['top_m']:.2f} m{ceiling}, rim {values['rim_m']:.2f} m above the floor; {text}"
     if limits.door_m is not None:
         part = "the shell" if limits.segments == 1 else f"each of {limits.segments} segments"
-        sides, door = (" x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m))
-        text += f"; {part} goes into a box of {sides} m, shortest side first: fits the door of {door} m"
+        sides, door = (
+            " x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m)
+        )
+        text += (
+            f"; {part} goes into a box of {sides} m, shortest side first: fits the door of {door} m"
+        )
     return Fact("room", [text], values)
 
 
@@ -240,12 +317,15 @@ def depth_of_focus(context: Context, samples: Samples) -> Fact:
     spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
     near_m = 1 / (1 / camera.focus_m + spread)
     far_m = 1 / (1 / camera.focus_m - spread) if 1 / camera.focus_m > spread else math.inf
-    near, far = (f"{value:.3g} m" if math.isfinite(value) else "infinity" for value in (near_m, far_m))
+    near, far = (
+        f"{value:.3g} m" if math.isfinite(value) else "infinity" for value in (near_m, far_m)
+    )
     text = f"from {near} to {far} (defocus below one pixel)"
     distance_m = np.concatenate([sampled.joined("distance_m") for sampled in samples])
     values = {"near_m": near_m, "far_m": far_m}
     if len(distance_m) and np.isfinite(distance_m).all():
-        low_m, high_m = distance_m.min(), distance_m.max()
+        low_m = distance_m.min()
+        high_m = distance_m.max()
         within = "within" if near_m <= low_m and high_m <= far_m else "not all within"
         text += f"; LEDs at {low_m:.3g} to {high_m:.3g} m: {within}"
         values |= {"nearest_led_m": low_m, "farthest_led_m": high_m}
@@ -273,10 +353,14 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
 
 def expected_error(context: Context, samples: Samples) -> Fact:
     """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
-    scene, mount = context.lab.scene, context.lab.camera.mount
+    scene = context.lab.scene
+    mount = context.lab.camera.mount
     lines: list[str] = []
     values: dict[str, Any] = {}
-    for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", "in reach", samples.reach)):
+    for key, what, sampled in (
+        ("frames", "at the frames", samples.frames),
+        ("reach", "in reach", samples.reach),
+    ):
         cross, roll = sampled.error.rms_arcsec()
         failing = int(np.isnan(sampled.error.total("roll")).sum())
         few = f"; too few lights at {failing} of {len(sampled.seen)}" if failing else ""
@@ -285,16 +369,28 @@ def expected_error(context: Context, samples: Samples) -> Fact:
             n = int(np.nanargmax(sampled.error.total("roll")))
             where = attitudes.describe(sampled.attitudes, n, scene, mount)
             worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
-        errors = f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)" if cross == cross else "no solution"
+        errors = (
+            f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
+            if cross == cross
+            else "no solution"
+        )
         lines.append(f"{what}: {errors}{worst}{few}")
         values[key] = {"cross_arcsec": cross, "roll_arcsec": roll, "without_solution": failing}
-        values[key] |= {f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")}
+        values[key] |= {
+            f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
+        }
     chosen = samples.frames if np.isfinite(values["frames"]["roll_arcsec"]) else samples.reach
-    lines += [f"{angle}: {cause_text(chosen, angle)}" for angle in ("cross", "roll") if causes(chosen, angle)]
+    lines += [
+        f"{angle}: {cause_text(chosen, angle)}"
+        for angle in ("cross", "roll")
+        if causes(chosen, angle)
+    ]
     lines.append("cross: sqrt(x² + y²), x and y the errors about both axes across the boresight")
     named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
     if named & {*SURVEYED, *(["focal length"] if context.beliefs.focal_sigma else [])}:
-        lines.append("of the survey: 1σ over surveys; one dome has one survey, whose error stays the same")
+        lines.append(
+            "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
+        )
     return Fact("expected error", lines, values)
 
 
@@ -307,7 +403,9 @@ def causes(sampled: Sampled, angle: str) -> dict[str, float]:
     by_cause = sampled.error.by_cause(angle)
     known = np.isfinite(sampled.error.total(angle))
     size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
-    return {name: value for name, value in sorted(size.items(), key=lambda item: -item[1]) if value > 0}
+    return {
+        name: value for name, value in sorted(size.items(), key=lambda item: -item[1]) if value > 0
+    }
 
 
 def cause_text(sampled: Sampled, angle: str) -> str:

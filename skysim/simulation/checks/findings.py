@@ -30,25 +30,38 @@ from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.background import BACKGROUND
 
-MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
+MAX_SATURATED = (
+    0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
+)
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
-SHORTEST_S, LARGEST_F_NUMBER = 10e-6, 22.0  # of the cameras and lenses that advice names
+# of the cameras and lenses that advice names
+SHORTEST_S = 10e-6
+LARGEST_F_NUMBER = 22.0
 FILTER_BELOW = 0.1  # factor of the light that calls for a filter
 MIN_LIGHTS = 4  # that an identification needs
 MIN_DETECTED = 0.5  # fraction of the lights on the chip that the tracker should detect
-MAX_FEW, MAX_FEW_SKY = 0.02, 0.5  # fraction of the directions in reach that may have fewer; of the whole sky
-HIGH_THRESHOLD = 20.0  # sigma, beyond which the threshold is the reason that lights are not detected
+# fraction of the directions in reach that may have fewer; of the whole sky
+MAX_FEW = 0.02
+MAX_FEW_SKY = 0.5
+HIGH_THRESHOLD = (
+    20.0  # sigma, beyond which the threshold is the reason that lights are not detected
+)
 MAX_BACKGROUND = 0.5  # of full scale
 MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's matching radius: more are not identified
-MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
+# a path that is longer than both gives a warning; in widths of the image
+MAX_SMEAR_PX = 4.0
+MAX_SMEAR_WIDTHS = 2.0
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
-MAX_TAG_RATIO, MAX_TAG_ARCSEC = 1.3, 1.0  # error of frames' times over the filter's claim; and the turn in that time
+# error of frames' times over the filter's claim; and the turn in that time
+MAX_TAG_RATIO = 1.3
+MAX_TAG_ARCSEC = 1.0
 
 
 def saturation(context: Context, samples: Samples) -> str:
     """Warn where many lights are saturated."""
-    ratio, scene = fill(context, samples), context.lab.scene
+    ratio = fill(context, samples)
+    scene = context.lab.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
     if full <= MAX_SATURATED or bright_background(context, samples):
         return ""
@@ -71,12 +84,16 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     An exposure is no shorter than SHORTEST_S and than the LED drive's cycle, in which each LED is lit once; a lens is
     not stopped down beyond LARGEST_F_NUMBER.
     """
-    scene, sources, cures = context.lab.scene, context.lab.camera.sources, dict[str, str]()
+    scene = context.lab.scene
+    sources = context.lab.camera.sources
+    cures = dict[str, str]()
     led = getattr(scene.light, "led", None)
     if led is not None and led.intensity_cd is not None:
         cures["light.led.intensity"] = f"{short(1e3 * factor * led.intensity_cd, 2)} mcd"
     elif led is not None:
-        cures["light.led.radiant_intensity"] = f"{short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
+        cures["light.led.radiant_intensity"] = (
+            f"{short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
+        )
     cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
     if factor * scene.exposure.time_s >= max(cycle_s, SHORTEST_S) or led is None:
         cures["exposure.time"] = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
@@ -87,7 +104,8 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
 
 def bright_background(context: Context, samples: Samples) -> str:
     """Warn where extended light alone fills the pixels."""
-    scene, camera = context.lab.scene, context.camera
+    scene = context.lab.scene
+    camera = context.camera
     full_e = full_scale_e(scene.camera.detector)
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
@@ -102,7 +120,8 @@ def bright_background(context: Context, samples: Samples) -> str:
 
 def dark_corners(context: Context, samples: Samples) -> str:
     """Warn where the lens passes no light to a part of the chip."""
-    camera, stops = context.camera.optics.camera, context.camera.optics.camera.vignetting
+    camera = context.camera.optics.camera
+    stops = context.camera.optics.camera.vignetting
     corner_deg = math.degrees(math.atan(camera.corner_px / camera.focal_px))
     if not isinstance(stops, TwoStopsConfig) or stops.cutoff_deg >= corner_deg:
         return ""
@@ -114,7 +133,8 @@ def dark_corners(context: Context, samples: Samples) -> str:
 
 def few_lights(context: Context, samples: Samples) -> str:
     """Warn where the tracker has too few lights: at the frames, or in reach."""
-    scene, mount = context.lab.scene, context.lab.camera.mount
+    scene = context.lab.scene
+    mount = context.lab.camera.mount
     needed = least_lights(scene)
     if any(find(context, samples) for find in (cap_too_small, dark_corners, bright_background)):
         return ""  # more lights where there are some would not help
@@ -139,7 +159,8 @@ def few_lights(context: Context, samples: Samples) -> str:
         return ""  # they are on the chip: `undetected` says why they are not detected
     if isinstance(scene.light, DomeConfig):
         return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
-    fainter, sky_mag = scene.tracker.limit_mag + 1, getattr(scene.light, "limit_mag", None)
+    fainter = scene.tracker.limit_mag + 1
+    sky_mag = getattr(scene.light, "limit_mag", None)
     if sky_mag is not None and sky_mag < scene.tracker.limit_mag:
         return f"light.limit_mag: {text}; change it to {scene.tracker.limit_mag:g}, the tracker's limit"
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
@@ -147,8 +168,11 @@ def few_lights(context: Context, samples: Samples) -> str:
 
 def hidden_lights(context: Context, samples: Samples) -> str:
     """Warn where something hides so many lights that the tracker has too few: at the frames."""
-    frames, scene, mount = samples.frames, context.lab.scene, context.lab.camera.mount
-    counts, hidden = frames.counts(), frames.hidden_counts()
+    frames = samples.frames
+    scene = context.lab.scene
+    mount = context.lab.camera.mount
+    counts = frames.counts()
+    hidden = frames.hidden_counts()
     few = (counts < least_lights(scene)) & (counts + hidden >= least_lights(scene))
     if not few.any():
         return ""
@@ -170,9 +194,11 @@ def least_lights(scene: Scene) -> int:
 
 def density_key(layout: Layout) -> str:
     """The key that sets how many LEDs a layout has."""
-    key, points = "light.layout", layout
+    key = "light.layout"
+    points = layout
     if isinstance(layout, OnPoints):
-        key, points = "light.layout.points", layout.points
+        key = "light.layout.points"
+        points = layout.points
     for name in ("count", "spacing_m", "limit_mag"):
         if getattr(points, name, None) is not None:
             return f"{key}.{name.removesuffix('_m')}"
@@ -183,7 +209,8 @@ def denser(layout: Layout, mean: float) -> str:
     """How to get a mean of three times the lights that an identification needs, from the mean number on the chip."""
     points = layout.points if isinstance(layout, OnPoints) else layout
     factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
-    count, spacing_m = getattr(points, "count", None), getattr(points, "spacing_m", None)
+    count = getattr(points, "count", None)
+    spacing_m = getattr(points, "spacing_m", None)
     if count is not None:
         return f"change it to {math.ceil(factor * count)}"
     if spacing_m is not None:
@@ -193,7 +220,8 @@ def denser(layout: Layout, mean: float) -> str:
 
 def undetected(context: Context, samples: Samples) -> str:
     """Warn where most of the lights on the chip are too faint or too small for the detector."""
-    scene, settings = context.lab.scene, context.settings
+    scene = context.lab.scene
+    settings = context.settings
     # As many as the tracker takes from a frame, if more are there.
     seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
     used = sum(map(len, samples.frames.used))
@@ -217,9 +245,12 @@ def undetected(context: Context, samples: Samples) -> str:
 
 def brighter(scene: Scene, factor: float, text: str) -> str:
     """The key that makes lights brighter by a factor, and its value: the exposure, if frames leave the time for it."""
-    exposure_s, led = factor * scene.exposure.time_s, getattr(scene.light, "led", None)
+    exposure_s = factor * scene.exposure.time_s
+    led = getattr(scene.light, "led", None)
     if exposure_s <= 1 / scene.exposure.rate_hz:
-        other = "light.led.intensity as much" if led is not None else "camera.f_number to a faster lens"
+        other = (
+            "light.led.intensity as much" if led is not None else "camera.f_number to a faster lens"
+        )
         return f"exposure.time: {text}; change it to {short(1e3 * exposure_s, 2)} ms, or {other}"
     if led is None:
         return f"camera.f_number: {text}; change it to {short(scene.camera.f_number / math.sqrt(factor), 2)}"
@@ -231,7 +262,8 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
 
 def not_where_expected(context: Context, samples: Samples) -> str:
     """Warn where errors that the tracker does not know of displace images beyond its matching radius."""
-    frames, scene = samples.frames, context.lab.scene
+    frames = samples.frames
+    scene = context.lab.scene
     cam_from_body = context.lab.camera.mount.cam_from_body
     found = [
         one
@@ -278,9 +310,13 @@ MISMATCH_KEYS = {
 }
 # What to change, from the scene and how many times too large the displacement is.
 CHANGES: dict[str, Callable[[Scene, float], str]] = {
-    "focal length": lambda scene, excess: f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm",
+    "focal length": lambda scene, excess: (
+        f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
+    ),
     "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
-    "assumed lever": lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
+    "assumed lever": lambda scene, excess: (
+        "leave it out, or fit the place with tracker.solver: pnp"
+    ),
     "rolling shutter": lambda scene, excess: (
         f"leave it out, so that the tracker corrects the rows for {short(row_time_us(scene), 3)} us each, or turn"
         f" {short(excess, 2)} times slower"
@@ -288,19 +324,28 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "survey set-up": lambda scene, excess: (
         f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
     ),
-    "surface survey": lambda scene, excess: f"change it to {short(1e3 * surface_error_m(scene) / excess, 2)} mm",
+    "surface survey": lambda scene, excess: (
+        f"change it to {short(1e3 * surface_error_m(scene) / excess, 2)} mm"
+    ),
 }
 
 
 def cap_too_small(context: Context, samples: Samples) -> str:
     """Warn where the field reaches beyond the LEDs at the greatest tilt."""
-    found, light = cap_margin(context, samples), context.lab.scene.light
+    found = cap_margin(context, samples)
+    light = context.lab.scene.light
     if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
         return ""
     if getattr(light.layout, "points", light.layout).kind == "listed":
         return ""  # its LEDs are where they are
-    key = "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
-    uncovered = "the tilt itself is not covered" if found.tilt_deg > found.cap_deg else "its edge has no LED"
+    key = (
+        "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
+    )
+    uncovered = (
+        "the tilt itself is not covered"
+        if found.tilt_deg > found.cap_deg
+        else "its edge has no LED"
+    )
     return (
         f"{key}: LEDs end at {found.cap_deg:.3g} deg from the zenith, but at a tilt of {found.tilt_deg:.1f} deg the"
         f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}, or"
@@ -311,7 +356,9 @@ def cap_too_small(context: Context, samples: Samples) -> str:
 def out_of_focus(context: Context, samples: Samples) -> str:
     """Warn where the defocus disk is wide beside the image in focus."""
     sampled = samples.frames
-    defocus, sigma, distance_m = (sampled.joined(name) for name in ("defocus_px", "sigma_px", "distance_m"))
+    defocus, sigma, distance_m = (
+        sampled.joined(name) for name in ("defocus_px", "sigma_px", "distance_m")
+    )
     if not len(defocus):
         return ""
     blur_px = 2 * float(np.median(defocus))
@@ -326,8 +373,10 @@ def out_of_focus(context: Context, samples: Samples) -> str:
 
 def long_smear(context: Context, samples: Samples) -> str:
     """Warn where images move by more than some pixels and than their own width."""
-    frames, scene = samples.frames, context.lab.scene
-    length_px, sigma = frames.joined("streak_length_px"), frames.joined("sigma_px")
+    frames = samples.frames
+    scene = context.lab.scene
+    length_px = frames.joined("streak_length_px")
+    sigma = frames.joined("sigma_px")
     if not len(length_px):
         return ""
     limit_px = max(MAX_SMEAR_PX, MAX_SMEAR_WIDTHS * GAUSSIAN_WIDTH * float(np.median(sigma)))
@@ -361,11 +410,15 @@ def unknown_tag_error(context: Context, samples: Samples) -> str:
 
 def thermal_drift(context: Context, samples: Samples) -> str:
     """Warn where dome, mount and lens drift so far that solutions err by more than expected."""
-    thermal_config, frames = context.lab.scene.thermal, samples.frames
+    thermal_config = context.lab.scene.thermal
+    frames = samples.frames
     if thermal_config is None:
         return ""
     at = frames.attitudes
-    turns = [drift_rad(*row, context) for row in zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)]
+    turns = [
+        drift_rad(*row, context)
+        for row in zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)
+    ]
     cross_rad = np.hypot(*np.array(turns)[:, :2].T)
     expected_rad = np.sqrt(frames.error.total("cross"))
     if not (cross_rad > expected_rad).any():
@@ -388,7 +441,9 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)
     sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
-    lights, mount, optics = context.beliefs.lights.take(view.row), context.lab.camera.mount, context.camera.optics
+    lights = context.beliefs.lights.take(view.row)
+    mount = context.lab.camera.mount
+    optics = context.camera.optics
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
     moved = thermal.camera_at(config, mount, optics, t_s)
     drifted_px = image_px(thermal.leds_at(config, lights, t_s), *moved, lab_from_body)

@@ -25,9 +25,21 @@ from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
 from skysim.sources.dome.placement.ambiguity import Ambiguity
 
-OWN_KEYS = ("camera.", "tracker.", "exposure.", "rotation_deg:")  # of a head; other findings are about the scene
-LEAST_ALIKE, MAP_WORK = 0.3, 60_000  # of an ambiguity map: least fraction sought, fields times LEDs in a field
-SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
+OWN_KEYS = (
+    "camera.",
+    "tracker.",
+    "exposure.",
+    "rotation_deg:",
+)  # of a head; other findings are about the scene
+# of an ambiguity map: least fraction sought, fields times LEDs in a field
+LEAST_ALIKE = 0.3
+MAP_WORK = 60_000
+SKY_FINDINGS = (
+    depth.sky_too_shallow,
+    depth.tracker_too_shallow,
+    claims.floor_too_small,
+    air.refraction,
+)
 
 
 class Check(NamedTuple):
@@ -38,7 +50,9 @@ class Check(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        numbers = {fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values} for fact in self.facts}
+        numbers = {
+            fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values} for fact in self.facts
+        }
         return {"facts": numbers, "findings": self.findings}
 
 
@@ -51,7 +65,11 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = lab.scene
-    first = [line for line in [assumptions.camera_outside_warning(scene, lab.camera.mount, lab.start)] if line]
+    first = [
+        line
+        for line in [assumptions.camera_outside_warning(scene, lab.camera.mount, lab.start)]
+        if line
+    ]
     if first:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(lab)
@@ -59,13 +77,19 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     if rate_body_rad_s is not None:
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
         frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
-    check_reference(guidance.plan(scene.motion, lab.start, lab.profiles), scene, lab.vehicle, lab.duration_s)
+    check_reference(
+        guidance.plan(scene.motion, lab.start, lab.profiles), scene, lab.vehicle, lab.duration_s
+    )
     samples = samples_of(context, frames, tilt_deg)
     facts = [
-        fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
+        fact
+        for build in (*FACTS, depth.faintest_star, claims.fact)
+        if (fact := build(context, samples)) is not None
     ]
     findings = [
-        line for find in (*FINDINGS, *SKY_FINDINGS, reflections.mirror_images) if (line := find(context, samples))
+        line
+        for find in (*FINDINGS, *SKY_FINDINGS, reflections.mirror_images)
+        if (line := find(context, samples))
     ]
     for finder in (bodies.bodies_near, stray.stray_light, stray.exclusion):
         findings += finder(context, samples)
@@ -114,14 +138,17 @@ def broken_assumptions(lab: Lab) -> list[str]:
 def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
     """Expected cross and roll error at the frames, of the facts of one camera; NaN without a solution."""
     frames = next((fact.values["frames"] for fact in facts if fact.name == "expected error"), None)
-    return (frames["cross_arcsec"], frames["roll_arcsec"]) if frames else (float("nan"), float("nan"))
+    return (
+        (frames["cross_arcsec"], frames["roll_arcsec"]) if frames else (float("nan"), float("nan"))
+    )
 
 
 def information(cross: float, roll: float) -> Floats:
     """(3, 3) inverse covariance about the camera's axes, rad^-2; zeros without a solution."""
     if not np.isfinite([cross, roll]).all():
         return np.zeros((3, 3))
-    across2, along2 = (cross * ARCSEC_RAD) ** 2 / 2, (roll * ARCSEC_RAD) ** 2
+    across2 = (cross * ARCSEC_RAD) ** 2 / 2
+    along2 = (roll * ARCSEC_RAD) ** 2
     return np.diag([1 / across2, 1 / across2, 1 / along2])
 
 
@@ -131,7 +158,8 @@ def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[fl
     Solutions of independent errors have the sum of their information: P^-1 = sum R_n P_n^-1 R_n^T with R_n the rotation
     from the axes of camera n to those of the main one.
     """
-    total, main = np.zeros((3, 3)), lab.camera.mount.cam_from_body
+    total = np.zeros((3, 3))
+    main = lab.camera.mount.cam_from_body
     for camera, error in zip(lab.cameras, errors, strict=True):
         R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
         total += R_main_from_cam @ information(*error) @ R_main_from_cam.T
@@ -145,9 +173,13 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together; facts : of each camera."""
     errors = [errors_arcsec(own) for own in facts]
     names = [head.name for head in lab.scene.heads]
-    lines = [f"{name}: {errors_text(*error)}" for name, error in zip(names, errors[1:], strict=True)]
+    lines = [
+        f"{name}: {errors_text(*error)}" for name, error in zip(names, errors[1:], strict=True)
+    ]
     combined = together_arcsec(lab, errors)
-    lines.append(f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts")
+    lines.append(
+        f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts"
+    )
     values = [
         {"name": name, "cross_arcsec": cross, "roll_arcsec": roll}
         for name, (cross, roll) in zip(names, errors[1:], strict=True)
@@ -158,11 +190,18 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
 
 def errors_text(cross: float, roll: float) -> str:
     """Expected errors as a sentence."""
-    return f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)" if cross == cross else "no solution"
+    return (
+        f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
+        if cross == cross
+        else "no solution"
+    )
 
 
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
     # A head is pointed elsewhere by its mount.
-    lines = [line.replace("motion.start:", "rotation_deg:", 1) if line not in main else line for line in own]
+    lines = [
+        line.replace("motion.start:", "rotation_deg:", 1) if line not in main else line
+        for line in own
+    ]
     return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]

@@ -70,15 +70,22 @@ def sampled(at: Attitudes, context: Context) -> Sampled:
         beam_of(main if math.isnan(t_s) else camera.lights, exposure)
         for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
     ]
-    known, seen, hidden = [], [], []
+    known = []
+    seen = []
+    hidden = []
     for exposure, beam, acceleration in zip(exposures, beams, at.accelerations(), strict=True):
         found, names = known_lights(beam, exposure, context, acceleration)
         known.append(found)
         seen.append(found.take(found.behind == VISIBLE))
         hidden.append(Counter(names[number] for number in found.behind[found.behind != VISIBLE]))
     used = [usable(view, context) for view in seen]
-    others = [other_lights(beam, exposure, context) for beam, exposure in zip(beams, exposures, strict=True)]
-    return Sampled(at, exposures, beams, known, seen, used, hidden, others, expected(used, at, context))
+    others = [
+        other_lights(beam, exposure, context)
+        for beam, exposure in zip(beams, exposures, strict=True)
+    ]
+    return Sampled(
+        at, exposures, beams, known, seen, used, hidden, others, expected(used, at, context)
+    )
 
 
 def known_lights(

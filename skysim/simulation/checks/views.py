@@ -125,14 +125,20 @@ class CameraModel(NamedTuple):
     @classmethod
     def of(cls, lab: Lab) -> CameraModel:
         """The main camera of a lab, with the background at its initial attitude."""
-        camera, detector = lab.scene.camera, lab.scene.camera.detector
+        camera = lab.scene.camera
+        detector = lab.scene.camera.detector
         exposure_s = lab.scene.exposure.time_s
         exposure = expected_exposure(lab.camera, lab.start, np.zeros(3), math.nan)
         glow_e = glow_by_light_e(beam_of(lab.camera.lights, exposure), exposure_s)
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
         pattern_e2 = (detector.dsnu * dark_e_s * exposure_s) ** 2 + detector.column_offset_e**2
-        read_e2 = detector.read_noise_e**2 + detector.reset_noise_e**2 + detector.gain_e_dn**2 / 12 + pattern_e2
+        read_e2 = (
+            detector.read_noise_e**2
+            + detector.reset_noise_e**2
+            + detector.gain_e_dn**2 / 12
+            + pattern_e2
+        )
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
         return cls(lab.camera.optics, lens_px, background_e, glow_e, noise_e, exposure_s)
@@ -166,14 +172,21 @@ def view(
     and its acceleration (3,) in body axes; the mean over the exposure T is -acceleration T^2 / 24.
     """
     assert lit.points is not None
-    mount, optics, exposure_s = exposure.mount, exposure.optics, camera.exposure_s
+    mount = exposure.mount
+    optics = exposure.optics
+    exposure_s = camera.exposure_s
     near = in_view(lit.points, optics, exposure.pose, reach=0.0)
-    xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(lit.points.take(near), optics, exposure.pose))
+    xy_px, distance_m, cos_out, cos_in = (
+        one[0] for one in project(lit.points.take(near), optics, exposure.pose)
+    )
     size = np.array([optics.camera.width_px, optics.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
     row = near[on_chip]
-    chosen, is_led = lit.points.take(row), lit.points.place[row, 3] > 0
-    xy_px, distance_m, cos_out, cos_in = (one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in))
+    chosen = lit.points.take(row)
+    is_led = lit.points.place[row, 3] > 0
+    xy_px, distance_m, cos_out, cos_in = (
+        one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in)
+    )
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
     electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * exposure_s
     arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
@@ -183,7 +196,10 @@ def view(
     rate_body_rad_s = exposure.trajectory.rate_at(exposure.t_s)
     streak_px, bend_px = (
         -factor * np.einsum("nij,j->ni", jacobian, mount.cam_from_body.apply(body))
-        for factor, body in ((exposure_s, rate_body_rad_s), (exposure_s**2 / 24, acceleration_body_rad_s2))
+        for factor, body in (
+            (exposure_s, rate_body_rad_s),
+            (exposure_s**2 / 24, acceleration_body_rad_s2),
+        )
     )
     if chosen.motion is not None:
         motion_cam = exposure.cam_from_lab.apply(chosen.motion[:, 0])
@@ -233,7 +249,8 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
 
 def peak_share(lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats) -> Floats:
     """(n,) share of the light in the brightest pixel; see the module's description."""
-    large, small = np.maximum(disk_px, defocus_px), np.minimum(disk_px, defocus_px)
+    large = np.maximum(disk_px, defocus_px)
+    small = np.minimum(disk_px, defocus_px)
     s2 = lens2_px2 + small**2 / 4
     still = -np.expm1(-(large**2) / (2 * s2)) / np.maximum(np.pi * large**2, 1e-12)
     still = np.where(large > 1e-3, still, 1 / (2 * np.pi * s2))

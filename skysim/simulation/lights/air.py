@@ -42,7 +42,10 @@ class Skyline(Obstacle):
 
     def during(self, exposure: Exposure) -> Lit:
         sky = self.air.at(exposure.time)
-        return Lit("the skyline", hides=Occluder("the skyline", lambda place: sky.below_horizon(place[:, :3])))
+        return Lit(
+            "the skyline",
+            hides=Occluder("the skyline", lambda place: sky.below_horizon(place[:, :3])),
+        )
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,9 @@ class AirGlow(Light):
     def glow(self, exposure: Exposure) -> Floats:
         """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
         toward, pixel_sr, shape = node_directions(exposure.optics)
-        view = viewing_geometry(toward, pixel_sr, exposure.optics, exposure.cam_from_lab, exposure.band)
+        view = viewing_geometry(
+            toward, pixel_sr, exposure.optics, exposure.cam_from_lab, exposure.band
+        )
         return air_glow(self.config, self.air.at(exposure.time), view).reshape(shape)
 
 

@@ -22,7 +22,12 @@ class Background(Light):
     glows: tuple[Glow, ...]
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit(BACKGROUND, glow=lambda: glow_map(self.glows, exposure.optics, exposure.cam_from_lab, exposure.band))
+        return Lit(
+            BACKGROUND,
+            glow=lambda: glow_map(
+                self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
+            ),
+        )
 
 
 def build(plan: Plan) -> Iterator[Light]:

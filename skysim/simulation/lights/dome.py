@@ -50,10 +50,16 @@ class LedDome(KnownLight):
         if self.thermal is not None:
             leds = leds_at(self.thermal, leds, exposure.t_s)
         if exposure.seeds is not None:
-            leds = self.pulsed(leds, exposure.seeds.run, exposure.index, exposure.window, exposure.t_s)
-        return Lit("LEDs", True, leds, self.emitter, edged=black_pixels(self.config, exposure, left))
+            leds = self.pulsed(
+                leds, exposure.seeds.run, exposure.index, exposure.window, exposure.t_s
+            )
+        return Lit(
+            "LEDs", True, leds, self.emitter, edged=black_pixels(self.config, exposure, left)
+        )
 
-    def pulsed(self, leds: Sources, seed: int, index: int, window: Window, middle_s: float) -> Sources:
+    def pulsed(
+        self, leds: Sources, seed: int, index: int, window: Window, middle_s: float
+    ) -> Sources:
         """The LEDs with their pulses and codes in a frame of the run of a seed; middle_s : mid-exposure."""
         timing = self.timing(seed)
         if timing.clocks:
@@ -79,10 +85,18 @@ class CollimatedDisplay(KnownLight):
     config: CollimatedDisplayConfig
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("stars", True, self.sources, self.emitter, edged=black_pixels(self.config, exposure))
+        return Lit(
+            "stars", True, self.sources, self.emitter, edged=black_pixels(self.config, exposure)
+        )
 
 
-def black_pixels(config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0) -> EdgedGlow:
+def black_pixels(
+    config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0
+) -> EdgedGlow:
     """The light of a display's black pixels; none without a display, or if its black is dark."""
-    optics, cam_from_lab, camera_m = exposure.optics, exposure.cam_from_lab, exposure.camera_m
-    return EdgedGlow(lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share)
+    optics = exposure.optics
+    cam_from_lab = exposure.cam_from_lab
+    camera_m = exposure.camera_m
+    return EdgedGlow(
+        lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share
+    )

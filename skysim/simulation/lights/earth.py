@@ -44,7 +44,9 @@ class LitEarth(DarkEarth):
     def during(self, exposure: Exposure) -> Lit:
         here = exposure.observer
         seen_from = (self.config, here.from_earth.position_m, sun_m(here.tt_jd))
-        optics, cam_from_lab, band = exposure.optics, exposure.cam_from_lab, exposure.band
+        optics = exposure.optics
+        cam_from_lab = exposure.cam_from_lab
+        band = exposure.band
         return (
             super()
             .during(exposure)

@@ -17,7 +17,9 @@ from skysim.sources.dome.led import Emitter
 
 def of_dome(config: DomeConfig, plan: Plan) -> KnownLight:
     """The LEDs of a dome. Raises InputError for LEDs off the surface, and for a dome that does not fit its room."""
-    return LedDome(dome.sources(config, plan.band), Emitter.from_config(config.led), config, plan.scene.thermal)
+    return LedDome(
+        dome.sources(config, plan.band), Emitter.from_config(config.led), config, plan.scene.thermal
+    )
 
 
 def of_display(config: CollimatedDisplayConfig, plan: Plan) -> KnownLight:

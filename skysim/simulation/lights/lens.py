@@ -28,7 +28,9 @@ class Baffle(Light):
     config: BaffleConfig
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
-        return beam.plus(Lit(STRAY_LIGHT, glow=lambda: float(sum(self.stray_e_s(beam, exposure).values()))))
+        return beam.plus(
+            Lit(STRAY_LIGHT, glow=lambda: float(sum(self.stray_e_s(beam, exposure).values())))
+        )
 
     def stray_e_s(self, beam: Beam, exposure: Exposure) -> dict[str, float]:
         """Electrons s^-1 px^-1 by the name of the body that sends them."""
@@ -36,7 +38,9 @@ class Baffle(Light):
         found = stray_of_bodies_e_s_m2(self.config, bodies, exposure.boresight)
         for lit in beam.lits:
             if lit.around is not None:
-                found[lit.name] = stray_around_e_s_m2(self.config, *lit.around(), exposure.boresight)
+                found[lit.name] = stray_around_e_s_m2(
+                    self.config, *lit.around(), exposure.boresight
+                )
         pixel_m2 = exposure.optics.camera.pixel_m**2
         return {name: light * pixel_m2 for name, light in found.items()}
 
@@ -64,7 +68,9 @@ class Ghosts(Light):
     ghosts: tuple[GhostConfig, ...]
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
-        paths = (Path(n, ghost_optics(exposure.optics, ghost)) for n, ghost in enumerate(self.ghosts, 1))
+        paths = (
+            Path(n, ghost_optics(exposure.optics, ghost)) for n, ghost in enumerate(self.ghosts, 1)
+        )
         return beam._replace(paths=(*beam.paths, *paths))
 
 

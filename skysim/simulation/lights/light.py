@@ -230,7 +230,10 @@ class Beam(NamedTuple):
 
     def before(self, lit: Lit) -> tuple[Occluder, ...]:
         """All that may hide the points of a light: what it is behind, and the discs, if it is at infinity."""
-        return (*lit.hidden_by, *(Occluder(disc.title, partial(behind_disc, disc)) for disc in self.discs))
+        return (
+            *lit.hidden_by,
+            *(Occluder(disc.title, partial(behind_disc, disc)) for disc in self.discs),
+        )
 
 
 def behind_disc(disc: BodyLight, place: Floats) -> NDArray[np.bool_]:

@@ -16,7 +16,9 @@ from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occlu
 from skysim.simulation.lights.plan import Plan
 from skysim.sources.dome.shell.surface import Surface, build_surface
 
-INWARD_FRACTION = 1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
+INWARD_FRACTION = (
+    1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
+)
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[
     for n, led_m in enumerate(position_m * (1 - INWARD_FRACTION)):
         ray = (camera_m - led_m)[None]
         wall_m = wall.meet(led_m, ray)[0]
-        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(ray)  # NaN, beneath the rim, is not
+        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(
+            ray
+        )  # NaN, beneath the rim, is not
     return behind
 
 

@@ -13,7 +13,16 @@ from dataclasses import replace
 from typing import Any
 
 from skysim.scene.sections.lights import LightConfig, add_kind
-from skysim.simulation.lights import air, background, earth, lens, obstacles, satellites, solar_system, wall
+from skysim.simulation.lights import (
+    air,
+    background,
+    earth,
+    lens,
+    obstacles,
+    satellites,
+    solar_system,
+    wall,
+)
 from skysim.simulation.lights.known import known_light
 from skysim.simulation.lights.light import Light
 from skysim.simulation.lights.plan import Plan

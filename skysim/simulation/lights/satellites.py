@@ -11,7 +11,12 @@ from skysim.scene.sections.orbit import SatellitesConfig
 from skysim.simulation.lights.light import Exposure, Light, Lit
 from skysim.simulation.lights.plan import Plan
 from skysim.sources.orbit.elements import Elements, read_elements
-from skysim.sources.orbit.satellites import MovingLight, as_sources, known_satellites, random_satellites
+from skysim.sources.orbit.satellites import (
+    MovingLight,
+    as_sources,
+    known_satellites,
+    random_satellites,
+)
 from skysim.sources.solar_system.observer import GcrsState
 
 
@@ -34,10 +39,14 @@ class Satellites(Light):
             def observer_at(after_s: float) -> GcrsState:
                 return exposure.viewpoint.state_at(exposure.t_s + after_s)
 
-            known = known_satellites(self.elements, self.config.standard_mag, exposure.view, exposure.time, observer_at)
+            known = known_satellites(
+                self.elements, self.config.standard_mag, exposure.view, exposure.time, observer_at
+            )
             found += known
         if self.config.random and exposure.seeds:
-            found += random_satellites(self.config.random, exposure.view, exposure.seeds.camera, exposure.index)
+            found += random_satellites(
+                self.config.random, exposure.view, exposure.seeds.camera, exposure.index
+            )
         points = as_sources(found, exposure.band) if found else None
         return Lit("satellites", points=points, satellites=tuple(light.truth for light in found))
 

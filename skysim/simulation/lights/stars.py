@@ -41,21 +41,32 @@ class StarsInOrbit(KnownLight):
         near = self.sources.take(self.sources.within(view.boresight, reach_rad))
         now_m_s = 1e3 * exposure.observer.velocity_km_s
         direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
-        return Lit("stars", True, replace(near, place=np.column_stack([direction, np.zeros(len(near))])), self.emitter)
+        return Lit(
+            "stars",
+            True,
+            replace(near, place=np.column_stack([direction, np.zeros(len(near))])),
+            self.emitter,
+        )
 
 
 def stars_of(config: StarsConfig, plan: Plan) -> KnownLight:
     """The stars of a scene at its start, in the lab's axes, which are the ICRS. Raises InputError."""
-    catalog, scene, viewpoint = plan.catalog, plan.scene, plan.viewpoint
+    catalog = plan.catalog
+    scene = plan.scene
+    viewpoint = plan.viewpoint
     assert catalog is not None
     if config.variability_seed is not None:
         if not catalog.scatter_mag.any():
-            raise InputError("light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0")
+            raise InputError(
+                "light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0"
+            )
         catalog = stars.varied(catalog, config.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = stars.AT_REST
     if config.bodies or config.satellites or config.air or viewpoint.orbit:
         velocity_m_s = viewpoint.state_at(0.0).velocity_m_s
-    shown = stars.sources(catalog, scene.start_time, config.limit_mag, Rotation.identity(), plan.band, velocity_m_s)
+    shown = stars.sources(
+        catalog, scene.start_time, config.limit_mag, Rotation.identity(), plan.band, velocity_m_s
+    )
     if viewpoint.orbit is None:
         return Stars(shown, Emitter())
     return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)

@@ -38,7 +38,9 @@ class WallGlow(Light):
 
     def glow(self, exposure: Exposure) -> Floats:
         """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
-        full = wall_glow(self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band)
+        full = wall_glow(
+            self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band
+        )
         return warm_up_factor(self.warm_up, exposure.t_s) * full
 
 
@@ -58,7 +60,9 @@ class Mirror(Light):
     def image(self, lit: Lit, exposure: Exposure) -> Lit:
         """The images of one light, which the same things hide."""
         assert lit.points is not None
-        images = images_in_wall(self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m)
+        images = images_in_wall(
+            self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m
+        )
         return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
 
 

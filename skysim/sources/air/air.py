@@ -15,7 +15,12 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.air import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.air import scintillation, starlight
-from skysim.sources.air.refraction import Refraction, Weather, standard_pressure_hpa, standard_temperature_c
+from skysim.sources.air.refraction import (
+    Refraction,
+    Weather,
+    standard_pressure_hpa,
+    standard_temperature_c,
+)
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
 from skysim.sources.solar_system.bodies import BodyLight
@@ -95,7 +100,9 @@ class Sky:
         place = np.column_stack([directions, lights.place[:, 3]])
         return replace(lights, place=place, strength=lights.strength * passed)
 
-    def twinkling(self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator) -> Sources:
+    def twinkling(
+        self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator
+    ) -> Sources:
         """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter."""
         air_masses = self.air_mass(seen.place[:, :3])
         optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
@@ -109,7 +116,9 @@ class Sky:
         place = body.place._replace(direction=direction, toward_sun=along / np.linalg.norm(along))
         blue, visual = ALBEDO[body.name][:2]
         b_v = SUN[0] - 2.5 * np.log10(blue / visual)
-        passed = starlight.transmission(self.air_mass(direction[None]), self.air.extinction_mag(b_v))
+        passed = starlight.transmission(
+            self.air_mass(direction[None]), self.air.extinction_mag(b_v)
+        )
         return replace(body, place=place, flux_e_s_m2=body.flux_e_s_m2 * float(passed[0]))
 
     def seeing_px(self, boresight: Floats, focal_px: float) -> float:
@@ -129,8 +138,15 @@ def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
     assert site.longitude_deg is not None  # checked in scene.py
     longitude, latitude = np.radians([site.longitude_deg, site.latitude_deg])
     sidereal = longitude + erfa.era00(ut1_jd(time), 0.0)
-    sin_l, cos_l, sin_b, cos_b = np.sin(sidereal), np.cos(sidereal), np.sin(latitude), np.cos(latitude)
-    in_cirs = [[-sin_b * cos_l, -sin_b * sin_l, cos_b], [-sin_l, cos_l, 0.0], [cos_b * cos_l, cos_b * sin_l, sin_b]]
+    sin_l = np.sin(sidereal)
+    cos_l = np.cos(sidereal)
+    sin_b = np.sin(latitude)
+    cos_b = np.cos(latitude)
+    in_cirs = [
+        [-sin_b * cos_l, -sin_b * sin_l, cos_b],
+        [-sin_l, cos_l, 0.0],
+        [cos_b * cos_l, cos_b * sin_l, sin_b],
+    ]
     return np.asarray(np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0))
 
 
@@ -139,12 +155,15 @@ def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
     if config is None:
         return np.zeros(len(azimuth_rad))
     table_rad = np.radians(config.azimuth_deg)
-    return np.asarray(np.interp(azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi))
+    return np.asarray(
+        np.interp(azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi)
+    )
 
 
 def weather_of(config: AirConfig, site: SiteConfig, band: Band) -> Weather:
     """The weather at a site: what the section says, else the standard atmosphere."""
-    pressure_hpa, temperature_c = config.pressure_hpa, config.temperature_c
+    pressure_hpa = config.pressure_hpa
+    temperature_c = config.temperature_c
     return Weather(
         site.height_m,
         float(np.radians(site.latitude_deg)),
@@ -159,4 +178,7 @@ def mean_wavelength_m(band: Band) -> float:
     """Mean wavelength of a G2 star's photo-electrons."""
     sun_k = temperature_k(*SUN)
     total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, sun_k))
-    return float(band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k)) / total)
+    return float(
+        band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
+        / total
+    )

@@ -14,8 +14,11 @@ from skysim.core.types import Floats
 
 # The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
 GAS_J_KMOL_K = 8314.32
-DRY_KG_KMOL, WATER_KG_KMOL = 28.9644, 18.0152
-EARTH_M, TROPOPAUSE_M, TOP_M = 6_378_120.0, 11_000.0, 80_000.0
+DRY_KG_KMOL = 28.9644
+WATER_KG_KMOL = 18.0152
+EARTH_M = 6_378_120.0
+TROPOPAUSE_M = 11_000.0
+TOP_M = 80_000.0
 LAPSE_K_M = 0.0065  # ISO 2533's, too
 VAPOR_EXPONENT = 18.36  # of the water vapor's pressure in the temperature
 NODES = 24  # of the Gauss-Legendre rule in each layer
@@ -38,7 +41,9 @@ class Weather(NamedTuple):
 
 def standard_pressure_hpa(height_m: float) -> float:
     """Pressure of the International Standard Atmosphere (ISO 2533) in the troposphere."""
-    return float(STANDARD_PRESSURE_HPA * (1 - LAPSE_K_M * height_m / STANDARD_TEMPERATURE_K) ** 5.25588)
+    return float(
+        STANDARD_PRESSURE_HPA * (1 - LAPSE_K_M * height_m / STANDARD_TEMPERATURE_K) ** 5.25588
+    )
 
 
 def standard_temperature_c(height_m: float) -> float:
@@ -58,23 +63,41 @@ class Atmosphere:
     r0_m: float
     t0_k: float
     gamma: float
-    scale_per_k: float  # g M / R: the gradient of the logarithm of the pressure times the temperature
+    scale_per_k: (
+        float  # g M / R: the gradient of the logarithm of the pressure times the temperature
+    )
     dry: float  # C1
     wet: float  # C2
 
     @classmethod
     def from_weather(cls, weather: Weather) -> Atmosphere:
         """The atmosphere above a site."""
-        t_c, t0_k, p_hpa = weather.temperature_c, weather.temperature_c + ZERO_CELSIUS_K, weather.pressure_hpa
-        gravity = 9.784 * (1 - 0.0026 * np.cos(2 * weather.latitude_rad) - 2.8e-7 * weather.height_m)
+        t_c = weather.temperature_c
+        t0_k = weather.temperature_c + ZERO_CELSIUS_K
+        p_hpa = weather.pressure_hpa
+        gravity = 9.784 * (
+            1 - 0.0026 * np.cos(2 * weather.latitude_rad) - 2.8e-7 * weather.height_m
+        )
         scale_per_k = gravity * DRY_KG_KMOL / GAS_J_KMOL_K
-        gamma, um2 = scale_per_k / LAPSE_K_M, (weather.wavelength_m * 1e6) ** 2
-        per_hpa = (287.6155 + (1.62887 + 0.0136 / um2) / um2) * 1e-6 * ZERO_CELSIUS_K / STANDARD_PRESSURE_HPA
+        gamma = scale_per_k / LAPSE_K_M
+        um2 = (weather.wavelength_m * 1e6) ** 2
+        per_hpa = (
+            (287.6155 + (1.62887 + 0.0136 / um2) / um2)
+            * 1e-6
+            * ZERO_CELSIUS_K
+            / STANDARD_PRESSURE_HPA
+        )
         saturated_hpa = 10 ** ((0.7859 + 0.03477 * t_c) / (1 + 0.00412 * t_c))
         saturated_hpa *= 1 + p_hpa * (4.5e-6 + 6e-10 * t_c**2)
         humidity = weather.humidity
-        vapor_hpa = humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa) if p_hpa > 0 else 0.0
-        lighter_hpa = vapor_hpa * (1 - WATER_KG_KMOL / DRY_KG_KMOL) * gamma / (VAPOR_EXPONENT - gamma)
+        vapor_hpa = (
+            humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
+            if p_hpa > 0
+            else 0.0
+        )
+        lighter_hpa = (
+            vapor_hpa * (1 - WATER_KG_KMOL / DRY_KG_KMOL) * gamma / (VAPOR_EXPONENT - gamma)
+        )
         dry = per_hpa * (p_hpa + lighter_hpa) / t0_k
         wet = (per_hpa * lighter_hpa + 1.12684e-5 * vapor_hpa) / t0_k
         return cls(EARTH_M + weather.height_m, t0_k, gamma, scale_per_k, dry, wet)
@@ -104,15 +127,20 @@ def refraction_rad(apparent_zenith_rad: Floats, atmosphere: Atmosphere) -> Float
     """
     n0 = atmosphere.troposphere(np.array(atmosphere.r0_m))[0]
     invariant = n0 * atmosphere.r0_m * np.sin(apparent_zenith_rad)
-    tropopause_m, top_m = EARTH_M + TROPOPAUSE_M, EARTH_M + TOP_M
+    tropopause_m = EARTH_M + TROPOPAUSE_M
+    top_m = EARTH_M + TOP_M
     at_tropopause = atmosphere.troposphere(np.array(tropopause_m))[0]
     z_tropopause = np.arcsin(invariant / (at_tropopause * tropopause_m))
     z_top = np.arcsin(invariant / (atmosphere.stratosphere(np.array(top_m))[0] * top_m))
-    low = layer_rad(atmosphere.troposphere, invariant, apparent_zenith_rad, z_tropopause, tropopause_m)
+    low = layer_rad(
+        atmosphere.troposphere, invariant, apparent_zenith_rad, z_tropopause, tropopause_m
+    )
     return low + layer_rad(atmosphere.stratosphere, invariant, z_tropopause, z_top, top_m)
 
 
-def layer_rad(layer: Layer, invariant: Floats, z_low: Floats, z_high: Floats, top_m: float) -> Floats:
+def layer_rad(
+    layer: Layer, invariant: Floats, z_low: Floats, z_high: Floats, top_m: float
+) -> Floats:
     """(N,) the integral over one layer between the ray's zenith distances at its ends; radius by Newton's method."""
     x, weight = np.polynomial.legendre.leggauss(NODES)
     half = (z_low - z_high)[:, None] / 2
@@ -133,7 +161,9 @@ class Refraction:
     """
 
     def __init__(self, weather: Weather) -> None:
-        apparent_rad = LOWEST_RAD * np.sin(np.linspace(0, np.pi / 2, RAYS))  # densest at the horizon
+        apparent_rad = LOWEST_RAD * np.sin(
+            np.linspace(0, np.pi / 2, RAYS)
+        )  # densest at the horizon
         bending_rad = np.zeros(RAYS)
         if weather.pressure_hpa > 0:
             bending_rad[1:] = refraction_rad(apparent_rad[1:], Atmosphere.from_weather(weather))

@@ -30,13 +30,17 @@ YOUNG_M_S = 10e-6  # of the variance at D = 1 m, t = 1 s, m^(4/3) s
 C_Y = 1.56  # median of the sites in Osborn et al. (2015)
 SCALE_HEIGHT_M = 8000.0  # of the turbulence in Young's law
 TOP_M = 25_000.0
-LAYERS, FREQUENCIES = 20, 300  # within 0.3 % of finer ones
+# within 0.3 % of finer ones
+LAYERS = 20
+FREQUENCIES = 300
 FREQUENCY_1_M = 1e-2, 3e3  # lowest and highest
 AIR_MASSES = np.geomspace(1.0, 40.0, 12)
 EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
 
 
-def variance(air_masses: Floats, aperture_m: float, exposure_s: float, height_m: float, wavelength_m: float) -> Floats:
+def variance(
+    air_masses: Floats, aperture_m: float, exposure_s: float, height_m: float, wavelength_m: float
+) -> Floats:
     """(N,) relative variances of stars' light at these air masses, from a site at a height."""
     spline = variance_table(aperture_m, height_m, wavelength_m)
     within_s = min(max(exposure_s, EXPOSURES_S[0]), EXPOSURES_S[-1])
@@ -57,7 +61,15 @@ def variance_table(aperture_m: float, height_m: float, wavelength_m: float) -> R
     scale /= YOUNG * float(np.sum(strength * above_m**2 / wind_m_s))
     f = np.geomspace(*FREQUENCY_1_M, FREQUENCIES)
     # The integral of S(f) 2 pi f df in even steps of ln f.
-    density = SPECTRUM * wavelength_m**-2 * f ** (-5 / 3) * 2 * np.pi * np.log(f[1] / f[0]) * airy(aperture_m * f) ** 2
+    density = (
+        SPECTRUM
+        * wavelength_m**-2
+        * f ** (-5 / 3)
+        * 2
+        * np.pi
+        * np.log(f[1] / f[0])
+        * airy(aperture_m * f) ** 2
+    )
     distance_m = AIR_MASSES[:, None] * above_m
     fresnel = np.sin(np.pi * wavelength_m * distance_m[..., None] * f**2) ** 2
     spectra = AIR_MASSES[:, None, None] * (scale * strength)[:, None] * fresnel * density
@@ -103,4 +115,6 @@ def exposure_filter(turns: Floats) -> Floats:
 def factors(variances: Floats, rng: np.random.Generator) -> Floats:
     """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173)."""
     log_variance = np.log1p(variances)
-    return np.asarray(np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2))
+    return np.asarray(
+        np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2)
+    )

@@ -35,7 +35,9 @@ class ProjectedStars(NamedTuple):
     place_m: Floats
 
 
-def project_stars(config: layouts.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band) -> ProjectedStars:
+def project_stars(
+    config: layouts.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band
+) -> ProjectedStars:
     """Stars as LED places: apparent directions at config.epoch, traced from the camera's nominal place to the surface.
 
     The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there. Of the stars on the
@@ -46,22 +48,37 @@ def project_stars(config: layouts.CelestialConfig, surface: Surface, led: leds.L
     if not surface.inside(camera_m):
         distance_m = np.linalg.norm(camera_m)
         raise InputError(
-            "light.layout.camera", f"{distance_m:g} m from the bearing's center, outside of the dome", "inside"
+            "light.layout.camera",
+            f"{distance_m:g} m from the bearing's center, outside of the dome",
+            "inside",
         )
     stars = catalog.read_for("light.layout.catalog", config.catalog)
-    lab_from_icrs = star_sources.cam_from_icrs(config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg)
+    lab_from_icrs = star_sources.cam_from_icrs(
+        config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg
+    )
     direction = lab_from_icrs.apply(star_sources.apparent(stars, config.epoch))
     above_horizon = direction[:, 2] > 0
-    stars, place_m = stars.take(above_horizon), surface.meet(camera_m, direction[above_horizon])
+    stars = stars.take(above_horizon)
+    place_m = surface.meet(camera_m, direction[above_horizon])
     within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(place_m, axis=1)
-    stars, place_m = stars.take(within), place_m[within]
+    stars = stars.take(within)
+    place_m = place_m[within]
     order = np.argsort(stars.v_mag, kind="stable")
-    stars, place_m = stars.take(order), place_m[order]
-    mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band) if config.brightness == "band" else stars.v_mag
-    selected = select_brightest(ProjectedStars(stars.hip, stars.v_mag, mag, place_m), config, led.disk_diameter_m)
+    stars = stars.take(order)
+    place_m = place_m[order]
+    mag = (
+        synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band)
+        if config.brightness == "band"
+        else stars.v_mag
+    )
+    selected = select_brightest(
+        ProjectedStars(stars.hip, stars.v_mag, mag, place_m), config, led.disk_diameter_m
+    )
     rays = selected.place_m - camera_m
     # A merged place is a mean of points on the surface and so lies inside it: trace it back onto the surface.
-    return selected._replace(place_m=surface.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
+    return selected._replace(
+        place_m=surface.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    )
 
 
 def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
@@ -91,10 +108,14 @@ def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedSt
 
     light = 10 ** (-0.4 * stars.shown_mag)
     weight = light / np.bincount(group, light)[group]
-    place_m = np.array([np.bincount(group, weight * axis) for axis in stars.place_m.T], dtype=float).T
+    place_m = np.array(
+        [np.bincount(group, weight * axis) for axis in stars.place_m.T], dtype=float
+    ).T
     v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
-    return ProjectedStars(stars.hip[first][order], v_mag[order], combined_mag(stars.shown_mag)[order], place_m[order])
+    return ProjectedStars(
+        stars.hip[first][order], v_mag[order], combined_mag(stars.shown_mag)[order], place_m[order]
+    )
 
 
 def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) -> ProjectedStars:
@@ -102,7 +123,9 @@ def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) ->
 
     A merged LED is between the places of its stars and may be too near a third, so merging repeats until none is.
     """
-    selected = ProjectedStars(stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count])
+    selected = ProjectedStars(
+        stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count]
+    )
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):
@@ -110,29 +133,39 @@ def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) ->
         selected = merge_stars(selected, target)
 
 
-def select_brightest(stars: ProjectedStars, config: layouts.CelestialConfig, separation_m: float) -> ProjectedStars:
+def select_brightest(
+    stars: ProjectedStars, config: layouts.CelestialConfig, separation_m: float
+) -> ProjectedStars:
     """The brightest stars, merged into config.count LEDs, or all stars to config.limit_mag. Raises InputError."""
     if config.limit_mag is not None:
         count = int(np.sum(stars.v_mag <= config.limit_mag))
         if not count:
             raise InputError(
-                "light.layout.limit_mag", f"no star to {config.limit_mag:g} mag on the dome", "a fainter limit"
+                "light.layout.limit_mag",
+                f"no star to {config.limit_mag:g} mag on the dome",
+                "a fainter limit",
             )
         return merge_close_stars(stars, count, separation_m)
     wanted = config.count or 1
     count = min(wanted, len(stars.hip))
     merged = merge_close_stars(stars, count, separation_m)
     while len(merged.hip) < wanted and count < len(stars.hip):
-        count = min(count + wanted - len(merged.hip), len(stars.hip))  # each star adds one LED at most
+        count = min(
+            count + wanted - len(merged.hip), len(stars.hip)
+        )  # each star adds one LED at most
         merged = merge_close_stars(stars, count, separation_m)
     if len(merged.hip) < wanted:
         raise InputError(
-            "light.layout.count", f"{wanted} LEDs, but the catalog gives {len(merged.hip)} on the dome", "at most that"
+            "light.layout.count",
+            f"{wanted} LEDs, but the catalog gives {len(merged.hip)} on the dome",
+            "at most that",
         )
     return merged
 
 
-def led_levels(config: layouts.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig) -> Floats:
+def led_levels(
+    config: layouts.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig
+) -> Floats:
     """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 
     m is stars.shown_mag. All LEDs have one color, so the magnitudes hold for this chip only, where m should be its
@@ -148,8 +181,12 @@ def led_levels(config: layouts.CelestialConfig, stars: ProjectedStars, normal: F
     gain = irradiance_e_s_m2(ones, Emitter.from_config(led), cos_emission, ones, distance_m)
     if not np.all(gain > 0):
         raise InputError(
-            "light.led.lobe", f"the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera", "a wider lobe"
+            "light.led.lobe",
+            f"the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera",
+            "a wider lobe",
         )
-    shown_mag = np.maximum(stars.shown_mag, -np.inf if config.brightest_mag is None else config.brightest_mag)
+    shown_mag = np.maximum(
+        stars.shown_mag, -np.inf if config.brightest_mag is None else config.brightest_mag
+    )
     needed = 10 ** (-0.4 * shown_mag) / gain
     return np.asarray(needed / needed.max())

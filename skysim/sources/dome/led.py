@@ -27,7 +27,12 @@ from skysim.scene.sections.leds import (
     SequentialConfig,
     WarmUpConfig,
 )
-from skysim.sources.photometry import Band, led_chromatic, led_strength_e_s_sr, radiant_strength_e_s_sr
+from skysim.sources.photometry import (
+    Band,
+    led_chromatic,
+    led_strength_e_s_sr,
+    radiant_strength_e_s_sr,
+)
 
 LIFE_SHARE = 0.7  # of its light that is left of an LED at the end of its life, L70
 COLORS = 129  # wavelengths at which a colored LED's strength is computed
@@ -78,7 +83,11 @@ class Emitter:
 
 
 def irradiance_e_s_m2(
-    strength_e_s_sr: Floats, emitter: Emitter, cos_emission: Floats, cos_incidence: Floats, distance_m: Floats
+    strength_e_s_sr: Floats,
+    emitter: Emitter,
+    cos_emission: Floats,
+    cos_incidence: Floats,
+    distance_m: Floats,
 ) -> Floats:
     """Irradiance at the aperture: E = I_0 L(theta) cos(phi) f(d), zero where either surface faces away.
 
@@ -90,14 +99,20 @@ def irradiance_e_s_m2(
     """
     facing = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
     emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
-    return np.where(facing, strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m), 0.0)
+    return np.where(
+        facing,
+        strength_e_s_sr * emitted * cos_incidence * FALLOFF[emitter.falloff](distance_m),
+        0.0,
+    )
 
 
 def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
     """Strength of an LED at full brightness in the chip's band: photo-electrons s^-1 sr^-1 along its normal."""
     if led.intensity_cd is not None:
         return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band, led.fwhm_m))
-    return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band, led.fwhm_m))
+    return float(
+        radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band, led.fwhm_m)
+    )
 
 
 def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
@@ -106,7 +121,10 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
     They are interpolated between COLORS wavelengths.
     """
     peak_m, grid_m = peaks_m(led, normal)
-    strengths = [full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band) for one in grid_m.tolist()]
+    strengths = [
+        full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band)
+        for one in grid_m.tolist()
+    ]
     return np.interp(peak_m, grid_m, strengths) / full_strength_e_s_sr(led, band)
 
 
@@ -134,7 +152,11 @@ def strength_factors(scatter: float, normal: Floats) -> Floats:
     Lognormal with this standard deviation of the logarithm, for which AFIT's Table 2 gives .07 to .09; within a
     tolerance, 1 plus an error as the tolerance says.
     """
-    return 1 + scaled_errors(scatter, normal) if isinstance(scatter, Tolerance) else np.exp(scatter * normal)
+    return (
+        1 + scaled_errors(scatter, normal)
+        if isinstance(scatter, Tolerance)
+        else np.exp(scatter * normal)
+    )
 
 
 def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
@@ -195,7 +217,9 @@ def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTr
     count = len(inputs.level)
     start_s = rng.uniform(0, led.pwm_period_s, count)
     on_s = inputs.level * led.pwm_period_s
-    return PulseTrains(np.full(count, led.pwm_period_s), start_s, on_s, np.ones(count), inputs.board)
+    return PulseTrains(
+        np.full(count, led.pwm_period_s), start_s, on_s, np.ones(count), inputs.board
+    )
 
 
 def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
@@ -204,7 +228,8 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     Each LED of a controller has a slot T and is lit for its level of it; the controller's cycle is the sum of its
     slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
     """
-    drive, count = led.drive, len(inputs.level)
+    drive = led.drive
+    count = len(inputs.level)
     assert isinstance(drive, SequentialConfig)
     if drive.controller == "board":
         group = inputs.board
@@ -219,7 +244,9 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
     cycle_s = led_count * np.float64(drive.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
-    return PulseTrains(cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count), controller)
+    return PulseTrains(
+        cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count), controller
+    )
 
 
 def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
@@ -230,7 +257,8 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
     level * duty. Over an exposure of n + f frames, n complete, the relative flicker is
     sqrt(f (1 - f) - duty / 3) / (n + f) where duty <= f <= 1 - duty, and zero for f = 0 (reference 1.3).
     """
-    drive, ones = led.drive, np.ones(len(inputs.level))
+    drive = led.drive
+    ones = np.ones(len(inputs.level))
     assert isinstance(drive, RefreshConfig)
     period_s = 1 / drive.rate_hz
     return PulseTrains(
@@ -252,7 +280,9 @@ DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTr
 
 
 @jit
-def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float) -> Any:
+def lit_moments_s(
+    begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float
+) -> Any:
     """On-time of a pulse train within [begin, end], s, its mean time and the standard deviation about it.
 
     The train is lit from start_s for on_s in every period_s, before and after. The result is exact for any interval:
@@ -265,18 +295,20 @@ def lit_moments_s(begin_s: float, end_s: float, period_s: float, start_s: float,
         return end_s - begin_s, middle, (end_s - begin_s) / sqrt(12.0)
     first = floor((begin_s - start_s - on_s) / period_s) + 1
     last = ceil((end_s - start_s) / period_s) - 1
-    lit_s, sum1, sum2 = 0.0, 0.0, 0.0
+    lit_s = 0.0
+    sum1 = 0.0
+    sum2 = 0.0
     # Times are taken from the middle of the interval, where the squares lose the fewest digits.
-    for j in range(first, last + 1, max(last - first, 1)):  # the two pulses at the ends, or the only one
+    for j in range(
+        first, last + 1, max(last - first, 1)
+    ):  # the two pulses at the ends, or the only one
         edge = max(start_s + j * period_s, begin_s)
         width = min(start_s + j * period_s + on_s, end_s) - edge
         if width > 0:
             center = edge + width / 2 - middle
-            lit_s, sum1, sum2 = (
-                lit_s + width,
-                sum1 + width * center,
-                sum2 + width * (center**2 + width**2 / 12),
-            )
+            lit_s = lit_s + width
+            sum1 = sum1 + width * center
+            sum2 = sum2 + width * (center**2 + width**2 / 12)
     n = last - first - 1
     if n > 0:
         center = start_s + (first + 1) * period_s + on_s / 2 + (n - 1) * period_s / 2 - middle

@@ -22,7 +22,9 @@ from skysim.sources.solar_system.ephemeris import load_ephemeris
 from skysim.sources.solar_system.observer import GcrsState
 
 CHUNK = 20_000  # times that are computed at once
-NODE_S = HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
+NODE_S = (
+    HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
+)
 
 Law = Literal["inertial", "zenith"]
 
@@ -86,13 +88,17 @@ def sample(
 
     stars : (N, 3) directions of the stars that the tracker detects;  field_rad : half-angle of a round field
     """
-    tree, parts = cKDTree(stars), list[Samples]()
+    tree = cKDTree(stars)
+    parts = list[Samples]()
     places_m = {name: place_spline(name, start, float(t_s[-1])) for name in ("sun", "moon")}
     for first in range(0, len(t_s), CHUNK):
         times = t_s[first : first + CHUNK]
         states = orbit.states(times)
         boresight = pointing.boresights(states)
-        angles = {name: erfa.sepp(place(times) - states.position_m, boresight) for name, place in places_m.items()}
+        angles = {
+            name: erfa.sepp(place(times) - states.position_m, boresight)
+            for name, place in places_m.items()
+        }
         limb = limb_elevation_rad(states.position_m, boresight)
         seen = tree.query_ball_point(boresight, 2 * np.sin(field_rad / 2), return_length=True)
         seen = np.where(limb > field_rad, seen, 0)
@@ -104,7 +110,8 @@ def sample(
 
 def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpline:
     """A body's place (3,) from the Earth's center in m, by seconds since the start."""
-    ephemeris, first_jd = load_ephemeris(), tt_jd(start)
+    ephemeris = load_ephemeris()
+    first_jd = tt_jd(start)
     nodes_s = np.arange(-NODE_S, last_s + 2 * NODE_S, NODE_S)
     dates = first_jd + nodes_s / DAY_S
     earth_km = [ephemeris.position_km("earth", jd) for jd in dates]

@@ -45,19 +45,28 @@ class CircularOrbit:
     @property
     def rates_rad_s(self) -> tuple[float, float]:
         """Of the argument of latitude and of the node."""
-        radius_m, inclination = EARTH_RADIUS_M + self.config.altitude_m, np.radians(self.config.inclination_deg)
-        n, k = np.sqrt(EARTH_MU_M3_S2 / radius_m**3), 1.5 * EARTH_J2 * (EARTH_RADIUS_M / radius_m) ** 2
-        return float(n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))), float(-k * n * np.cos(inclination))
+        radius_m = EARTH_RADIUS_M + self.config.altitude_m
+        inclination = np.radians(self.config.inclination_deg)
+        n = np.sqrt(EARTH_MU_M3_S2 / radius_m**3)
+        k = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / radius_m) ** 2
+        return float(n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))), float(
+            -k * n * np.cos(inclination)
+        )
 
     def states(self, after_s: Floats) -> GcrsState:
-        config, (rate, node_rate) = self.config, self.rates_rad_s
+        config = self.config
+        (rate, node_rate) = self.rates_rad_s
         inclination = np.radians(config.inclination_deg)
         along = np.radians(config.argument_deg) + rate * after_s
         node = np.radians(config.raan_deg) + node_rate * after_s
         toward_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
-        ahead = np.stack([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination)], axis=-1)
+        ahead = np.stack(
+            [-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination)], axis=-1
+        )
         ahead = np.column_stack([ahead, np.full(len(node), np.sin(inclination))])
-        radius_m, cosine, sine = EARTH_RADIUS_M + config.altitude_m, np.cos(along)[:, None], np.sin(along)[:, None]
+        radius_m = EARTH_RADIUS_M + config.altitude_m
+        cosine = np.cos(along)[:, None]
+        sine = np.sin(along)[:, None]
         position_m = radius_m * (cosine * toward_node + sine * ahead)
         velocity_m_s = radius_m * rate * (cosine * ahead - sine * toward_node)
         return GcrsState(position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m))
@@ -79,8 +88,11 @@ class TleOrbit:
             time = self.start + datetime.timedelta(seconds=middle_s)
             place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
             if errors.any():
-                raise InputError("orbit.file", f"SGP4 has no place of this satellite at {time}", "newer elements")
-            position_m[rows], velocity_m_s[rows] = place[0], velocity[0]
+                raise InputError(
+                    "orbit.file", f"SGP4 has no place of this satellite at {time}", "newer elements"
+                )
+            position_m[rows] = place[0]
+            velocity_m_s[rows] = velocity[0]
         return GcrsState(position_m, velocity_m_s)
 
 
@@ -105,7 +117,9 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
     if len(rows) != 1:
         listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (len(elements.numbers) > 5)
         raise InputError(
-            "orbit.number", f"{config.number}: {len(rows)} satellites of {config.file}", f"one of {listed}"
+            "orbit.number",
+            f"{config.number}: {len(rows)} satellites of {config.file}",
+            f"one of {listed}",
         )
     return TleOrbit(elements.take(rows), start)
 
@@ -114,7 +128,11 @@ def oem(config: OemOrbitConfig, start: datetime.datetime) -> OemOrbit:
     return OemOrbit(read_oem(config.file, start))
 
 
-ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {"circular": circular, "tle": tle, "oem": oem}
+ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {
+    "circular": circular,
+    "tle": tle,
+    "oem": oem,
+}
 
 
 def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:

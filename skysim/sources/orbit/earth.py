@@ -25,13 +25,16 @@ def sun_m(tt_jd: float) -> Floats:
     return 1e3 * (ephemeris.position_km("sun", tt_jd) - ephemeris.position_km("earth", tt_jd))
 
 
-def hidden_by_earth(observer_m: Floats, direction: Floats, distance_m: Floats | float = np.inf) -> NDArray[np.bool_]:
+def hidden_by_earth(
+    observer_m: Floats, direction: Floats, distance_m: Floats | float = np.inf
+) -> NDArray[np.bool_]:
     """Whether the Earth is between an observer and points in unit directions (..., 3) at these distances.
 
     The line p + s d comes nearest to the center at s = -p.d, where its distance is sqrt(p^2 - (p.d)^2). An observer on
     or below the ellipsoid sees what is above the plane that touches it there.
     """
-    place, along = observer_m * TO_SPHERE, direction * TO_SPHERE
+    place = observer_m * TO_SPHERE
+    along = direction * TO_SPHERE
     length = np.linalg.norm(along, axis=-1)
     inward = -(along @ place if place.ndim == 1 else np.sum(along * place, axis=-1)) / length
     square = np.sum(place * place, axis=-1)
@@ -59,8 +62,10 @@ def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
 
     With the nadir angle of the direction and the angular radius of the Earth, arcsin(1/r), it is their difference.
     """
-    place, toward = place_m * TO_SPHERE, direction * TO_SPHERE
-    radius, length = np.linalg.norm(place, axis=-1), np.linalg.norm(toward, axis=-1)
+    place = place_m * TO_SPHERE
+    toward = direction * TO_SPHERE
+    radius = np.linalg.norm(place, axis=-1)
+    length = np.linalg.norm(toward, axis=-1)
     above_horizon = np.arcsin(np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1))
     return np.asarray(above_horizon + np.arccos(1 / np.maximum(radius, 1.0)))
 

@@ -29,13 +29,26 @@ from skysim.core.types import Floats
 
 MAX_SATELLITES = 100_000  # of a file
 REQUIRED = (
-    *("NORAD_CAT_ID", "EPOCH", "MEAN_MOTION", "ECCENTRICITY", "INCLINATION", "RA_OF_ASC_NODE"),
-    *("ARG_OF_PERICENTER", "MEAN_ANOMALY", "BSTAR"),
+    "NORAD_CAT_ID",
+    "EPOCH",
+    "MEAN_MOTION",
+    "ECCENTRICITY",
+    "INCLINATION",
+    "RA_OF_ASC_NODE",
+    "ARG_OF_PERICENTER",
+    "MEAN_ANOMALY",
+    "BSTAR",
 )
 # What SGP4 does not use: a message may lack it.
 OPTIONAL = {
-    **{"CLASSIFICATION_TYPE": "U", "OBJECT_ID": "", "EPHEMERIS_TYPE": "0", "ELEMENT_SET_NO": "0", "REV_AT_EPOCH": "0"},
-    **{"MEAN_MOTION_DOT": "0", "MEAN_MOTION_DDOT": "0", "OBJECT_NAME": ""},
+    "CLASSIFICATION_TYPE": "U",
+    "OBJECT_ID": "",
+    "EPHEMERIS_TYPE": "0",
+    "ELEMENT_SET_NO": "0",
+    "REV_AT_EPOCH": "0",
+    "MEAN_MOTION_DOT": "0",
+    "MEAN_MOTION_DDOT": "0",
+    "OBJECT_NAME": "",
 }
 EPOCH = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?", re.ASCII)
 TLE_LENGTHS = 68, 69  # without and with the checksum
@@ -61,7 +74,9 @@ def read_elements(path: str) -> Elements:
         raise InputError(path, "empty", "a TLE or an OMM")
     text = "\n".join(line for _, line in lines)
     if text[0] in "<[{" or "NORAD_CAT_ID" in lines[0][1]:
-        satellites = [satellite(path, n, fields) for n, fields in enumerate(messages(path, text), 1)]
+        satellites = [
+            satellite(path, n, fields) for n, fields in enumerate(messages(path, text), 1)
+        ]
     else:
         satellites = list(read_tle(path, lines))
     if not 0 < len(satellites) <= MAX_SATELLITES:
@@ -83,7 +98,9 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
         pair = line[: TLE_LENGTHS[1]], second[: TLE_LENGTHS[1]]
         for begin, one in zip("12", pair, strict=True):
             if not one.startswith(f"{begin} ") or len(one) not in TLE_LENGTHS:
-                raise InputError(path, f"{excerpt(one)} is not line {begin} of a TLE", where=Where(path, n))
+                raise InputError(
+                    path, f"{excerpt(one)} is not line {begin} of a TLE", where=Where(path, n)
+                )
             if len(one) == TLE_LENGTHS[1] and checksum(one) != one[-1]:
                 raise InputError(
                     path,
@@ -125,15 +142,23 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     from sgp4 import omm
     from sgp4.api import Satrec
 
-    record, texts = Satrec(), {key: str(value) for key, value in fields.items() if value not in (None, "")}
+    record = Satrec()
+    texts = {key: str(value) for key, value in fields.items() if value not in (None, "")}
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
         raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
-        raise InputError(path, f"EPOCH {excerpt(epoch)}", "2012-06-22T21:00:00.123456", where=Where(path, n, "message"))
+        raise InputError(
+            path,
+            f"EPOCH {excerpt(epoch)}",
+            "2012-06-22T21:00:00.123456",
+            where=Where(path, n, "message"),
+        )
     try:
-        omm.initialize(record, {**OPTIONAL, **texts, "EPOCH": epoch if "." in epoch else f"{epoch}.0"})
+        omm.initialize(
+            record, {**OPTIONAL, **texts, "EPOCH": epoch if "." in epoch else f"{epoch}.0"}
+        )
     except (ValueError, OverflowError) as error:
         raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
@@ -146,7 +171,9 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
     error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
     if error or not np.isfinite(place_km).all():
         what = SGP4_ERRORS.get(error, "elements that are not numbers")
-        raise InputError(path, f"SGP4 refuses these elements: {what}", where=Where(path, n, "satellite"))
+        raise InputError(
+            path, f"SGP4 refuses these elements: {what}", where=Where(path, n, "satellite")
+        )
     return int(record.satnum), name or str(record.satnum), record
 
 
@@ -164,7 +191,9 @@ def gcrs_states(
 
     # In one number with the Julian date a satellite would be off by 0.3 m.
     days = utc_days(time) + np.asarray(after_s, float) / DAY_S
-    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(np.full(len(days), J2000_JD), days)
+    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(
+        np.full(len(days), J2000_JD), days
+    )
     matrix = gcrs_from_teme(time)
     return 1e3 * place_km @ matrix.T, 1e3 * velocity_km_s @ matrix.T, errors.astype(np.int64)
 

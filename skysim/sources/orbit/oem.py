@@ -16,11 +16,20 @@ from scipy.interpolate import BPoly
 
 from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError, Where
-from skysim.core.io.text import Segment, check_version, keyword_value, one_of, read_lines, seconds_since, to_numbers
+from skysim.core.io.text import (
+    Segment,
+    check_version,
+    keyword_value,
+    one_of,
+    read_lines,
+    seconds_since,
+    to_numbers,
+)
 from skysim.core.time import J2000_JD, SCALES
 from skysim.core.types import Floats
 
-VERSION, VERSIONS = "CCSDS_OEM_VERS", ("1.0", "2.0", "3.0")
+VERSION = "CCSDS_OEM_VERS"
+VERSIONS = ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
 SAME_M = 1.0  # of a sample that both of two adjoining segments have
@@ -58,13 +67,17 @@ def read_oem(path: str, start: datetime.datetime) -> Ephemeris:
     """
     segments = split_segments(path)
     if not segments:
-        raise InputError(path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers")
+        raise InputError(
+            path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers"
+        )
     parts = [segment_samples(path, segment, start) for segment in segments]
     t_s, samples = parts[0]
     for t, more in parts[1:]:
         if t[0] == t_s[-1] and np.linalg.norm(more[0, :3] - samples[-1, :3]) < SAME_M:
-            t, more = t[1:], more[1:]
-        t_s, samples = np.concatenate([t_s, t]), np.concatenate([samples, more])
+            t = t[1:]
+            more = more[1:]
+        t_s = np.concatenate([t_s, t])
+        samples = np.concatenate([samples, more])
     if len(t_s) < 2 or (np.diff(t_s) <= 0).any():
         raise InputError(path, f"the epochs of {len(t_s)} samples", "two or more, in order of time")
     missing = np.isnan(samples[:, 6])
@@ -83,7 +96,9 @@ def gravity_m_s2(position_m: Floats) -> Floats:
 
 def split_segments(path: str) -> list[Segment]:
     """The segments of a message. Raises InputError for a line out of place."""
-    version, segments, section = "", list[Segment](), ""
+    version = ""
+    segments = list[Segment]()
+    section = ""
     for n, line in read_lines(Path(path)):
         word = line.split(maxsplit=1)[0]
         if word == "COMMENT":
@@ -114,8 +129,11 @@ def segment_samples(path: str, segment: Segment, start: datetime.datetime) -> tu
     one_of(path, metadata, "CENTER_NAME", ("EARTH",))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     if not segment.data:
-        raise InputError(path, "a segment without data", "lines of an epoch, a position and a velocity")
-    lines, rows = [n for n, _ in segment.data], [words[1:] for _, words in segment.data]
+        raise InputError(
+            path, "a segment without data", "lines of an epoch, a position and a velocity"
+        )
+    lines = [n for n, _ in segment.data]
+    rows = [words[1:] for _, words in segment.data]
     width = 9 if len(rows[0]) == 9 else 6
     numbers = 1e3 * to_numbers(path, lines, rows, width)
     t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)

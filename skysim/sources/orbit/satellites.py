@@ -84,23 +84,30 @@ def known_satellites(
     observer_at : the camera's state, seconds after mid-exposure
     SGP4 gives all satellites at mid-exposure; the few near the field are then followed through it (`path`).
     """
-    here, sun = observer_at(0.0), sun_m(tt_jd(time))
+    here = observer_at(0.0)
+    sun = sun_m(tt_jd(time))
     states = gcrs_states(elements, time, np.zeros(1))
     others = np.flatnonzero(
         (states[2][:, 0] == 0) & (np.linalg.norm(states[0][:, 0] - here.position_m, axis=1) > OWN_M)
     )
-    place_m, velocity_m_s = states[0][others, 0], states[1][others, 0]
+    place_m = states[0][others, 0]
+    velocity_m_s = states[1][others, 0]
     to_m = place_m - here.position_m
     range_m = np.linalg.norm(to_m, axis=1)
-    across_m_s = np.linalg.norm(np.cross(to_m / range_m[:, None], velocity_m_s - here.velocity_m_s), axis=1)
-    reach_rad = view.field_rad + MARGIN_RAD + (view.turn_rad + across_m_s / range_m * view.duration_s) / 2
+    across_m_s = np.linalg.norm(
+        np.cross(to_m / range_m[:, None], velocity_m_s - here.velocity_m_s), axis=1
+    )
+    reach_rad = (
+        view.field_rad + MARGIN_RAD + (view.turn_rad + across_m_s / range_m * view.duration_s) / 2
+    )
     near = to_m @ view.boresight > np.cos(np.minimum(reach_rad, np.pi)) * range_m
     sunlit = sunlit_fraction(place_m, sun)
     hidden = hidden_by_earth(here.position_m, to_m / range_m[:, None], range_m)
     for n in np.flatnonzero(near & (sunlit > 0) & ~hidden):
         one = elements.take([int(others[n])])
         seen = path(one, time, view.duration_s, observer_at)
-        to_sun, to_camera = sun - place_m[n], -to_m[n]
+        to_sun = sun - place_m[n]
+        to_camera = -to_m[n]
         phase_rad = float(erfa.sepp(to_sun, to_camera))
         v_mag = magnitude(standard_mag, range_m[n], phase_rad, sunlit[n])
         about = (float(range_m[n] / 1e3), float(np.degrees(phase_rad)), float(sunlit[n]))
@@ -108,7 +115,10 @@ def known_satellites(
 
 
 def path(
-    one: Elements, time: datetime.datetime, duration_s: float, observer_at: Callable[[float], GcrsState]
+    one: Elements,
+    time: datetime.datetime,
+    duration_s: float,
+    observer_at: Callable[[float], GcrsState],
 ) -> tuple[Floats, Floats]:
     """Apparent place (3,) of a satellite at mid-exposure, a unit vector, and its motion (2, 3).
 
@@ -120,18 +130,25 @@ def path(
     half_s = max(duration_s, SHORTEST_S) / 2
     after_s = half_s * np.array([-1.0, 0.0, 1.0])
     states = [observer_at(float(t)) for t in after_s]
-    from_m, delay_s = np.array([state.position_m for state in states]), np.zeros(3)
+    from_m = np.array([state.position_m for state in states])
+    delay_s = np.zeros(3)
     for _ in range(3):
         to_m = gcrs_states(one, time, after_s - delay_s)[0][0] - from_m
         delay_s = np.linalg.norm(to_m, axis=1) / SPEED_OF_LIGHT_M_S
     range_m = np.linalg.norm(to_m, axis=1, keepdims=True)
-    toward = to_m / range_m + np.array([state.velocity_m_s for state in states]) / SPEED_OF_LIGHT_M_S
-    before, place, after = toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
+    toward = (
+        to_m / range_m + np.array([state.velocity_m_s for state in states]) / SPEED_OF_LIGHT_M_S
+    )
+    before, place, after = (
+        toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
+    )
     motion = np.stack([(after - before) / (2 * half_s), (after + before - 2 * place) / half_s**2])
     return place, motion
 
 
-def random_satellites(config: RandomSatellitesConfig, view: View, run_seed: int, index: int) -> Iterator[MovingLight]:
+def random_satellites(
+    config: RandomSatellitesConfig, view: View, run_seed: int, index: int
+) -> Iterator[MovingLight]:
     """Random satellites that can cross the field in the exposure of a frame of the run with a scene's seed.
 
     They are uniformly distributed over a cone that holds all paths through the field, as many (Poisson) as `per_field`
@@ -141,7 +158,9 @@ def random_satellites(config: RandomSatellitesConfig, view: View, run_seed: int,
     slowest, fastest = np.radians(config.rate_deg_s)
     reach_rad = min(view.field_rad + (view.turn_rad + fastest * view.duration_s) / 2, np.pi)
     mean = config.per_field * (1 - np.cos(reach_rad)) / (1 - np.cos(view.field_rad))
-    axes = erfa.rz(rng.uniform(0, 2 * np.pi), np.eye(3))  # any two axes across the boresight will do
+    axes = erfa.rz(
+        rng.uniform(0, 2 * np.pi), np.eye(3)
+    )  # any two axes across the boresight will do
     east = np.cross(view.boresight, axes[np.argmin(np.abs(axes @ view.boresight))])
     east /= np.linalg.norm(east)
     north = np.cross(view.boresight, east)
@@ -155,7 +174,13 @@ def random_satellites(config: RandomSatellitesConfig, view: View, run_seed: int,
         rate = np.exp(rng.uniform(np.log(slowest), np.log(fastest)))
         motion = np.stack([rate * along, -(rate**2) * place])
         about = float("nan"), float("nan"), 1.0
-        yield moving_light(RANDOM_BASE + n, f"random {n}", float(rng.uniform(*config.v_mag)), (place, motion), about)
+        yield moving_light(
+            RANDOM_BASE + n,
+            f"random {n}",
+            float(rng.uniform(*config.v_mag)),
+            (place, motion),
+            about,
+        )
 
 
 def moving_light(
@@ -164,7 +189,9 @@ def moving_light(
     """The light of a satellite on its path; about: range_km, phase_deg, sunlit."""
     place, motion = seen
     rate_deg_s = float(np.degrees(np.linalg.norm(np.cross(place, motion[0]))))
-    return MovingLight(SatelliteTruth(id, name, v_mag, *to_astronomical(place), rate_deg_s, *about), place, motion)
+    return MovingLight(
+        SatelliteTruth(id, name, v_mag, *to_astronomical(place), rate_deg_s, *about), place, motion
+    )
 
 
 def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:

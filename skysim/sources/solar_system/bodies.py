@@ -81,14 +81,17 @@ class BodyLight:
     def truth(self) -> BodyTruth:
         """What a frame's truth says of the body."""
         x, y, z = self.place.direction
-        ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(z))
-        diameter_arcsec, phase_deg = np.degrees(2 * self.radius_rad) * 3600, np.degrees(self.place.phase_rad)
+        ra_deg = np.degrees(np.arctan2(y, x)) % 360
+        dec_deg = np.degrees(np.arcsin(z))
+        diameter_arcsec = np.degrees(2 * self.radius_rad) * 3600
+        phase_deg = np.degrees(self.place.phase_rad)
         numbers = map(float, (self.magnitude, ra_deg, dec_deg, diameter_arcsec, phase_deg))
         return BodyTruth(self.id, self.name, *numbers)
 
     def directions(self, xy: Floats) -> Floats:
         """(M, 3) unit vectors toward points (M, 2) of the disc, in units of its radius."""
-        x_axis, center = self.place.toward_sun, self.place.direction
+        x_axis = self.place.toward_sun
+        center = self.place.direction
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
         vectors = center + np.tan(self.radius_rad) * offset
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
@@ -105,7 +108,9 @@ class BodyLight:
 
 def bodies_from(config: BodiesConfig, observer: Observer, band: Band) -> list[BodyLight]:
     """The chosen bodies as an observer sees them, the farthest first."""
-    lights = [body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)]
+    lights = [
+        body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)
+    ]
     return sorted(lights, key=lambda light: -light.place.distance_km)
 
 
@@ -117,7 +122,8 @@ def chosen(config: BodiesConfig) -> list[str]:
 
 def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     """The light of a body at its place."""
-    body, v_mag = BODIES[name], magnitude(name, at, tt_jd)
+    body = BODIES[name]
+    v_mag = magnitude(name, at, tt_jd)
     earthshine = earthshine_fraction(at) if name == "moon" else 0.0
     flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))

@@ -54,7 +54,10 @@ def _flux_v0_e_s_m2(albedo: Albedo, band: Band) -> float:
 def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
     """Spectral photon flux of a body of V = 0, as `black_body_v0`."""
     relative = np.array(albedo) / albedo[1]
-    return np.asarray(black_body_v0(wavelength_m, temperature_k(*SUN)) * np.interp(wavelength_m, BANDS_M, relative))
+    return np.asarray(
+        black_body_v0(wavelength_m, temperature_k(*SUN))
+        * np.interp(wavelength_m, BANDS_M, relative)
+    )
 
 
 @lru_cache(maxsize=64)

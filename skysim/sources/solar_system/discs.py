@@ -16,11 +16,16 @@ import numpy as np
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 
-LIMB_DARKENED, LOMMEL_SEELIGER, LAMBERT = 0, 1, 2  # laws of `brightness`
+# laws of `brightness`
+LIMB_DARKENED = 0
+LOMMEL_SEELIGER = 1
+LAMBERT = 2
 ACROSS = 12  # elements on the diameter of a small disc
 SAMPLES = 16  # points across an element at which the brightness is sampled
 RIM = 20  # cells within the rim in which the mean over a cell matters
-PHASE_STEP_DEG = 0.05  # phases of small discs are rounded to this, so that frames share their elements
+PHASE_STEP_DEG = (
+    0.05  # phases of small discs are rounded to this, so that frames share their elements
+)
 
 
 @jit
@@ -69,11 +74,15 @@ def light_map(surface: Surface, axis: Floats) -> Floats:
 @jit
 def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
     """Light of each point's cell, lit from the Sun and from the observer."""
-    sine, cosine, step = sin(phase_rad), cos(phase_rad), axis[1] - axis[0]
+    sine = sin(phase_rad)
+    cosine = cos(phase_rad)
+    step = axis[1] - axis[0]
     inner = inner_radius2(step)
     for j in range(len(axis)):
         for i in range(len(axis)):
-            sunlit[j, i], earthlit[j, i] = cell_light(law, sine, cosine, axis[i], axis[j], step, inner)
+            sunlit[j, i], earthlit[j, i] = cell_light(
+                law, sine, cosine, axis[i], axis[j], step, inner
+            )
 
 
 @jit
@@ -95,7 +104,9 @@ def cell_light(
     rho2 = x * x + y * y
     if rho2 > (1 + step / 2) ** 2:
         return 0.0, 0.0
-    covered, inward, mu = 1.0, 1.0, 0.0
+    covered = 1.0
+    inward = 1.0
+    mu = 0.0
     if rho2 < inner:
         mu = sqrt(1 - rho2)
     else:
@@ -105,7 +116,9 @@ def cell_light(
         m2 = sqrt(max(1 - (rho + step / 2) ** 2, 0.0))
         mu = 2 / 3 * (m1 * m1 + m1 * m2 + m2 * m2) / (m1 + m2) if m1 > 0 else 0.0
         inward = 1.0 if covered == 1 else (1 + rho - step / 2) / (2 * rho)
-    return covered * brightness(law, mu, inward * x * sine + mu * cosine), covered * brightness(law, mu, mu)
+    return covered * brightness(law, mu, inward * x * sine + mu * cosine), covered * brightness(
+        law, mu, mu
+    )
 
 
 class Elements(NamedTuple):
@@ -132,7 +145,9 @@ def disc_elements(surface: Surface) -> Elements:
 def _elements(law: int, phase_steps: int, earthshine: float) -> Elements:
     fine = ACROSS * SAMPLES
     axis = np.asarray((np.arange(fine) + 0.5) * (2 / fine) - 1, float)
-    light = light_map(Surface(law, float(np.radians(phase_steps * PHASE_STEP_DEG)), earthshine), axis)
+    light = light_map(
+        Surface(law, float(np.radians(phase_steps * PHASE_STEP_DEG)), earthshine), axis
+    )
     cells = (ACROSS, SAMPLES, ACROSS, SAMPLES)
     weighted = (light, light * axis, light * axis[:, None])
     share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)

@@ -60,7 +60,9 @@ def load_ephemeris() -> Ephemeris:
     with np.load(EPHEMERIS, allow_pickle=False) as arrays:
         names = [name.removesuffix("_days") for name in arrays.files if name.endswith("_days")]
         series = {
-            name: Series(float(arrays[f"{name}_days"]), float(arrays[f"{name}_unit_km"]), arrays[name])
+            name: Series(
+                float(arrays[f"{name}_days"]), float(arrays[f"{name}_unit_km"]), arrays[name]
+            )
             for name in names
         }
         return Ephemeris(float(arrays["first_jd"]), float(arrays["earth_moon_ratio"]), series)

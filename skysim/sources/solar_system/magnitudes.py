@@ -23,7 +23,10 @@ from skysim.sources.solar_system.places import Place
 MOON_KM = 384400.0  # mean distance
 FULL_MOON_MAG = -12.73  # at this distance, the Sun at 1 au
 EARTH = (-3.99, -1.060e-3, 2.054e-4)
-POLES_DEG = {"saturn": (40.589, 83.537), "uranus": (257.311, -15.175)}  # right ascension, declination (IAU WGCCRE 2015)
+POLES_DEG = {
+    "saturn": (40.589, 83.537),
+    "uranus": (257.311, -15.175),
+}  # right ascension, declination (IAU WGCCRE 2015)
 URANUS_FLATTENING = 0.0022927
 
 
@@ -31,10 +34,13 @@ def magnitude(name: str, place: Place, tt_jd: float) -> float:
     """V of a body above the atmosphere. Phase angles that the Earth never sees are extrapolated."""
     if name == "sun":
         return float(SUN_V_MAG + 5 * np.log10(place.distance_km / AU_KM))
-    sun_au, phase_deg = place.sun_distance_km / AU_KM, float(np.degrees(place.phase_rad))
+    sun_au = place.sun_distance_km / AU_KM
+    phase_deg = float(np.degrees(place.phase_rad))
     if name == "moon":
         return moon_magnitude(place.distance_km, sun_au, phase_deg)
-    return float(5 * np.log10(sun_au * place.distance_km / AU_KM) + PLANETS[name](phase_deg, place, tt_jd))
+    return float(
+        5 * np.log10(sun_au * place.distance_km / AU_KM) + PLANETS[name](phase_deg, place, tt_jd)
+    )
 
 
 def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float:
@@ -55,11 +61,14 @@ def earthshine_fraction(moon: Place) -> float:
     shines on the Moon from the observer's direction. So the earthlit Moon is a full Moon (phase angle 0) fainter by
     the magnitude of the Earth less that of the Sun, both as seen from the Moon.
     """
-    sun_au, moon_au = moon.sun_distance_km / AU_KM, moon.distance_km / AU_KM
+    sun_au = moon.sun_distance_km / AU_KM
+    moon_au = moon.distance_km / AU_KM
     phase_deg = float(np.degrees(moon.phase_rad))
     earth_mag = polynomial(180 - phase_deg, EARTH) + 5 * np.log10(moon_au * sun_au)
     fainter = earth_mag - (SUN_V_MAG + 5 * np.log10(sun_au))
-    full, sunlit = (moon_magnitude(moon.distance_km, sun_au, angle_deg) for angle_deg in (0.0, phase_deg))
+    full, sunlit = (
+        moon_magnitude(moon.distance_km, sun_au, angle_deg) for angle_deg in (0.0, phase_deg)
+    )
     return float(10 ** (-0.4 * (full + fainter - sunlit)))
 
 
@@ -69,7 +78,9 @@ def polynomial(phase_deg: float, coefficients: tuple[float, ...]) -> float:
 
 
 def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    return polynomial(phase_deg, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12))
+    return polynomial(
+        phase_deg, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
+    )
 
 
 def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
@@ -79,7 +90,10 @@ def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
 
 
 def mars(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    return polynomial(phase_deg, (-1.601, 2.267e-2, -1.302e-4) if phase_deg <= 50 else (-0.367, -2.573e-2, 3.445e-4))
+    return polynomial(
+        phase_deg,
+        (-1.601, 2.267e-2, -1.302e-4) if phase_deg <= 50 else (-0.367, -2.573e-2, 3.445e-4),
+    )
 
 
 def jupiter(phase_deg: float, _place: Place, _tt_jd: float) -> float:
@@ -95,7 +109,9 @@ def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
 
 def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
     """Fainter toward the equator; the latitudes are planetographic."""
-    latitudes_deg = np.degrees(np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2))
+    latitudes_deg = np.degrees(
+        np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2)
+    )
     by_phase = polynomial(phase_deg, (0.0, 6.587e-3, 1.045e-4)) if phase_deg > 3.1 else 0.0
     return -7.110 + by_phase - 8.4e-4 * float(np.abs(latitudes_deg).mean())
 
@@ -122,5 +138,8 @@ def latitudes_rad(name: str, place: Place) -> Floats:
     """(2,) planetocentric latitudes of the Sun and of the observer above the planet's equator."""
     ra, dec = np.radians(POLES_DEG[name])
     pole = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    sines = [-(vector @ pole) / np.linalg.norm(vector) for vector in (place.from_sun_km, place.to_body_km)]
+    sines = [
+        -(vector @ pole) / np.linalg.norm(vector)
+        for vector in (place.from_sun_km, place.to_body_km)
+    ]
     return np.arcsin(sines)

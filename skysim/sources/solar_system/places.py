@@ -49,7 +49,8 @@ def place(name: str, observer: Observer) -> Place:
     (`erfa.ab`). Neglected: deflection by the planets (0.02" at Jupiter's limb), and the outer planets' displacement
     from their systems' barycenters. Source: IERS Conventions 2010, chapter 7; Urban & Seidelmann (2013), ch. 7.
     """
-    ephemeris, delay_s = load_ephemeris(), 0.0
+    ephemeris = load_ephemeris()
+    delay_s = 0.0
     for _ in range(3):
         left_jd = observer.tt_jd - delay_s / DAY_S
         to_body_km = ephemeris.barycentric_km(name, left_jd) - observer.position_km
@@ -63,7 +64,9 @@ def place(name: str, observer: Observer) -> Place:
     if name != "sun":
         body_from_sun = from_sun_km / np.linalg.norm(from_sun_km)
         au = sun_km_away / AU_KM
-        deflected = erfa.ld(1.0, astrometric, body_from_sun, sun_to_observer_km / sun_km_away, au, DEFLECTION_LIMIT)
+        deflected = erfa.ld(
+            1.0, astrometric, body_from_sun, sun_to_observer_km / sun_km_away, au, DEFLECTION_LIMIT
+        )
     beta = observer.velocity_km_s / SPEED_OF_LIGHT_KM_S
     direction = erfa.ab(deflected, beta, sun_km_away / AU_KM, np.sqrt(1 - beta @ beta))
     return lit_place(direction / np.linalg.norm(direction), from_sun_km, to_body_km)
@@ -77,7 +80,9 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     """
     to_observer = -to_body_km / np.linalg.norm(to_body_km)
     distance_km = float(np.linalg.norm(from_sun_km))
-    to_sun = -from_sun_km / distance_km if distance_km > 1 else to_observer  # the Sun itself is at a phase of 0
+    to_sun = (
+        -from_sun_km / distance_km if distance_km > 1 else to_observer
+    )  # the Sun itself is at a phase of 0
     across = to_sun - (to_sun @ to_observer) * to_observer
     phase_rad = float(np.arctan2(np.linalg.norm(across), to_sun @ to_observer))
     # The Sun itself and a body in opposition have no bright limb: any direction will do.

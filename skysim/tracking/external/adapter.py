@@ -18,7 +18,16 @@ from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.sections.light import StarsConfig
 from skysim.tracking.external import process
-from skysim.tracking.external.interface import FAILED, OWN, TRACKERS, Answer, Leds, Picture, Setup, Stars
+from skysim.tracking.external.interface import (
+    FAILED,
+    OWN,
+    TRACKERS,
+    Answer,
+    Leds,
+    Picture,
+    Setup,
+    Stars,
+)
 
 
 class ExternalTracker:
@@ -37,14 +46,19 @@ class ExternalTracker:
         commands: Mapping[str, str],
     ) -> ExternalTracker:
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
-        config, name = scene.tracker, scene.tracker.name
+        config = scene.tracker
+        name = scene.tracker.name
         TRACKERS.check_name(name, commands)
         setup = build_setup(scene, camera, settings, lights)
         if name in commands:
             arguments, image_format = process.split_command(name, commands[name])
-            return cls(process.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s))
+            return cls(
+                process.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s)
+            )
         host, environment = host_command("skysim.tracking.external.host", name)
-        return cls(process.TrackerProgram(name, host, None, setup, config.time_limit_s, environment))
+        return cls(
+            process.TrackerProgram(name, host, None, setup, config.time_limit_s, environment)
+        )
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
         """Send a frame; return the tracker's report."""
@@ -59,7 +73,9 @@ class ExternalTracker:
         raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
 
 
-def build_setup(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:
+def build_setup(
+    scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds
+) -> Setup:
     """The set-up sent to the tracker: the same assumed hardware as skysim's own tracker gets."""
     return Setup(
         "icrs" if isinstance(scene.light, StarsConfig) else "lab",

@@ -29,7 +29,8 @@ class FunctionTracker:
     """
 
     def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
-        self.name, self.function = name, function
+        self.name = name
+        self.function = function
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
         """The tracker's report on a frame; the function gets a copy of its image."""

@@ -14,13 +14,23 @@ from typing import IO, Any
 import numpy as np
 
 from skysim.core.plugins import Respond, describe_error, serve
-from skysim.tracking.external.interface import FAILED, TRACKERS, Answer, Picture, Setup, Tracker, check_answer
+from skysim.tracking.external.interface import (
+    FAILED,
+    TRACKERS,
+    Answer,
+    Picture,
+    Setup,
+    Tracker,
+    check_answer,
+)
 
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     """Read the pixels of a frame whose header has been read."""
     count = header["bytes"]
-    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(header["height_px"], header["width_px"])
+    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
+        header["height_px"], header["width_px"]
+    )
     streak = header["streak_px"]
     fields = (header["frame"], header["t_s"], header["exposure_s"])
     return Picture(image, *fields, None if streak is None else tuple(streak))
@@ -50,7 +60,10 @@ def create(name: str, setup: dict[str, Any]) -> Respond:
     tracker = create_tracker(name, Setup.of_tree(setup))
 
     def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
-        return {"frame": header["frame"], **solve_picture(tracker, receive_picture(header, frames)).as_tree()}
+        return {
+            "frame": header["frame"],
+            **solve_picture(tracker, receive_picture(header, frames)).as_tree(),
+        }
 
     return respond
 

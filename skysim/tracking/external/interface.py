@@ -101,8 +101,13 @@ class Setup:
         values = {name: value for name, value in tree.items() if name != "skysim_tracker"}
         for name, map_type in (("stars", Stars), ("leds", Leds)):
             if values[name] is not None:
-                values[name] = map_type(**{key: np.array(value) for key, value in values[name].items()})
-        values["center_px"], values["distortion"] = tuple(values["center_px"]), tuple(values["distortion"])
+                values[name] = map_type(
+                    **{key: np.array(value) for key, value in values[name].items()}
+                )
+        values["center_px"], values["distortion"] = (
+            tuple(values["center_px"]),
+            tuple(values["distortion"]),
+        )
         return cls(**values)
 
 
@@ -173,9 +178,13 @@ def check_answer(answer: Any) -> Answer:
         raise ValueError(f"status {answer.status!r}; allowed: text")
     quaternion = None
     if answer.cam_from_ref_xyzw is not None:
-        quaternion = normalize_quaternion(finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,)))
+        quaternion = normalize_quaternion(
+            finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
+        )
     if (status == SOLVED) != (quaternion is not None):
-        raise ValueError(f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw")
+        raise ValueError(
+            f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw"
+        )
     covariance = answer.covariance_rad2
     if covariance is not None:
         covariance = check_covariance(finite_array(covariance, "covariance_rad2", (3, 3)))
@@ -213,7 +222,9 @@ def check_centroids(centroids: Any) -> Floats:
         raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
     xy_px = finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
     if (farthest := np.abs(xy_px).max(initial=0.0)) > MAX_CENTROID_PX:
-        raise ValueError(f"centroids_px has {farthest:g}; allowed: up to {MAX_CENTROID_PX:g} px from the first pixel")
+        raise ValueError(
+            f"centroids_px has {farthest:g}; allowed: up to {MAX_CENTROID_PX:g} px from the first pixel"
+        )
     return xy_px
 
 

@@ -32,8 +32,17 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
     for option in options or ():
         name, equals, command = option.partition("=")
         if not equals or not NAME.fullmatch(name) or not command.strip():
-            raise InputError("programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -")
-        taken = {*programs, *(known for kind in (TRACKERS, CONTROLLERS) for known in (*kind.own, *kind.entry_points()))}
+            raise InputError(
+                "programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -"
+            )
+        taken = {
+            *programs,
+            *(
+                known
+                for kind in (TRACKERS, CONTROLLERS)
+                for known in (*kind.own, *kind.entry_points())
+            ),
+        }
         if name in taken:
             raise InputError(f"programs.{name}", "name already in use", "another one")
         split_command(name, command)
@@ -49,7 +58,11 @@ def split_command(name: str, command: str) -> tuple[list[str], str | None]:
         raise InputError(f"programs.{name}", error) from None
     formats = {image_format or "png" for image_format in FOLDER.findall(command)}
     if formats - set(WRITERS) or len(formats) > 1:
-        raise InputError(f"programs.{name}", "", f"{{folder}}, or one of {{folder:{'}, {folder:'.join(WRITERS)}}}")
+        raise InputError(
+            f"programs.{name}",
+            "",
+            f"{{folder}}, or one of {{folder:{'}, {folder:'.join(WRITERS)}}}",
+        )
     return arguments, formats.pop() if formats else None
 
 
@@ -66,7 +79,9 @@ def write_fits(path: Path, picture: Picture) -> None:
 
     from skysim.core.io import files
 
-    header = fits.Header({"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame})
+    header = fits.Header(
+        {"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame}
+    )
     with files.atomic_file(path) as temporary:
         fits.PrimaryHDU(picture.image_dn, header).writeto(temporary, overwrite=True)
 
@@ -92,13 +107,16 @@ class TrackerProgram(Program):
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.image_format = image_format
-        self.failures, self.last_failure = 0, ""
+        self.failures = 0
+        self.last_failure = ""
         super().__init__(TRACKERS.key, name, arguments, setup.as_tree(), limit_s, environment)
 
     def solve(self, picture: Picture) -> Answer:
         """The program's answer to a frame, with the seconds it took. Raises ProgramError."""
         if self.failures >= MAX_FAILURES:
-            raise ProgramError(f"given up after {MAX_FAILURES} failures in a row, the last: {self.last_failure}")
+            raise ProgramError(
+                f"given up after {MAX_FAILURES} failures in a row, the last: {self.last_failure}"
+            )
         try:
             if self.running is None:
                 self.start()
@@ -108,7 +126,8 @@ class TrackerProgram(Program):
             answer = self.to_answer(reply, picture.frame)
         except ProgramError as error:
             if self.running is None:
-                self.failures, self.last_failure = self.failures + 1, str(error)
+                self.failures = self.failures + 1
+                self.last_failure = str(error)
             raise
         self.failures = 0
         own_s = spent_s if answer.seconds is None else min(answer.seconds, spent_s)
@@ -119,7 +138,9 @@ class TrackerProgram(Program):
         if not isinstance(reply, dict) or reply.get("frame") != frame:
             raise self.fail(f"no answer to frame {frame}, but {str(reply)[:80]!r}")
         try:
-            return interface.check_answer(Answer.of_tree({key: reply[key] for key in reply if key != "frame"}))
+            return interface.check_answer(
+                Answer.of_tree({key: reply[key] for key in reply if key != "frame"})
+            )
         except ValueError as error:
             raise ProgramError(str(error)) from None
 
@@ -143,7 +164,9 @@ class TrackerProgram(Program):
                     previous.unlink(missing_ok=True)
                 WRITERS[self.image_format](path, picture)
             except OSError as error:
-                raise self.fail(f"the program's folder takes no frame: {error.strerror or error}", 0.0) from None
+                raise self.fail(
+                    f"the program's folder takes no frame: {error.strerror or error}", 0.0
+                ) from None
             return [(json.dumps(header | {"file": str(path)}) + "\n").encode()]
         dtype = "<u2" if picture.image_dn.dtype == np.uint16 else "<f8"
         pixels = np.ascontiguousarray(picture.image_dn, dtype=dtype).tobytes()

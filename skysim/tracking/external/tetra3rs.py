@@ -26,14 +26,20 @@ class Tetra3rs:
     def __init__(self, setup: Setup) -> None:
         """Raises ValueError for a set-up that it cannot work with, ImportError where tetra3rs is not installed."""
         if setup.reference != "icrs":
-            raise ValueError("tetra3rs solves star fields only; allowed: scenes with light.kind: stars")
+            raise ValueError(
+                "tetra3rs solves star fields only; allowed: scenes with light.kind: stars"
+            )
         unknown = [name for name in setup.options if name not in OPTIONS]
         if unknown:
-            raise ValueError(f"tracker.options: unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}")
+            raise ValueError(
+                f"tracker.options: unknown option {unknown[0]!r}; allowed: {', '.join(OPTIONS)}"
+            )
         try:
             import tetra3rs
         except ImportError:
-            raise ImportError("tetra3rs is not installed; allowed: pip install 'skysim[oracle]'") from None
+            raise ImportError(
+                "tetra3rs is not installed; allowed: pip install 'skysim[oracle]'"
+            ) from None
         self.options = setup.options
         fast = setup.options.get("fast", False)
         self.extract = tetra3rs.extract_centroids_fast if fast else tetra3rs.extract_centroids
@@ -58,7 +64,9 @@ class Tetra3rs:
             threads=1,
         )
         solution = self.database.solve_from_centroids(
-            extraction.centroids, camera_model=self.camera, observer_velocity_km_s=self.velocity_km_s
+            extraction.centroids,
+            camera_model=self.camera,
+            observer_velocity_km_s=self.velocity_km_s,
         )
         xy_px = (
             np.array([(centroid.x, centroid.y) for centroid in extraction.centroids]).reshape(-1, 2)
@@ -79,8 +87,11 @@ def camera_model(tetra3rs: Any, setup: Setup) -> Any:
     """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers
     of the focal length.
     """
-    f, (k1, k2, p1, p2, k3) = setup.focal_px, setup.distortion
-    distortion = tetra3rs.RadialDistortion(k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f)
+    f = setup.focal_px
+    (k1, k2, p1, p2, k3) = setup.distortion
+    distortion = tetra3rs.RadialDistortion(
+        k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f
+    )
     return tetra3rs.CameraModel(
         f,
         setup.width_px,

@@ -15,11 +15,15 @@ from skysim.apps.cli import main
 
 
 @pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+def command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run `skysim` with some words in the folder `tmp_path`; `answers` are what is typed."""
 
     def run(*words: object, answers: str = "") -> subprocess.CompletedProcess[str]:
-        arguments, out, err = ["skysim", *map(str, words)], io.StringIO(), io.StringIO()
+        arguments = ["skysim", *map(str, words)]
+        out = io.StringIO()
+        err = io.StringIO()
         monkeypatch.setattr(sys, "argv", arguments)
         monkeypatch.setattr(sys, "stdin", io.StringIO(answers))
         with (
@@ -29,6 +33,8 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., su
             pytest.raises(SystemExit) as left,
         ):
             main.main()
-        return subprocess.CompletedProcess(arguments, int(left.value.code or 0), out.getvalue(), err.getvalue())
+        return subprocess.CompletedProcess(
+            arguments, int(left.value.code or 0), out.getvalue(), err.getvalue()
+        )
 
     return run

@@ -29,11 +29,15 @@ def test_a_shell_completes_names_and_options(typed: str, completed: list[str]) -
         "COMP_CWORD": str(len(typed.split()) - 1),
     }
     code = "import sys; sys.argv[0] = 'skysim'; from skysim.apps.cli.main import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
     assert (done.stdout.split(), done.stderr) == (completed, "")
 
 
-def test_files_and_folders_complete_beside_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_and_folders_complete_beside_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "shed").mkdir()
     for name in ("shed/lab.yaml", "shefex_mine.yaml", "notes.txt"):
         (tmp_path / name).touch()

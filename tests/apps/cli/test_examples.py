@@ -27,13 +27,16 @@ def commands(command: Any, name: str = "") -> dict[str, Any]:
 
 def command_of(words: list[str]) -> tuple[str, Any, list[str]]:
     """The path of the command that some words call, the command, and the words left; `camera FILE` is `camera show`."""
-    path, command = "", ROOT
+    path = ""
+    command = ROOT
     while inner := getattr(command, "commands", {}):
         if path == "camera" and words and words[0] not in inner:
             words = ["show", *words]
         if not words or words[0] not in inner:
             break
-        path, command, words = f"{path} {words[0]}".strip(), inner[words[0]], words[1:]
+        path = f"{path} {words[0]}".strip()
+        command = inner[words[0]]
+        words = words[1:]
     return path, command, words
 
 
@@ -50,13 +53,17 @@ def test_a_help_ends_with_examples(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "line"), [(name, line) for name, lines in EXAMPLES.items() for line in lines], ids=lambda text: text
+    ("name", "line"),
+    [(name, line) for name, lines in EXAMPLES.items() for line in lines],
+    ids=lambda text: text,
 )
 def test_an_example_calls_its_command_with_options_that_it_has(name: str, line: str) -> None:
     program, *words = shlex.split(line)
     path, command, left = command_of(words)
     assert program == "skysim"
-    assert path == name or (f"{path} ".startswith(f"{name} ".lstrip()) and hasattr(commands(ROOT)[name], "commands"))
+    assert path == name or (
+        f"{path} ".startswith(f"{name} ".lstrip()) and hasattr(commands(ROOT)[name], "commands")
+    )
     command.make_context(path, list(left))  # raises for an unknown option or a missing argument
     assert len(line) <= 78
 

@@ -24,7 +24,12 @@ from skysim.scene import loader
 
 SHEFEX = SCENES / "shefex2.yaml"
 ANSWER = {
-    *("lights", "brightest_dn", "background_dn", "tried_fov_deg", "catalog_limit_mag", "hint"),
+    "lights",
+    "brightest_dn",
+    "background_dn",
+    "tried_fov_deg",
+    "catalog_limit_mag",
+    "hint",
     "file",
     "status",
     "ra_deg",
@@ -55,7 +60,8 @@ class Skysim:
     """Runs the command in this process; stderr is read at the file descriptor, where C libraries print too."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-        self.monkeypatch, self.capfd = monkeypatch, capfd
+        self.monkeypatch = monkeypatch
+        self.capfd = capfd
 
     def __call__(self, *words: object) -> Ran:
         self.monkeypatch.setattr(sys, "argv", ["skysim", *map(str, words)])
@@ -74,8 +80,16 @@ def skysim(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of `skysim render shefex2 --frames 1`, by the real command."""
     folder = tmp_path_factory.mktemp("rendered")
-    command = [sys.executable, "-c", "from skysim.apps.cli.main import main; main()", "render", "shefex2"]
-    done = subprocess.run([*command, "--frames", "1", "--out", str(folder)], capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-c",
+        "from skysim.apps.cli.main import main; main()",
+        "render",
+        "shefex2",
+    ]
+    done = subprocess.run(
+        [*command, "--frames", "1", "--out", str(folder)], capture_output=True, text=True
+    )
     assert done.returncode == 0
     assert done.stderr == ""
     return folder
@@ -105,7 +119,9 @@ def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
 
 
 @pytest.mark.slow
-def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tmp_path: Path) -> None:
+def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     path = tmp_path / "made" / "lab.xml"
     done = skysim("scenes", "export", "simsat_cmg", "--out", path)
     assert (done.code, done.err) == (0, "")
@@ -142,11 +158,17 @@ def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
 
 @pytest.mark.long
 def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) -> None:
-    assert {p.name for p in rendered.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
+    assert {p.name for p in rendered.iterdir()} == {
+        "frame_0000.fits",
+        "frame_0000.png",
+        "frame_0000.ecsv",
+    }
 
 
 @pytest.mark.slow
-def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(skysim: Skysim, tmp_path: Path) -> None:
+def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     words = ["render", "afit_simsat", "--frames", "1", "--out", str(tmp_path)]
     assert skysim(*words).code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -157,11 +179,15 @@ def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(sk
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     words = ["render", "apl_dome", "--frames", "1", "--out", str(tmp_path)]
     told = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
     assert told.code == 0
-    assert told.err.startswith("skysim: vehicle.camera: 5 m from the bearing, outside of light.surface")
+    assert told.err.startswith(
+        "skysim: vehicle.camera: 5 m from the bearing, outside of light.surface"
+    )
     assert told.err.count("\n") == 1
 
 
@@ -198,11 +224,15 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     roll = np.degrees(np.arctan2((up_ra - ra) * np.cos(np.radians(dec)), up_dec - dec))
     assert answer["roll_deg"] == pytest.approx(float(roll), abs=0.05)
     # Between the middles of the edge columns: 2 atan(329 x 9.9 um / 25 mm).
-    assert answer["fov_deg"] == pytest.approx(2 * np.degrees(np.arctan(329 * 9.9e-3 / 25)), abs=1e-6)
+    assert answer["fov_deg"] == pytest.approx(
+        2 * np.degrees(np.arctan(329 * 9.9e-3 / 25)), abs=1e-6
+    )
 
 
 @pytest.mark.slow
-def test_solve_takes_a_picture_of_which_nothing_is_told(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_takes_a_picture_of_which_nothing_is_told(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     """2 atan(658 x 9.9 um / 50 mm) between the middles of the edge columns, where the scene points."""
     ran = skysim("solve", rendered / "frame_0000.fits", "--json", "--out", tmp_path)
     (answer,) = json.loads(ran.out)
@@ -218,7 +248,11 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
 ) -> None:
     """As if there were none, when aberration is left out."""
     frames = {}
-    for name, date in (("none", None), ("late", "9012-06-22T21:00:00"), ("good", "2012-06-22T21:00:00")):
+    for name, date in (
+        ("none", None),
+        ("late", "9012-06-22T21:00:00"),
+        ("good", "2012-06-22T21:00:00"),
+    ):
         frames[name] = tmp_path / f"{name}.fits"
         with fits.open(rendered / "frame_0000.fits") as hdus:
             hdus[0].header["DATE-OBS"] = date
@@ -226,7 +260,9 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
     ran = skysim("solve", *frames.values(), "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
     none, late, good = json.loads(ran.out)
     assert ran.code == 0
-    assert ran.err == (f"skysim: {frames['late']}: DATE-OBS 9012-06-22T21:00:00 is outside 1900 to 2100: ignored\n")
+    assert ran.err == (
+        f"skysim: {frames['late']}: DATE-OBS 9012-06-22T21:00:00 is outside 1900 to 2100: ignored\n"
+    )
     for key in ("ra_deg", "dec_deg", "roll_deg"):
         assert late[key] == none[key]
         assert late[key] != good[key]
@@ -237,7 +273,9 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
 
 
 @pytest.mark.slow
-def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_writes_what_it_prints_and_a_picture(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
     assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.annotated.png"}
@@ -246,7 +284,9 @@ def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Pat
 
 
 @pytest.mark.slow
-def test_solve_takes_a_folder_and_says_why_a_picture_is_refused(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_takes_a_folder_and_says_why_a_picture_is_refused(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "night"
     folder.mkdir()
     frame = cv2.imread(str(rendered / "frame_0000.png"), cv2.IMREAD_UNCHANGED)
@@ -256,20 +296,30 @@ def test_solve_takes_a_folder_and_says_why_a_picture_is_refused(skysim: Skysim, 
     assert (ran.code, ran.err) == (0, "")
     assert ran.out.count("  likely: perhaps mirrored: it solves when flipped") == 1
     assert f"{folder / 'b.png'}: no identification beyond chance\n  seen:   " in ran.out
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"solutions.json", "a.annotated.png", "b.annotated.png"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "solutions.json",
+        "a.annotated.png",
+        "b.annotated.png",
+    }
 
 
 @pytest.mark.slow
 def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     path = rendered / "frame_0000.png"
-    ran = skysim("solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path)
+    ran = skysim(
+        "solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path
+    )
     assert json.loads(ran.out)[0]["catalog_limit_mag"] == 8.0
     assert (
-        "--catalog: unknown catalog 'hip'; allowed: gaia_v8.0" in skysim("solve", path, "--catalog", "hip").one_line()
+        "--catalog: unknown catalog 'hip'; allowed: gaia_v8.0"
+        in skysim("solve", path, "--catalog", "hip").one_line()
     )
     damaged = tmp_path / "x.ecsv"
     damaged.write_text("stars")
-    assert f"--catalog: {damaged}: not a star catalog" in skysim("solve", path, "--catalog", damaged).one_line()
+    assert (
+        f"--catalog: {damaged}: not a star catalog"
+        in skysim("solve", path, "--catalog", damaged).one_line()
+    )
 
 
 @pytest.mark.slow
@@ -287,7 +337,9 @@ def test_a_run_s_json_parses_and_counts(skysim: Skysim, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_seed_writes_the_same_bytes(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_the_same_seed_writes_the_same_bytes(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     assert skysim("render", "shefex2", "--frames", "1", "--out", tmp_path).code == 0
     for name in ("frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"):
         assert (tmp_path / name).read_bytes() == (rendered / name).read_bytes()
@@ -301,12 +353,25 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(skysim: Skysim, tmp_path
 
 @pytest.mark.slow
 def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
-    skysim("render", "shefex2", "--frames", "1", "--seed", "9", "--out", tmp_path, "--set", "title=Nine")
+    skysim(
+        "render",
+        "shefex2",
+        "--frames",
+        "1",
+        "--seed",
+        "9",
+        "--out",
+        tmp_path,
+        "--set",
+        "title=Nine",
+    )
     assert fits.getheader(tmp_path / "frame_0000.fits")["SEED"] == 9
 
 
 @pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
-def test_a_stage_of_a_run_is_named_by_its_option(skysim: Skysim, tmp_path: Path, stage: str) -> None:
+def test_a_stage_of_a_run_is_named_by_its_option(
+    skysim: Skysim, tmp_path: Path, stage: str
+) -> None:
     ran = skysim("run", "shefex2", f"--{stage}", "magic", "--out", tmp_path / "out")
     assert f"tracker.{stage}: unknown {stage} 'magic'; allowed: " in ran.one_line()
     assert not (tmp_path / "out").exists()
@@ -315,9 +380,21 @@ def test_a_stage_of_a_run_is_named_by_its_option(skysim: Skysim, tmp_path: Path,
 @pytest.mark.long
 def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> None:
     """Above the scene's own and above --set; TRIAD takes two stars where the scene's QUEST takes all."""
-    words = ["run", "shefex2", "--frames", "1", "--json", "--out", tmp_path, "--set", "tracker.solver=magic"]
+    words = [
+        "run",
+        "shefex2",
+        "--frames",
+        "1",
+        "--json",
+        "--out",
+        tmp_path,
+        "--set",
+        "tracker.solver=magic",
+    ]
     named = ["--detector", "default", "--centroider", "cog", "--identifier", "pyramid", "--solver"]
-    (triad,), (quest,) = (json.loads(skysim(*words, *named, solver).out)["rows"] for solver in ("triad", "quest"))
+    (triad,), (quest,) = (
+        json.loads(skysim(*words, *named, solver).out)["rows"] for solver in ("triad", "quest")
+    )
     assert (triad["status"], quest["status"]) == ("solved", "solved")
     assert triad["matched"] == quest["matched"]
     assert triad["cross_sigma_arcsec"] > 1.1 * quest["cross_sigma_arcsec"]
@@ -350,7 +427,10 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
             ["shefex2", "--set", "camera.focal_lenght=25 mm"],
             "unknown key; did you mean focal_length?; allowed: ",
         ),
-        (["shefex2", "--set", "camera.focal_length=25"], "25 has no unit; allowed: a length such as"),
+        (
+            ["shefex2", "--set", "camera.focal_length=25"],
+            "25 has no unit; allowed: a length such as",
+        ),
         (
             ["shefex2", "--set", "camera.focal_length=25 kg"],
             "'25 kg' is not a length; allowed: a length such as",
@@ -369,12 +449,18 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
             "requires roll_deg, pitch_deg, yaw_deg",
         ),
         (["afit_simsat", "--set", "motion.start={roll_deg: 40}"], "up to vehicle.tilt_stop_deg 30"),
-        (["afit_simsat", "--set", "light.surface.apex=90 in"], "the bearing's center is outside of the dome"),
+        (
+            ["afit_simsat", "--set", "light.surface.apex=90 in"],
+            "the bearing's center is outside of the dome",
+        ),
         (
             ["shefex2", "--set", "tracker.identifier=magic"],
             "tracker.identifier: unknown identifier 'magic'; allowed: default, pyramid",
         ),
-        (["shefex2", "--set", "tracker.solver=rotation_only"], "unknown solver 'rotation_only'; allowed: "),
+        (
+            ["shefex2", "--set", "tracker.solver=rotation_only"],
+            "unknown solver 'rotation_only'; allowed: ",
+        ),
         (
             ["shefex2", "--set", "light.catalog=nosuch"],
             "light.catalog: unknown catalog 'nosuch'; allowed: gaia_v8.0, hipparcos_hp6.5",
@@ -401,7 +487,11 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
             "background.0.kind: unknown kind 'aurora'; allowed: uniform, ",
         ),
         (
-            ["shefex2", "--set", "motion.jitter=[{kind: line, frequency_hz: 1e9, rms_arcsec: [1, 1, 1]}]"],
+            [
+                "shefex2",
+                "--set",
+                "motion.jitter=[{kind: line, frequency_hz: 1e9, rms_arcsec: [1, 1, 1]}]",
+            ],
             "motion.jitter: 1e+09 Hz over ",
         ),
         (["shefex2", "--set", "seed"], "--set: seed; allowed: path.to.key=value"),
@@ -430,7 +520,10 @@ def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Pat
     path.write_text((SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic"))
     line = path.read_text()[: path.read_text().index("falloff:")].count("\n") + 1
     said = skysim("render", path).one_line()
-    assert said == f"skysim: light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square' ({path}, line {line})"
+    assert (
+        said
+        == f"skysim: light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square' ({path}, line {line})"
+    )
 
 
 def test_what_is_not_yaml_is_one_line(skysim: Skysim, tmp_path: Path) -> None:
@@ -451,7 +544,9 @@ def test_no_command_at_all_shows_the_help(skysim: Skysim) -> None:
 
 def test_a_folder_that_cannot_be_made_is_one_line(skysim: Skysim, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    said = skysim("render", "shefex2", "--frames", "1", "--out", tmp_path / "file" / "out").one_line()
+    said = skysim(
+        "render", "shefex2", "--frames", "1", "--out", tmp_path / "file" / "out"
+    ).one_line()
     assert "cannot be created as a folder" in said
 
 
@@ -500,7 +595,10 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
     ),
     "empty frame": (lambda at, r: as_fits(at, np.zeros_like(frame_of(r))), "the frame is empty"),
     "flat frame": (lambda at, r: as_fits(at, np.full_like(frame_of(r), 64)), "the frame is empty"),
-    "saturated": (lambda at, r: as_fits(at, np.full_like(frame_of(r), 4064)), "the frame is saturated"),
+    "saturated": (
+        lambda at, r: as_fits(at, np.full_like(frame_of(r), 4064)),
+        "the frame is saturated",
+    ),
     "NaN": (lambda at, r: as_fits(at, with_nan(frame_of(r))), "NaN or infinite"),
     "truncated FITS": (lambda at, r: cut(r / "frame_0000.fits", at), "not a complete FITS file"),
     "truncated PNG": (lambda at, r: cut(r / "frame_0000.png", at), "cannot be decoded"),
@@ -517,7 +615,8 @@ def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
     skysim: Skysim, rendered: Path, tmp_path: Path, kind: str
 ) -> None:
     make, says = BAD_IMAGES[kind]
-    path, out = make(tmp_path, rendered), tmp_path / "out"
+    path = make(tmp_path, rendered)
+    out = tmp_path / "out"
     ran = skysim("solve", path, "--camera", SHEFEX, "--json", "--out", out)
     said = ran.one_line()
     assert says in said
@@ -529,9 +628,20 @@ def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
 
 
 @pytest.mark.slow
-def test_a_bad_image_does_not_stop_the_good_one_behind_it(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_a_bad_image_does_not_stop_the_good_one_behind_it(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     good = rendered / "frame_0000.fits"
-    ran = skysim("solve", tmp_path / "nosuch.fits", good, "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
+    ran = skysim(
+        "solve",
+        tmp_path / "nosuch.fits",
+        good,
+        "--camera",
+        SHEFEX,
+        "--json",
+        "--out",
+        tmp_path / "out",
+    )
     ran.one_line()
     assert [answer["status"] == "solved" for answer in json.loads(ran.out)] == [False, True]
 
@@ -550,12 +660,18 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--fov", "15", "--camera", SHEFEX], "--fov: conflicts with a camera; allowed: one of the two"),
+        (
+            ["--fov", "15", "--camera", SHEFEX],
+            "--fov: conflicts with a camera; allowed: one of the two",
+        ),
         (["--fov", "0"], "--fov: 0; allowed: the horizontal field of view, 1 to 120 degrees"),
         (["--fov", "nan"], "--fov: nan; allowed"),
         (["--fov", "wide"], "--fov"),
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
-        (["--camera", "nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
+        (
+            ["--camera", "nosuch"],
+            "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, ",
+        ),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
         (["--time", "9999-12-31T23:59:59"], "--time: 9999-12-31T23:59:59 is outside 1900 to 2100"),
         (["--time", "1899-12-31T23:59:59+00:00"], "is outside 1900 to 2100"),
@@ -574,7 +690,9 @@ def test_a_wrong_option_of_solve_is_one_line(
 
 
 @pytest.mark.slow
-def test_a_camera_file_with_a_slip_is_one_line(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_a_camera_file_with_a_slip_is_one_line(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     camera = tmp_path / "camera.yaml"
     camera.write_text(SHEFEX.read_text().replace('focal_length: "25 mm"', "focal_length: 25"))
     said = skysim("solve", rendered / "frame_0000.fits", "--camera", camera).one_line()
@@ -608,14 +726,18 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
 
 
 def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
-    told = json.loads(skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out)
+    told = json.loads(
+        skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out
+    )
     assert told["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
     assert told["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
     assert any(line.startswith("light.layout.cap_deg: ") for line in told["findings"])
 
 
 @pytest.mark.slow
-def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     words = ("--frames", 1, "--set", "light.led.intensity=60 mcd", "--out", tmp_path)
     ran = skysim("run", "afit_simsat", *words, "--json")
     assert ran.code == 0
@@ -660,17 +782,27 @@ def test_scenes_show_prints_keys_with_their_origin(skysim: Skysim) -> None:
 
 
 def test_an_option_without_effect_is_one_line(skysim: Skysim) -> None:
-    for words in (("check", "afit_simsat"), ("run", "afit_simsat"), ("scenes", "show", "afit_simsat")):
+    for words in (
+        ("check", "afit_simsat"),
+        ("run", "afit_simsat"),
+        ("scenes", "show", "afit_simsat"),
+    ):
         line = skysim(*words, "--set", "tracker.limit_mag=4").one_line()
-        assert "tracker.limit_mag: has no effect: under a dome the tracker's map is of LEDs; allowed: " in line
+        assert (
+            "tracker.limit_mag: has no effect: under a dome the tracker's map is of LEDs; allowed: "
+            in line
+        )
 
 
 def test_compare_takes_options_of_any_of_its_trackers() -> None:
     """Each is refused for the other tracker alone; one that serves none is refused."""
-    words, both = ["tracker.solver=quest", "tracker.options={a: 1}"], ["own", "mine"]
+    words = ["tracker.solver=quest", "tracker.options={a: 1}"]
+    both = ["own", "mine"]
     assert load("shefex2", 1, None, words, both).tracker.name == "own"
     for trackers in (["own"], ["mine"]):
         with pytest.raises(InputError, match="has no effect"):
             load("shefex2", 1, None, words, trackers)
-    with pytest.raises(InputError, match=r"tracker.assumed_camera_body: has no effect.*\(overrides\)"):
+    with pytest.raises(
+        InputError, match=r"tracker.assumed_camera_body: has no effect.*\(overrides\)"
+    ):
         load("shefex2", 1, None, ["tracker.assumed_camera_body=[1 m, 0 m, 0 m]"], both)

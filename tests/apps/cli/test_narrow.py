@@ -38,9 +38,12 @@ def row(frame: int) -> FrameRow:
 def score(name: str) -> TrackerScore:
     times = {"time_ms_median": 12.5, "time_ms_p95": 123.0}
     errors = dict.fromkeys(
-        [f"{angle}_arcsec_{what}" for angle in ("cross", "roll") for what in ("median", "worst")], 1234.5
+        [f"{angle}_arcsec_{what}" for angle in ("cross", "roll") for what in ("median", "worst")],
+        1234.5,
     )
-    return TrackerScore(name, 400, Summary(0.951, 0.925, 0.97, 400), 3, 12, 0, **errors, **times, refusals={})
+    return TrackerScore(
+        name, 400, Summary(0.951, 0.925, 0.97, 400), 3, 12, 0, **errors, **times, refusals={}
+    )
 
 
 @pytest.mark.parametrize("width", [80, 100, 240])
@@ -78,7 +81,12 @@ def test_the_summary_of_a_run_fits_the_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(as_text, "terminal_width", lambda: 80)
-    motion = {"pointing_deg_worst": 0.0687, "pointing_deg_end": 0.069, "torque_nm_worst": 0.0757, "imu_deg_worst": 1.0}
+    motion = {
+        "pointing_deg_worst": 0.0687,
+        "pointing_deg_end": 0.069,
+        "torque_nm_worst": 0.0757,
+        "imu_deg_worst": 1.0,
+    }
     report(motion | {"imu_deg_end": 0.005, "gyro_saturated_s": 0.0}).print()
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
@@ -94,7 +102,8 @@ def test_the_rows_of_a_run_fit_the_terminal(
     monkeypatch.setattr(as_text, "terminal_width", lambda: width)
     as_text.print_table(frame_table(TRIPLE, [row(0), row(1)]))
     out = capsys.readouterr().out
-    lines, named = out.splitlines(), " ".join(out.split()).partition("in a wider terminal: ")[2]
+    lines = out.splitlines()
+    named = " ".join(out.split()).partition("in a wider terminal: ")[2]
     assert len(named.split(", ") if named else []) == left_out
     table = [line for line in lines if "solved" in line]
     assert len(table) == 2

@@ -25,16 +25,33 @@ STUDY = {
     ("words", "message"),
     [
         ("run shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
-        ("check shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
-        ("validate study.yaml shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
-        ("compare shefex2 --tracker own --program mine=cat", "--program mine: has no effect: nothing has this name"),
-        ("study run study.yaml --program mine=cat", "--program mine: has no effect: nothing has this name"),
-        ("study run study.yaml --engine serial --workers 2", "--workers 2: has no effect with --engine serial"),
+        (
+            "check shefex2 --program mine=cat",
+            "--program mine: has no effect: nothing has this name",
+        ),
+        (
+            "validate study.yaml shefex2 --program mine=cat",
+            "--program mine: has no effect: nothing has this name",
+        ),
+        (
+            "compare shefex2 --tracker own --program mine=cat",
+            "--program mine: has no effect: nothing has this name",
+        ),
+        (
+            "study run study.yaml --program mine=cat",
+            "--program mine: has no effect: nothing has this name",
+        ),
+        (
+            "study run study.yaml --engine serial --workers 2",
+            "--workers 2: has no effect with --engine serial",
+        ),
         ("stream shefex2 --folder out --host ::1", "--host ::1: has no effect without --http"),
         ("reproduce afit-table-1 --open", "--open: has no effect without --report"),
     ],
 )
-def test_an_option_without_effect_is_refused(command: Command, words: str, message: str, tmp_path: Path) -> None:
+def test_an_option_without_effect_is_refused(
+    command: Command, words: str, message: str, tmp_path: Path
+) -> None:
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
     done = command(*words.split())
     assert (done.returncode, done.stdout) == (2, "")

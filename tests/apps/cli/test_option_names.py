@@ -44,8 +44,16 @@ def raised_keys() -> Iterator[str]:
         if path.relative_to(PACKAGE).parts[0] == "apps" or path.parent.name == "sections":
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
-                key = node.args[0].values[0] if isinstance(node.args[0], ast.JoinedStr) else node.args[0]
+            if (
+                isinstance(node, ast.Call)
+                and getattr(node.func, "id", "") == "InputError"
+                and node.args
+            ):
+                key = (
+                    node.args[0].values[0]
+                    if isinstance(node.args[0], ast.JoinedStr)
+                    else node.args[0]
+                )
                 if isinstance(key, ast.Constant):
                     yield key.value
 
@@ -65,7 +73,10 @@ def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
     found = {key for key in raised_keys() if "." in key and key.partition(".")[0] in PARAMETERS}
     assert len(found) > 10
     # With a name filled in, as `dataset.{name}`, the begin alone is known.
-    assert {key for key in found if key not in OPTIONS and key[-1] != "."} <= {"where.", "programs."}
+    assert {key for key in found if key not in OPTIONS and key[-1] != "."} <= {
+        "where.",
+        "programs.",
+    }
 
 
 @pytest.mark.parametrize(
@@ -73,8 +84,14 @@ def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
     [
         (InputError("survey.tilt_deg", "95", "up to 30"), "--tilt: 95; allowed: up to 30"),
         (InputError("programs.mine", "name already in use"), "--program mine: name already in use"),
-        (InputError("where.rate", "unknown level 5", "1, 2"), "--where rate: unknown level 5; allowed: 1, 2"),
-        (InputError("overrides", "frames", "path.to.key=value"), "--set: frames; allowed: path.to.key=value"),
+        (
+            InputError("where.rate", "unknown level 5", "1, 2"),
+            "--where rate: unknown level 5; allowed: 1, 2",
+        ),
+        (
+            InputError("overrides", "frames", "path.to.key=value"),
+            "--set: frames; allowed: path.to.key=value",
+        ),
         (InputError("seed", "-1", "0 or more", OVERRIDES), "seed: -1; allowed: 0 or more (--set)"),
         (InputError("seed", "-1", "", Where("x.yaml", 3)), "seed: -1 (x.yaml, line 3)"),
         (InputError("light.layout", "full"), "light.layout: full"),
@@ -101,5 +118,8 @@ def test_a_key_that_is_checked_after_loading_gets_its_place() -> None:
     assert in_file.where is not None
     assert in_file.where.line
     assert in_file.where.file.endswith("shefex2.yaml")
-    assert str(as_typed(InputError("camera.f_number", "too fast"))) == "camera.f_number: too fast (--set)"
+    assert (
+        str(as_typed(InputError("camera.f_number", "too fast")))
+        == "camera.f_number: too fast (--set)"
+    )
     assert str(as_typed(InputError("seed", "unlucky"))) == "--seed: unlucky"

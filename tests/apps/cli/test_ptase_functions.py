@@ -88,7 +88,9 @@ def flown(folder: Path, *words: str) -> Any:
 def looks(row: Any, ra_deg: float, dec_deg: float, roll_deg: float) -> bool:
     """Whether a run's frame was solved there."""
     wanted = np.array([ra_deg, dec_deg, roll_deg])
-    return row["status"] == "solved" and bool(np.abs(np.array(row["estimate_deg"]) - wanted).max() < 0.05)
+    return row["status"] == "solved" and bool(
+        np.abs(np.array(row["estimate_deg"]) - wanted).max() < 0.05
+    )
 
 
 class Field(NamedTuple):
@@ -125,7 +127,9 @@ def identified(found: Any, one: Field) -> bool:
 
 def chosen_catalog(folder: Path) -> bool:
     count = asked("catalog", "info", "hipparcos_hp6.5")["stars"]
-    return count > 5000 and bool(np.abs(drawn_at(folder, "light.catalog=hipparcos_hp6.5") - [83, 2, 20]).max() < 1e-3)
+    return count > 5000 and bool(
+        np.abs(drawn_at(folder, "light.catalog=hipparcos_hp6.5") - [83, 2, 20]).max() < 1e-3
+    )
 
 
 def screen(folder: Path) -> bool:
@@ -135,8 +139,14 @@ def screen(folder: Path) -> bool:
 
 def drawn_at(folder: Path, *sets: str) -> Floats:
     """(3,) right ascension, declination, roll of what is drawn, deg, from the frame's truth."""
-    asked("render", *SCENE, "--out", str(folder), *(word for one in sets for word in ("--set", one)))
-    told = [line for line in (folder / "frame_0000.ecsv").read_text("utf-8").splitlines() if "cam_from_lab" in line]
+    asked(
+        "render", *SCENE, "--out", str(folder), *(word for one in sets for word in ("--set", one))
+    )
+    told = [
+        line
+        for line in (folder / "frame_0000.ecsv").read_text("utf-8").splitlines()
+        if "cam_from_lab" in line
+    ]
     xyzw = np.array(json.loads(told[0][told[0].index("[") : told[0].index("]") + 1]))
     return np.degrees(ra_dec_roll_rad(Rotation.from_quat(xyzw)))
 
@@ -157,7 +167,12 @@ def coordinates(folder: Path) -> bool:
 
 
 def image_processing(folder: Path) -> bool:
-    row = flown(folder, *("--detector", "local", "--centroider", "gaussian_fit"), "--set", "tracker.threshold_sigma=7")
+    row = flown(
+        folder,
+        *("--detector", "local", "--centroider", "gaussian_fit"),
+        "--set",
+        "tracker.threshold_sigma=7",
+    )
     return looks(row, 83, 2, 20)
 
 
@@ -176,7 +191,9 @@ def studied(folder: Path, *words: str) -> Any:
     """A small study's table."""
     path = folder / "monte_carlo.yaml"
     files.write_text(path, STUDY)
-    told = asked("study", "run", str(path), "--engine", "serial", "--out", str(folder / "study"), *words)
+    told = asked(
+        "study", "run", str(path), "--engine", "serial", "--out", str(folder / "study"), *words
+    )
     return told["points"]
 
 
@@ -277,7 +294,8 @@ def proc_cat(folder: Path) -> bool:
 
 def attitudes(folder: Path) -> bool:
     """The deterministic one from two stars, and least squares."""
-    one, names = field(), ("triad", "least_squares")
+    one = field()
+    names = ("triad", "least_squares")
     sigma_rad = np.full(len(one.rows), ARCSEC_RAD)
     found = [SOLVERS[name](one.seen, one.seen, sigma_rad) for name in names]
     return all(getattr(each, "cam_from_ref", each).magnitude() < ARCSEC_RAD for each in found)
@@ -285,8 +303,14 @@ def attitudes(folder: Path) -> bool:
 
 def true_sky(folder: Path) -> bool:
     asked("render", *SCENE, "--out", str(folder))
-    told = asked("solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved"))[0]
-    return told["status"] == "solved" and abs(told["ra_deg"] - 83) < 0.2 and abs(told["dec_deg"] - 2) < 0.2
+    told = asked(
+        "solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved")
+    )[0]
+    return (
+        told["status"] == "solved"
+        and abs(told["ra_deg"] - 83) < 0.2
+        and abs(told["dec_deg"] - 2) < 0.2
+    )
 
 
 def from_a_camera(folder: Path) -> bool:
@@ -295,27 +319,44 @@ def from_a_camera(folder: Path) -> bool:
 
     asked("render", *SCENE, "--out", str(folder))
     gray = to_8bit(images.read_image(folder / "frame_0000.png"), "square root")
-    video = cv2.VideoWriter(str(folder / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, gray.shape[::-1])
+    video = cv2.VideoWriter(
+        str(folder / "camera.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, gray.shape[::-1]
+    )
     video.write(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
     video.release()
-    told = asked("solve", "--live", str(folder / "camera.avi"), "--fov", "14.87", "--out", str(folder))[0]
-    return told["status"] == "solved" and abs(told["ra_deg"] - 83) < 0.2 and abs(told["dec_deg"] - 2) < 0.2
+    told = asked(
+        "solve", "--live", str(folder / "camera.avi"), "--fov", "14.87", "--out", str(folder)
+    )[0]
+    return (
+        told["status"] == "solved"
+        and abs(told["ra_deg"] - 83) < 0.2
+        and abs(told["dec_deg"] - 2) < 0.2
+    )
 
 
 def estimate(folder: Path) -> bool:
     """With a hint near the axis the stars are named; with a wrong one there is nothing to be named from."""
-    one, known = field(), catalog(5.1)
+    one = field()
+    known = catalog(5.1)
     axis = one.seen.mean(axis=0) / np.linalg.norm(one.seen.mean(axis=0))
     told = {"magnitude": one.magnitude, "epsilon_mag": SIGMA_MAG, "within_rad": np.radians(15)}
     right = fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=axis, **told)
-    return identified(right, one) and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **told) is None
+    return (
+        identified(right, one)
+        and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **told) is None
+    )
 
 
 def false_stars(folder: Path) -> bool:
     """Three false lights, brighter than all stars: the first triangle is none."""
-    one, known = field(), catalog(5.1)
+    one = field()
+    known = catalog(5.1)
     side = np.cross(one.seen[0], [0.0, 0.0, 1.0])
-    false = one.seen.mean(axis=0) + np.outer([0.05, -0.07, 0.11], side) + [[0.0, 0.0, z] for z in (0.06, 0.02, -0.09)]
+    false = (
+        one.seen.mean(axis=0)
+        + np.outer([0.05, -0.07, 0.11], side)
+        + [[0.0, 0.0, z] for z in (0.06, 0.02, -0.09)]
+    )
     seen = np.vstack([false / np.linalg.norm(false, axis=1, keepdims=True), one.seen])
     light = np.append([-1.5, -1.4, -1.3], one.magnitude)
     told = {"magnitude": light, "epsilon_mag": SIGMA_MAG}
@@ -327,7 +368,8 @@ def false_stars(folder: Path) -> bool:
 
 def magnitude_errors(folder: Path) -> bool:
     """Mean and variance come back: magnitudes off by .1 with an alternating .05 about it."""
-    one, known = field(), catalog(5.1)
+    one = field()
+    known = catalog(5.1)
     off = 0.1 + 0.05 * (-1.0) ** np.arange(len(one.rows))
     told = {"magnitude": one.magnitude + off, "epsilon_mag": SIGMA_MAG}
     found = fialho_4(one.seen, known, TOLERANCE_RAD, **told)

@@ -23,8 +23,12 @@ class Screen(io.StringIO):
         return True
 
 
-def test_a_table_shows_cells_heads_and_title_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    table = Table([Column("file", kind="text"), Column(HOSTILE)], [["a[/b]/m[red].png", Cell("WRONG", "bad")]])
+def test_a_table_shows_cells_heads_and_title_as_they_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = Table(
+        [Column("file", kind="text"), Column(HOSTILE)], [["a[/b]/m[red].png", Cell("WRONG", "bad")]]
+    )
     print_table(table, HOSTILE)
     title, heads, line = capsys.readouterr().out.splitlines()
     assert title.strip() == HOSTILE
@@ -46,6 +50,9 @@ def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_a_tracker_says_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check_answer(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status == "lost ?[2J?? in? space"
+    assert (
+        check_answer(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status
+        == "lost ?[2J?? in? space"
+    )
     terminal.print_error("a\x1b[31m.png: no such\nfile")
     assert capsys.readouterr().err == "skysim: a?[31m.png: no such file\n"

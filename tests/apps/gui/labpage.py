@@ -24,14 +24,20 @@ import pytest
 from skysim.core.paths import ROOT
 
 CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (found := shutil.which(name))
+    ),
+    "",
 )
 PICTURES = ROOT / "out" / "screenshots"
 SLOW_MS = 600_000  # a first compilation on a busy machine
 QUICK_MS = 90_000
 TOKEN = "right"
 STAGES = ("detector", "centroider", "identifier", "solver")
-WIDE, NARROW = {"width": 1920, "height": 1080}, {"width": 1280, "height": 800}
+WIDE = {"width": 1920, "height": 1080}
+NARROW = {"width": 1280, "height": 800}
 
 
 class Server:
@@ -41,12 +47,26 @@ class Server:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        self.folder, self.out = folder, folder / "out"
-        command = [sys.executable, "-m", "skysim", "gui", "shefex2", "--no-open", "--port", str(self.port)]
+        self.folder = folder
+        self.out = folder / "out"
+        command = [
+            sys.executable,
+            "-m",
+            "skysim",
+            "gui",
+            "shefex2",
+            "--no-open",
+            "--port",
+            str(self.port),
+        ]
         place = ["--host", host, "--folder", str(folder), "--out", str(self.out), "--token", TOKEN]
         # With pytest's own variable NiceGUI takes the server for a test of itself.
-        environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-        self.process = subprocess.Popen([*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True)
+        environment = {
+            name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
+        }
+        self.process = subprocess.Popen(
+            [*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True
+        )
         self.url = f"http://127.0.0.1:{self.port}/"
         self.login = f"{self.url}?token={TOKEN}"
 
@@ -97,9 +117,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     """Chromium without a screen."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="the extra `browser` is not installed"
+    )
     with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"])
+        found = driver.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
+        )
         yield found
         found.close()
 
@@ -144,7 +168,9 @@ class opened:
         status(self.page, "solved")
         self.page.locator(".lab-frame canvas[data-frame]").wait_for()
         self.page.set_default_timeout(QUICK_MS)
-        self.page.wait_for_timeout(300)  # no person types in the moment in which fields are filled in
+        self.page.wait_for_timeout(
+            300
+        )  # no person types in the moment in which fields are filled in
 
     def __enter__(self) -> Any:
         return self.page
@@ -178,7 +204,9 @@ def source(page: Any) -> str:
 
 def changed(page: Any, before: str) -> None:
     """Wait for another frame."""
-    page.wait_for_function("before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before)
+    page.wait_for_function(
+        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before
+    )
 
 
 def come(true: Callable[[], bool], within_s: float = QUICK_MS / 1000) -> bool:
@@ -214,7 +242,8 @@ def choose_stage(page: Any, stage: str, algorithm: str) -> None:
 
 def set_to(page: Any, name: str, value: str) -> None:
     """Type a key's value in the forms; wait for what comes of it."""
-    frame, field = source(page), page.get_by_label(name, exact=True)
+    frame = source(page)
+    field = page.get_by_label(name, exact=True)
     field.fill(value)
     field.press("Enter")
     changed(page, frame)
@@ -255,7 +284,9 @@ def brightness(page: Any) -> float:
 def screen(page: Any, x: float, y: float) -> tuple[float, float]:
     """Where a pixel of a frame is on the screen."""
     box = page.locator(".lab-frame canvas").bounding_box()
-    left, top, scale = map(float, page.locator(".lab-frame canvas").get_attribute("data-placement").split())
+    left, top, scale = map(
+        float, page.locator(".lab-frame canvas").get_attribute("data-placement").split()
+    )
     return box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
 
 
@@ -267,7 +298,9 @@ def frame_pixel(page: Any, x: float, y: float) -> tuple[float, float]:
 
 def picture(page: Any, **how: Any) -> np.ndarray:
     """(H, W, 3) of the screen, whole numbers that can be subtracted."""
-    return cv2.imdecode(np.frombuffer(page.screenshot(**how), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    return cv2.imdecode(np.frombuffer(page.screenshot(**how), np.uint8), cv2.IMREAD_COLOR).astype(
+        int
+    )
 
 
 def pixels(page: Any) -> list[tuple[int, int, int]]:

@@ -8,14 +8,26 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from labpage import CHROMIUM, NARROW, QUICK_MS, Server, changed, come, opened, pictured, source, status
+from labpage import (
+    CHROMIUM,
+    NARROW,
+    QUICK_MS,
+    Server,
+    changed,
+    come,
+    opened,
+    pictured,
+    source,
+    status,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.worker import session
 
 pytest_plugins = ["labpage"]
-TABS, WORKERS = 20, 2
+TABS = 20
+WORKERS = 2
 
 
 class Hand:
@@ -30,16 +42,22 @@ class Hand:
         self.alive.discard(self)
 
 
-def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
     monkeypatch.setattr(session, "Session", Hand)
     monkeypatch.setattr(session, "QUEUE_S", 0.001)
     monkeypatch.setattr(Hand, "alive", set())
-    workers, served, told = session.Workers(WORKERS), list[tuple[int, Hand | None]](), dict[int, str]()
+    workers = session.Workers(WORKERS)
+    served = list[tuple[int, Hand | None]]()
+    told = dict[int, str]()
     gone = set[int]()
 
     async def tab(number: int) -> None:
-        got = await workers.wait(lambda: number not in gone, lambda text: told.update({number: text}))
+        got = await workers.wait(
+            lambda: number not in gone, lambda text: told.update({number: text})
+        )
         served.append((number, got))
 
     async def story() -> None:
@@ -58,7 +76,9 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
             assert hand is not None
             hand.close()
             if next_one == 3:
-                tabs.append(asyncio.create_task(tab(TABS)))  # a newcomer looks at once, and yet is the last
+                tabs.append(
+                    asyncio.create_task(tab(TABS))
+                )  # a newcomer looks at once, and yet is the last
             await tabs[next_one]
             assert served[-1][0] == next_one
             assert len(Hand.alive) == WORKERS
@@ -72,7 +92,10 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
-    with Server(tmp_path, "--workers", str(WORKERS)) as server, opened(browser, server.login, NARROW) as first:
+    with (
+        Server(tmp_path, "--workers", str(WORKERS)) as server,
+        opened(browser, server.login, NARROW) as first,
+    ):
         with opened(browser, server.login, NARROW) as second:
             waiting = []
             for _ in range(TABS - WORKERS):
@@ -99,5 +122,8 @@ def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
 
 def place(page: Any) -> int:
     """How many wait before a page; -1 if it does not wait."""
-    found = re.search(r"2 of 2 workers in use(?:; (\d+) before this page)?\.", page.locator(".lab-wait").inner_text())
+    found = re.search(
+        r"2 of 2 workers in use(?:; (\d+) before this page)?\.",
+        page.locator(".lab-wait").inner_text(),
+    )
     return int(found[1] or 0) if found else -1

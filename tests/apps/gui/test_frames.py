@@ -53,14 +53,17 @@ def decoded(data: bytes) -> tuple[dict[str, Any], np.ndarray]:
     length = int.from_bytes(data[-4:], "little")
     fields = json.loads(data[-4 - length : -4])
     kind = np.uint8 if fields["shaded"] else np.uint16
-    return fields, np.frombuffer(data[HEADER_BYTES : -4 - length], kind).reshape(fields["grid"][::-1])
+    return fields, np.frombuffer(data[HEADER_BYTES : -4 - length], kind).reshape(
+        fields["grid"][::-1]
+    )
 
 
 class Source:
     """In place of a session: the worker shows an image of number 1, or has ended (None)."""
 
     def __init__(self, image: np.ndarray | None) -> None:
-        self.image, self.display = image, ALL_PIXELS
+        self.image = image
+        self.display = ALL_PIXELS
 
     async def run(self, task: str, *arguments: Any) -> Pixels | None:
         if self.image is None:
@@ -69,12 +72,16 @@ class Source:
         return getattr(worker, task)(*arguments)
 
 
-def served(image: np.ndarray, display: Display = ALL_PIXELS, saturation_dn: float = np.inf) -> ServedFrame:
+def served(
+    image: np.ndarray, display: Display = ALL_PIXELS, saturation_dn: float = np.inf
+) -> ServedFrame:
     pixels = pixels_for(display, levels_of(image), saturation_dn, 1)
     return ServedFrame(pixels, {"label": "sky"}, Source(image))
 
 
-def response(frame: ServedFrame, display: Display, whole: bool = False) -> tuple[dict[str, Any], np.ndarray]:
+def response(
+    frame: ServedFrame, display: Display, whole: bool = False
+) -> tuple[dict[str, Any], np.ndarray]:
     return decoded(asyncio.run(frame.response(display, whole)))
 
 
@@ -94,11 +101,14 @@ def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str | tuple[flo
     fewer, whole = (response(frame, display, whole) for whole in (False, True))
     np.testing.assert_array_equal(whole[1], sky(2))
     assert fewer[1].shape == (58, 77)
-    assert [fewer[0][name] for name in ("limits", "histogram")] == [whole[0][name] for name in ("limits", "histogram")]
+    assert [fewer[0][name] for name in ("limits", "histogram")] == [
+        whole[0][name] for name in ("limits", "histogram")
+    ]
 
 
 def test_all_pixels_come_from_the_worker_if_it_still_has_them() -> None:
-    display, image = Display(SCREEN), sky(2)
+    display = Display(SCREEN)
+    image = sky(2)
     frame = served(image, display)
     zoomed = Display()
     np.testing.assert_array_equal(response(frame, zoomed)[1], image)
@@ -123,7 +133,9 @@ def reduced(image: np.ndarray, columns: int) -> np.ndarray:
 
 def test_a_shade_is_that_of_the_mean_over_its_area() -> None:
     image = np.random.default_rng(3).integers(0, 2541, (120, 160)).astype(np.uint16)
-    np.testing.assert_allclose(reduced(image, 40), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=5.6)
+    np.testing.assert_allclose(
+        reduced(image, 40), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=5.6
+    )
     shares = [overlaps(length, count) for length, count in zip(image.shape, (58, 77), strict=True)]
     means = shares[0] @ image @ shares[1].T  # areas that share pixels
     np.testing.assert_allclose(reduced(image, 77), means, atol=5.6)
@@ -132,7 +144,8 @@ def test_a_shade_is_that_of_the_mean_over_its_area() -> None:
 
 def overlaps(length: int, count: int) -> np.ndarray:
     """(count, length) share of each pixel of a row in each of as many equal areas, by their ends."""
-    ends, edges = np.arange(count + 1) * length / count, np.arange(length)
+    ends = np.arange(count + 1) * length / count
+    edges = np.arange(length)
     shared = np.minimum(ends[1:, None], edges + 1) - np.maximum(ends[:-1, None], edges)
     return np.clip(shared, 0, None) * count / length
 
@@ -147,7 +160,9 @@ def test_shades_follow_the_curve_between_the_limits(curve: str) -> None:
 
 def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
     image = sky(4)
-    image[51, 80], image[90, 83] = 4095, 4095  # the second is on the edge of two areas
+    # the second is on the edge of two areas
+    image[51, 80] = 4095
+    image[90, 83] = 4095
     found = shades(image, 61, (0.0, 100.0), 4095.0, "linear")
     assert np.argwhere(found == SATURATED).tolist() == [[19, 30], [34, 31], [34, 32]]
 
@@ -162,7 +177,10 @@ def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
         ),
         ({"limits": "-1.5,2e3", "near": ""}, Display((0, 0), (-1.5, 2000.0))),
         *[({"screen": screen}, None) for screen in ("x", "5", "-4,5", "1.5,2", "1000000,5")],
-        *[({"limits": limits}, None) for limits in ("other", "2,1", "1", "nan,2", "1,inf", "1,2,3", "")],
+        *[
+            ({"limits": limits}, None)
+            for limits in ("other", "2,1", "1", "nan,2", "1,inf", "1,2,3", "")
+        ],
         *[({"near": near}, None) for near in ("5", "5,6,7", "-1,3", "x,y")],
         ({"curve": "other"}, None),
     ],
@@ -175,7 +193,9 @@ def test_a_query_is_a_display_or_refused(query: dict[str, str], display: Display
 def test_zscale_is_astropy_s_and_the_others_are_those_of_pictures(seed: int) -> None:
     image = sky(seed, (70, 90 + seed))
     levels = levels_of(image)
-    np.testing.assert_allclose(limits_of(levels, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12)
+    np.testing.assert_allclose(
+        limits_of(levels, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12
+    )
     assert limits_of(levels, "automatic") == stretch.display_levels(image)
     assert limits_of(levels, "min to max") == (image.min(), image.max())
     assert limits_of(levels._replace(offset=-50.0, step=0.5), (100.0, 120.0)) == (300.0, 340.0)
@@ -185,7 +205,8 @@ def test_the_histogram_s_axis_is_linear_in_the_sky_and_holds_all_pixels() -> Non
     """Half of the counts are below the sky's median; the axis ends at the extremes of all pixels."""
     image = sky(5, (640, 640))
     found = response(served(image), ALL_PIXELS)[0]["histogram"]
-    counts, (low, high) = np.array(found["counts"]), found["range"]
+    counts = np.array(found["counts"])
+    (low, high) = found["range"]
     assert (len(counts), low, high) == (BINS, image.min(), image.max())
     assert counts.sum() == 40 * 80
     assert found["sky"] == np.median(image[::16, ::8])
@@ -207,17 +228,25 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
     async def nothing(*_: object) -> None:
         raise AssertionError("not a frame")
 
-    guard, image = Guard(nothing, ("*",), "right", 1), sky(8)
+    guard = Guard(nothing, ("*",), "right", 1)
+    image = sky(8)
     frames = {3: served(image), 4: served(image, Display((40, 40), near_px=(5, 6)))}
     monkeypatch.setitem(FRAMES, "tab", TabFrames(print, frames))
 
     async def answers(paths: Sequence[str], token: str) -> list[httpx.Response]:
-        transport, cookies = httpx.ASGITransport(app=guard), {"skysim_gui_1": token}
-        async with httpx.AsyncClient(transport=transport, base_url="http://lab", cookies=cookies) as client:
+        transport = httpx.ASGITransport(app=guard)
+        cookies = {"skysim_gui_1": token}
+        async with httpx.AsyncClient(
+            transport=transport, base_url="http://lab", cookies=cookies
+        ) as client:
             return [await client.get(path) for path in paths]
 
     assert asyncio.run(answers(["/frame/tab/3"], "wrong"))[0].status_code == 401
-    paths = ["3?limits=zscale", "4?screen=40,40&limits=automatic&near=5,6", "4?screen=40,40&whole=1"]
+    paths = [
+        "3?limits=zscale",
+        "4?screen=40,40&limits=automatic&near=5,6",
+        "4?screen=40,40&whole=1",
+    ]
     whole, fewer, rest = asyncio.run(answers([f"/frame/tab/{path}" for path in paths], "right"))
     for answer in (whole, rest):
         np.testing.assert_array_equal(decoded(answer.content)[1], image)
@@ -225,9 +254,10 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
     fields, levels = decoded(fewer.content)
     assert (levels.shape, fields["near"]["x"]) == ((30, 40), 5)
     wrong = ["tab/5", "tab/3?near=5,6,7", "other/3", "tab/x", "tab/3?screen=x", "tab/3?screen=-4,5"]
-    assert {answer.status_code for answer in asyncio.run(answers([f"/frame/{path}" for path in wrong], "right"))} == {
-        404
-    }
+    assert {
+        answer.status_code
+        for answer in asyncio.run(answers([f"/frame/{path}" for path in wrong], "right"))
+    } == {404}
 
 
 # Over a stream.
@@ -242,7 +272,8 @@ def split(message: bytes) -> tuple[int, np.ndarray]:
 
 def test_a_frame_goes_over_the_stream_or_is_announced() -> None:
     async def story() -> tuple[list[int], list[bytes]]:
-        announced, got = list[int](), list[bytes]()
+        announced = list[int]()
+        got = list[bytes]()
         frames = TabFrames(announced.append)
         frames.add(1, served(sky(1)), alone=False)  # no stream yet
         stream = frames.stream(ALL_PIXELS)
@@ -264,19 +295,26 @@ def test_a_frame_goes_over_the_stream_or_is_announced() -> None:
         np.testing.assert_array_equal(image, sky(number))
 
 
-def test_a_stream_ends_without_frames_and_gives_way_to_a_newer_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_ends_without_frames_and_gives_way_to_a_newer_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(served_module, "IDLE_S", 0.02)
 
     async def story() -> tuple[list[int], list[bytes]]:
-        announced, got = list[int](), list[bytes]()
+        announced = list[int]()
+        got = list[bytes]()
         frames = TabFrames(announced.append)
-        former, newer = (asyncio.ensure_future(anext(frames.stream(ALL_PIXELS), None)) for _ in range(2))
+        former, newer = (
+            asyncio.ensure_future(anext(frames.stream(ALL_PIXELS), None)) for _ in range(2)
+        )
         await asyncio.sleep(0)
         frames.add(1, served(sky(1)), alone=False)
         assert await former is None
         got.append(await newer)
         frames.drawn = 1
-        await asyncio.gather(*[one async for one in frames.stream(ALL_PIXELS)])  # idle from the start
+        await asyncio.gather(
+            *[one async for one in frames.stream(ALL_PIXELS)]
+        )  # idle from the start
         frames.add(2, served(sky(2)), alone=False)
         return [*announced], got  # what comes when the loop closes is of no interest
 
@@ -332,7 +370,12 @@ def test_a_worker_keeps_the_pixels_of_its_newest_images() -> None:
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
     count = 500
     random = np.random.default_rng(7)
-    lights = Lights(np.arange(count), random.uniform(0, 1000, (count, 2)), random.random(count), random.random(count))
+    lights = Lights(
+        np.arange(count),
+        random.uniform(0, 1000, (count, 2)),
+        random.random(count),
+        random.random(count),
+    )
     again = pickle.loads(pickle.dumps(lights))
     assert len(pickle.dumps(lights)) < 41 * count + 1000  # eight bytes a number
     assert len(again) == count
@@ -343,7 +386,8 @@ def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
 
 def test_contents_go_with_the_next_frame_or_else_by_themselves() -> None:
     async def story() -> list[dict[int, dict[str, str]]]:
-        contents, sent = Contents(), []
+        contents = Contents()
+        sent = []
         contents.send = sent.append
         contents.set(1, {"text": "a"})
         assert contents.take() == {1: {"text": "a"}}  # a frame takes them
@@ -390,7 +434,9 @@ def is_whole(page: Any) -> bool:
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
-def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(square: Any, tmp_path: Any) -> None:
+def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
+    square: Any, tmp_path: Any
+) -> None:
     assert come(lambda: is_whole(square))
     square.evaluate(DRAWINGS)
     square.keyboard.press("ArrowLeft")

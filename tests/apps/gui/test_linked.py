@@ -41,7 +41,9 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 
 def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> None:
     places_px = np.array([[10.0, 20], [40, 50], [70, 80]])
-    true = Lights(np.array([3, 4, 5]), places_px, np.array([5000.0, 900, 100]), np.array([1.5, np.nan, 4]))
+    true = Lights(
+        np.array([3, 4, 5]), places_px, np.array([5000.0, 900, 100]), np.array([1.5, np.nan, 4])
+    )
     found = [
         Detection(200, 200, 0.1, 50),
         Detection(10.3, 20.4, 0.05, 700, 3, 0.02),
@@ -70,7 +72,8 @@ def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> N
     np.testing.assert_array_equal(places_m[ids == dark][0], sources.place[5, :3])
     views = geometry.lab_geometry(lab).views
     boresight = lab.camera.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
-    eye, target = np.array(views["camera"].eye_m), np.array(views["camera"].target_m)
+    eye = np.array(views["camera"].eye_m)
+    target = np.array(views["camera"].target_m)
     np.testing.assert_allclose(eye, lab.camera.mount.camera_body_m, rtol=0, atol=1e-12)
     np.testing.assert_allclose(target - eye, boresight, rtol=0, atol=1e-12)
     assert views["top"].eye_m[2] > places_m[:, 2].max()
@@ -78,7 +81,11 @@ def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> N
 
 
 def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() -> None:
-    spots = (Detection(1, 2, 0.1, 5, 7, 0.03125), Detection(3, 4, 0.1, 5), Detection(5, 6, 0.1, 5, 9, float("nan")))
+    spots = (
+        Detection(1, 2, 0.1, 5, 7, 0.03125),
+        Detection(3, 4, 0.1, 5),
+        Detection(5, 6, 0.1, 5, 9, float("nan")),
+    )
     solved = TrackerResult("solved", spots, 1.0, (0.0, 0.0, 0.0))
     view = SimpleNamespace(t_s=0.25, result=solved)
     assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
@@ -90,7 +97,9 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)
     assert fields["names"] == {7: "LED 7", 9: "LED 9"}
     assert (fields["grid"], fields["place"]["top"]) == (1, strips.STRIP_PX + strips.HEAD_PX)
-    assert not any(curve.points for curve in strip.curves)  # a chart that is drawn again does not send them again
+    assert not any(
+        curve.points for curve in strip.curves
+    )  # a chart that is drawn again does not send them again
 
 
 def test_of_too_many_residuals_whole_frames_are_left_out() -> None:
@@ -127,7 +136,9 @@ def identified(page: Any, folder: Path) -> dict[int, tuple[float, float]]:
 
 @pytest.mark.browser
 @in_browser
-def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(dome: Any, tmp_path: Path) -> None:
+def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(
+    dome: Any, tmp_path: Path
+) -> None:
     count = len(identified(dome, tmp_path))
     assert come(lambda: f"identified {count}," in drawn(dome, "lights"))
     for name in ("camera", "bearing", "top", "outside"):
@@ -147,7 +158,9 @@ def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(dome: Any
 
 @pytest.mark.browser
 @in_browser
-def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(dome: Any, tmp_path: Path) -> None:
+def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(
+    dome: Any, tmp_path: Path
+) -> None:
     """From the star camera the 3-D view shows each LED where the frame does."""
     spots = identified(dome, tmp_path)
     one, (x, y) = next(iter(spots.items()))
@@ -159,13 +172,20 @@ def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(dome: Any, 
 
     dome.get_by_role("button", name="camera", exact=True).click()
     assert come(lambda: drawn(dome, "view") == "camera")
-    space, (width, height) = dome.locator(".lab-space").bounding_box(), (1600, 1200)
+    space = dome.locator(".lab-space").bounding_box()
+    width = 1600
+    height = 1200
     scale = space["height"] / height
-    inside = {n: at for n, at in spots.items() if abs(at[0] - width / 2) * scale < space["width"] / 2 - 10}
+    inside = {
+        n: at for n, at in spots.items() if abs(at[0] - width / 2) * scale < space["width"] / 2 - 10
+    }
     assert len(inside) > 4
     nearest = min(inside, key=lambda n: np.hypot(inside[n][0] - 800, inside[n][1] - 700))
     at = np.array(inside[nearest]) - ((width - 1) / 2, (height - 1) / 2)
-    dome.mouse.move(space["x"] + space["width"] / 2 + at[0] * scale, space["y"] + space["height"] / 2 + at[1] * scale)
+    dome.mouse.move(
+        space["x"] + space["width"] / 2 + at[0] * scale,
+        space["y"] + space["height"] / 2 + at[1] * scale,
+    )
     assert come(lambda: frame.get_attribute("data-ringed") == str(nearest))
     dome.locator(".lab-under .mono", has_text=f"LED {nearest}").wait_for()
     dome.get_by_role("button", name="outside", exact=True).click()
@@ -188,13 +208,16 @@ DOT = """() => { const canvas = document.querySelector(".lab-dots"), dots = getE
 
 @pytest.mark.browser
 @in_browser
-def test_a_dot_of_a_strip_lights_up_its_light_and_a_light_its_dots(browser: Any, server: Server) -> None:
+def test_a_dot_of_a_strip_lights_up_its_light_and_a_light_its_dots(
+    browser: Any, server: Server
+) -> None:
     with opened(browser, server.login, NARROW) as page:
         simulate(page, 5)
         page.get_by_text(re.compile(r"5/5$")).wait_for()
         for _ in range(10):  # room for all strips
             page.get_by_role("separator", name="Height of the 3-D view").press("ArrowUp")
-        canvas, frame = page.locator(".lab-dots"), page.locator(".lab-frame canvas")
+        canvas = page.locator(".lab-dots")
+        frame = page.locator(".lab-frame canvas")
         assert come(lambda: int(canvas.get_attribute("data-dots") or 0) > 60)
         canvas.evaluate("one => one.closest('.q-tab-panel').scrollTo(0, 250)")
         page.wait_for_timeout(500)

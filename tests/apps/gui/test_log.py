@@ -31,7 +31,9 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     assert "identify with noise: solved" in log.line(view, info)
     assert f"error {view.result.cross_arcsec:.2f}″ across" in log.line(view, info)
     one = dict(zip(log.COLUMNS, log.row(view, info), strict=True))
-    np.testing.assert_allclose([float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
+    )
     assert float(one["cross_arcsec"]) == pytest.approx(view.result.cross_arcsec, rel=1e-8)
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
@@ -45,7 +47,9 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
 
 def test_a_csv_file_reads_back_with_commas_and_unknown_values() -> None:
     rows = [("solved, but late", 1 / 3, True, None), ('a "b"', float("nan"), False, 12)]
-    table = Table.read(csv_table(("text", "value", "flag", "count"), rows).decode(), format="ascii.csv")
+    table = Table.read(
+        csv_table(("text", "value", "flag", "count"), rows).decode(), format="ascii.csv"
+    )
     assert list(table["text"]) == ["solved, but late", 'a "b"']
     assert table["value"][0] == pytest.approx(1 / 3, rel=1e-9)
     assert table["value"].mask.tolist() == [False, True]
@@ -56,7 +60,9 @@ def test_a_csv_file_reads_back_with_commas_and_unknown_values() -> None:
 def test_a_field_of_view_is_made_by_the_focal_length() -> None:
     changes = forms.field_override("shefex2", {}, 20.0)
     camera = loader.load("shefex2", changes).camera
-    assert 2 * np.degrees(np.arctan(camera.width_px / 2 / camera.focal_px)) == pytest.approx(20.0, abs=1e-3)
+    assert 2 * np.degrees(np.arctan(camera.width_px / 2 / camera.focal_px)) == pytest.approx(
+        20.0, abs=1e-3
+    )
     with pytest.raises(InputError, match=r"field: allowed: 0\.5 to 120"):
         forms.field_override("shefex2", {}, 200.0)
 
@@ -76,7 +82,9 @@ def test_key_1_identifies_with_noise_and_without(page: Any, tmp_path: Path) -> N
             onto_the_page(page)
         return found
 
-    before, noisy, frame = angles(page), frames(), source(page)
+    before = angles(page)
+    noisy = frames()
+    frame = source(page)
     page.keyboard.press("n")
     changed(page, frame)
     np.testing.assert_allclose(angles(page), before, rtol=0, atol=1e-4)
@@ -95,7 +103,9 @@ def test_key_1_identifies_with_noise_and_without(page: Any, tmp_path: Path) -> N
         page.get_by_role("button", name="CSV of the identifications").click()
     table = Table.read(comes.value.path(), format="ascii.csv")
     assert list(table["noise"]) == ["True", "True", "False", "False"]
-    np.testing.assert_allclose([table[f"true_{n}_deg"][-1] for n in (1, 2, 3)], before, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        [table[f"true_{n}_deg"][-1] for n in (1, 2, 3)], before, rtol=0, atol=1e-4
+    )
     assert max(table["cross_arcsec"]) < 60
     frame = source(page)
     page.keyboard.press("n")

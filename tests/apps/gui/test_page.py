@@ -58,7 +58,10 @@ FOCUSED = """() => {
           Math.ceil(box.bottom) + 4];
 }"""  # what has the focus, and where it is
 pytest_plugins = ["labpage"]
-pytestmark = [pytest.mark.browser, pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"),
+]
 
 
 def test_it_shows_a_solved_frame_with_names_and_a_map_of_keys(page: Any) -> None:
@@ -78,12 +81,15 @@ def test_nothing_is_cut_off_or_scrolls_at_either_size(page: Any) -> None:
         assert box["y"] + box["height"] < size["height"]
         assert box["width"] > 0.45 * size["width"]
         root = "document.documentElement"
-        assert not page.evaluate(f"{root}.scrollHeight > innerHeight || {root}.scrollWidth > innerWidth")
+        assert not page.evaluate(
+            f"{root}.scrollHeight > innerHeight || {root}.scrollWidth > innerWidth"
+        )
         pictured(page, f"size_{size['width']}")
 
 
 def test_keys_slew_and_the_frame_does_not_jump(page: Any) -> None:
-    before, box = angles(page), page.locator(".lab-frame canvas").bounding_box()
+    before = angles(page)
+    box = page.locator(".lab-frame canvas").bounding_box()
     for key, coarse in (("ArrowRight", False), ("ArrowUp", True), ("r", False)):
         frame = source(page)
         page.keyboard.press(f"Shift+{key}" if coarse else key)
@@ -141,17 +147,26 @@ def test_an_attitude_is_typed_and_1_identifies_it(page: Any) -> None:
 
 
 def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
-    kept = {name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")}
+    kept = {
+        name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")
+    }
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(gray, frame)
-    truth, told = Table.read(kept["truth"]), json.loads(kept["solution"].read_text())
-    assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute("aria-label")
+    truth = Table.read(kept["truth"])
+    told = json.loads(kept["solution"].read_text())
+    assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute(
+        "aria-label"
+    )
     np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
     assert cv2.imread(str(kept["figure"])).shape[2] == 3
-    assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load("shefex2").model_dump() | {"stem": ""}
+    assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load(
+        "shefex2"
+    ).model_dump() | {"stem": ""}
     with zipfile.ZipFile(exported(page, "all of them", tmp_path)) as archive:
-        assert set(archive.namelist()) == {path.name for path in tmp_path.iterdir() if path.suffix != ".zip"}
+        assert set(archive.namelist()) == {
+            path.name for path in tmp_path.iterdir() if path.suffix != ".zip"
+        }
         assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
 
 
@@ -166,19 +181,26 @@ def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: 
     assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
     page.locator(".lab-under .mono", has_text="residual").wait_for()
     told = page.locator(".lab-under .mono").inner_text()
-    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(spot["residual_px"], abs=6e-4)
+    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(
+        spot["residual_px"], abs=6e-4
+    )
     assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
     assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
 
 
 def limits(page: Any) -> list[float]:
     """The display's black and white levels, DN."""
-    return [float(level) for level in page.locator(".lab-plot").get_attribute("data-limits").split()]
+    return [
+        float(level) for level in page.locator(".lab-plot").get_attribute("data-limits").split()
+    ]
 
 
-def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(page: Any, tmp_path: Path) -> None:
+def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(
+    page: Any, tmp_path: Path
+) -> None:
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
-    dark, automatic = brightness(page), limits(page)
+    dark = brightness(page)
+    automatic = limits(page)
     chosen(page, "Limits", "zscale")
     wanted = ZScaleInterval().get_limits(frame)
     assert come(lambda: np.allclose(limits(page), wanted, rtol=1e-6, atol=0))
@@ -200,9 +222,13 @@ def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(page: 
     assert come(lambda: limits(page) == automatic)
 
 
-def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_frame(page: Any) -> None:
+def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_frame(
+    page: Any,
+) -> None:
     canvas = page.locator(".lab-frame canvas")
-    whole, at = canvas.get_attribute("data-placement"), np.round(screen(page, 200, 300))  # a mouse counts whole pixels
+    # a mouse counts whole pixels
+    whole = canvas.get_attribute("data-placement")
+    at = np.round(screen(page, 200, 300))
     spot = frame_pixel(page, *at)
     page.mouse.move(*at)
     page.mouse.wheel(0, -500)
@@ -220,14 +246,17 @@ def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_fr
 def test_the_readout_has_the_pixel_s_value_and_where_it_points(page: Any, tmp_path: Path) -> None:
     """Right ascension and declination as the exported frame's WCS, by astropy."""
     path = exported(page, "frame, FITS", tmp_path)
-    frame, sky = fits.getdata(path), WCS(fits.getheader(path))
+    frame = fits.getdata(path)
+    sky = WCS(fits.getheader(path))
     for x, y in ((100, 80), (500, 400)):
         page.mouse.move(*screen(page, x, y))
         told = page.locator(".lab-readout .mono").inner_text()
         place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", told).groups()]
         assert int(re.search(r"(\d+) DN", told)[1]) == frame[y, x]
         ra_deg, dec_deg = sky.pixel_to_world_values(*place)
-        assert float(re.search(r"RA ([\d.]+)°", told)[1]) == pytest.approx(float(ra_deg), abs=6e-3)  # a place's 0.05 px
+        assert float(re.search(r"RA ([\d.]+)°", told)[1]) == pytest.approx(
+            float(ra_deg), abs=6e-3
+        )  # a place's 0.05 px
         shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", told)[1].replace("−", "-"))
         assert shown_dec == pytest.approx(float(dec_deg), abs=6e-3)
         hours = Angle(re.search(r"\d+h\d+m[\d.]+s", told)[0]).degree
@@ -243,8 +272,12 @@ def test_a_cut_shows_its_profile(page: Any, tmp_path: Path) -> None:
     page.mouse.move(*screen(page, 160, 200), steps=4)
     page.mouse.up()
     page.keyboard.up("Shift")
-    values, ends = (np.array(plot.get_attribute(f"data-{name}").split(), float) for name in ("profile", "cut"))
-    np.testing.assert_allclose(ends, [100, 200, 160, 200], rtol=0, atol=2)  # to a pixel of the screen
+    values, ends = (
+        np.array(plot.get_attribute(f"data-{name}").split(), float) for name in ("profile", "cut")
+    )
+    np.testing.assert_allclose(
+        ends, [100, 200, 160, 200], rtol=0, atol=2
+    )  # to a pixel of the screen
     x, y = np.linspace(ends[:2], ends[2:], len(values)).T
     expected = RegularGridInterpolator(tuple(map(np.arange, frame.shape)), frame)((y, x))
     np.testing.assert_allclose(values, expected, rtol=0, atol=0.06)
@@ -287,23 +320,30 @@ NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim
 
 
 def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(page: Any) -> None:
-    size, random = (659, 493), np.random.default_rng(4)
+    size = (659, 493)
+    random = np.random.default_rng(4)
     places = np.vstack([random.uniform(0, size, (20, 2)), [[size[0] - 1, 5], [3, size[1] - 2]]])
     names = [(*place, f"HIP {n}") for n, place in enumerate(places.tolist())]
     boxes = np.array(page.evaluate(NAMES, [names, list(size)]))
     assert 15 <= len(boxes) <= len(names)
-    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    low = boxes[:, :2]
+    high = boxes[:, :2] + boxes[:, 2:]
     assert (low >= -1.01).all()
     assert (high <= np.array(size) + 1.01).all()
     separate = (low[:, None] >= high[None] - 2.01).any(axis=2)
     np.testing.assert_array_equal(separate | separate.T, ~np.eye(len(boxes), dtype=bool))
-    gap = np.maximum(np.maximum(low[:, None] - places, places - high[:, None]), 0).max(axis=2).min(axis=1)
+    gap = (
+        np.maximum(np.maximum(low[:, None] - places, places - high[:, None]), 0)
+        .max(axis=2)
+        .min(axis=1)
+    )
     assert (gap < 25).all()
 
 
 def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
     onto_the_page(page)
-    unseen, reached = picture(page), []
+    unseen = picture(page)
+    reached = []
     for _ in range(27):
         page.keyboard.press("Tab")
         name, *box = page.evaluate(FOCUSED)
@@ -327,7 +367,8 @@ def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
 
 
 def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
-    frame, field = source(page), page.get_by_label("angle 1")
+    frame = source(page)
+    field = page.get_by_label("angle 1")
     before = field.input_value()
     field.fill("")
     page.keyboard.type("e1r2")
@@ -349,7 +390,9 @@ def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
 
 def focused(page: Any, name: str) -> None:
     """Wait until a list has the keyboard."""
-    page.wait_for_function("name => document.activeElement.closest('[aria-label]')?.ariaLabel === name", arg=name)
+    page.wait_for_function(
+        "name => document.activeElement.closest('[aria-label]')?.ariaLabel === name", arg=name
+    )
 
 
 def test_another_identifier_by_f7_and_the_keys_are_the_camera_s_again(page: Any) -> None:
@@ -381,7 +424,9 @@ def test_f6_configures_image_processing_without_keys_that_have_no_effect(page: A
     choose_stage(page, "detector", "thesis")
     page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="detached")
     assert page.get_by_label("tracker.min_area_px", exact=True).count() == 0
-    assert come(lambda: "tracker.detector%3Dthesis" in address(page) and "threshold" not in address(page))
+    assert come(
+        lambda: "tracker.detector%3Dthesis" in address(page) and "threshold" not in address(page)
+    )
     pictured(page, "f6")
     for undone in ("tracker.detector", "tracker.threshold_sigma"):
         onto_the_page(page)
@@ -411,11 +456,14 @@ def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None
     page.locator("input[aria-label='runs, F8']:focus").wait_for()
     set_to(page, "field, °", "8")
     onto_the_page(page)
-    before, frame = angles(page), source(page)
+    before = angles(page)
+    frame = source(page)
     page.keyboard.press("ArrowUp")
     changed(page, frame)
     (ra, dec, _), (ra_before, dec_before, _) = np.radians(angles(page)), np.radians(before)
-    cosine = np.sin(dec) * np.sin(dec_before) + np.cos(dec) * np.cos(dec_before) * np.cos(ra - ra_before)
+    cosine = np.sin(dec) * np.sin(dec_before) + np.cos(dec) * np.cos(dec_before) * np.cos(
+        ra - ra_before
+    )
     np.testing.assert_allclose(np.degrees(np.arccos(cosine)), 8 / 50, rtol=2e-3, atol=0)
     set_to(page, "field, °", "14.868")
 
@@ -425,13 +473,17 @@ def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: S
     page.keyboard.press("n")  # the camera's noise, which trials of centroids do not have
     changed(page, frame)
     page.keyboard.press("2")
-    page.get_by_role("status").filter(has_text="trials of centroids do not use camera.detector.noise").wait_for()
+    page.get_by_role("status").filter(
+        has_text="trials of centroids do not use camera.detector.noise"
+    ).wait_for()
     page.get_by_text("200 of 200 trials").wait_for()
     told = page.get_by_text("identified", exact=False).last.inner_text()
     assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
     report = page.locator("a[href^='/report/']").first
     path = str(report.get_attribute("href")).removeprefix("/")
-    assert server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404  # another browser that has the token
+    assert (
+        server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404
+    )  # another browser that has the token
     with page.expect_popup() as opens:
         report.click()
     opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
@@ -442,7 +494,8 @@ def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: S
 
 
 def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
-    before, frame = angles(page), source(page)
+    before = angles(page)
+    frame = source(page)
     panel(page, "Image")
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
@@ -455,7 +508,9 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     page.mouse.click(*screen(page, 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
         assert abs(dn - int(photo[y, x])) <= 2
-    noise, broken, program, large = (tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png"))
+    noise, broken, program, large = (
+        tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png")
+    )
     cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
     page.set_input_files("input[type=file]", noise)
     page.get_by_text(re.compile(r"noise\.png: (?!solved|solving)")).wait_for()
@@ -489,7 +544,9 @@ def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) ->
     sky = ROOT / "docs" / "images" / "sky.jpg"
     page.set_input_files("input[type=file]", sky)
     page.get_by_text(re.compile(r"sky\.jpg: solved\n")).wait_for(timeout=SLOW_MS)
-    field = float(re.search(r"field ([\d.]+)°", page.locator(".lab-panels .mono").last.inner_text())[1])
+    field = float(
+        re.search(r"field ([\d.]+)°", page.locator(".lab-panels .mono").last.inner_text())[1]
+    )
     choose_stage(page, "identifier", "pyramid")
     panel(page, "Image")
     page.get_by_label("field of view, deg").fill(str(field))
@@ -502,7 +559,9 @@ def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) ->
 
 def rolled(page: Any, name: str) -> float:
     """The roll that a picture was solved to."""
-    facts = page.locator(".lab-panels .mono", has_text=re.compile(rf"^{name}: solved")).last.inner_text()
+    facts = page.locator(
+        ".lab-panels .mono", has_text=re.compile(rf"^{name}: solved")
+    ).last.inner_text()
     return float(re.search(r"roll ([\d.]+)", facts)[1])
 
 
@@ -515,14 +574,19 @@ def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> N
         turn = cv2.getRotationMatrix2D((wide / 2, high / 2), turn_deg, 1)
         video.write(cv2.warpAffine(photo, turn, (wide, high)))
     video.release()
-    with Server(tmp_path, "--camera", clip) as watching, opened(browser, watching.login, NARROW) as page:
+    with (
+        Server(tmp_path, "--camera", clip) as watching,
+        opened(browser, watching.login, NARROW) as page,
+    ):
         panel(page, "Image")
         page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
         still = rolled(page, "sky.jpg")
         page.get_by_role("button", name="Watch").click()
         page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
         turned = rolled(page, "camera")
-        np.testing.assert_allclose(still - turned, 10, rtol=0, atol=0.05)  # the last frame's; the sky turns back
+        np.testing.assert_allclose(
+            still - turned, 10, rtol=0, atol=0.05
+        )  # the last frame's; the sky turns back
         page.get_by_role("button", name="Watch").wait_for()
         identified(page)
 
@@ -541,12 +605,14 @@ def test_an_export_is_of_the_image_on_the_page(page: Any, tmp_path: Path) -> Non
     saved = exported(page, "frame, PNG", tmp_path)
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     assert cv2.imread(str(saved), cv2.IMREAD_UNCHANGED).shape == photo.shape
-    assert json.loads(exported(page, "solution", tmp_path).read_text())["solution"]["roll_deg"] == pytest.approx(
-        solved, abs=1e-3
-    )
+    assert json.loads(exported(page, "solution", tmp_path).read_text())["solution"][
+        "roll_deg"
+    ] == pytest.approx(solved, abs=1e-3)
     page.get_by_role("button", name="Export").click()
     page.locator(".q-menu .q-item", has_text=re.compile("^truth$")).click()
-    page.get_by_role("status").filter(has_text="truth: not known of an image from elsewhere").wait_for()
+    page.get_by_role("status").filter(
+        has_text="truth: not known of an image from elsewhere"
+    ).wait_for()
     identified(page)
 
 

@@ -48,7 +48,11 @@ from skysim.sources import catalog, stars
 def test_a_body_has_its_name_and_magnitude() -> None:
     """In the sensor's labels and in what the page says of a true light."""
     sensor = SimpleNamespace(prefix="HIP")
-    assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == ["Jupiter", "Sirius", "HIP 20"]
+    assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
+        "Jupiter",
+        "Sirius",
+        "HIP 20",
+    ]
     settings = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "exposure.frames": "1"}
     settings |= {"motion.start": "{ra_deg: 154.9, dec_deg: 4.8}", "motion.rate_deg_s": "[0, 0, 0]"}
     flight = simulate_motion(loader.load("shefex2", settings))
@@ -59,7 +63,8 @@ def test_a_body_has_its_name_and_magnitude() -> None:
 
 # Where the camera looks.
 
-STARS, DOME = loader.load("shefex2"), loader.load("afit_simsat")
+STARS = loader.load("shefex2")
+DOME = loader.load("afit_simsat")
 UPRIGHT = Mount(np.array([0.0, 0.0, 0.4]), Rotation.from_euler("x", 180, degrees=True))
 
 
@@ -88,8 +93,12 @@ def test_an_arrow_moves_stars_the_other_way_by_its_share_of_the_field_even_at_th
     across = 2 * np.arctan(STARS.camera.width_px / 2 / STARS.camera.focal_px)
     np.testing.assert_allclose(np.arctan2(x, z), -pointing.FINE * across, rtol=1e-9)
     np.testing.assert_allclose(y, 0.0, atol=1e-12)
-    _, y, z = (mount.cam_from_body * pointing.moved(STARS, mount, before, 0.0, pointing.FINE, 0.0).inv()).apply(star)
-    np.testing.assert_allclose(np.arctan2(y, z), pointing.FINE * across, rtol=1e-9)  # down: y is down
+    _, y, z = (
+        mount.cam_from_body * pointing.moved(STARS, mount, before, 0.0, pointing.FINE, 0.0).inv()
+    ).apply(star)
+    np.testing.assert_allclose(
+        np.arctan2(y, z), pointing.FINE * across, rtol=1e-9
+    )  # down: y is down
 
 
 def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None:
@@ -97,7 +106,9 @@ def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
     before = pointing.from_angles(STARS, mount, (83.0, 2.0, 0.0))
     above = stars.cam_from_icrs(83.0, 2.0, 0.0).inv().apply([0.0, -0.1, 1.0])
-    x, y, _ = (mount.cam_from_body * pointing.moved(STARS, mount, before, 0, 0, 10.0).inv()).apply(above)
+    x, y, _ = (mount.cam_from_body * pointing.moved(STARS, mount, before, 0, 0, 10.0).inv()).apply(
+        above
+    )
     np.testing.assert_allclose(np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9)  # to the left of up
 
 
@@ -124,7 +135,9 @@ def test_a_form_s_own_values_make_the_same_scene(name: str) -> None:
     """What stands in the fields, put over the file, changes nothing: units, defaults and lists come back."""
     values = forms.fields(name, {})
     again = {one.key: one.text for one in values if not one.is_set and one.text != "null"}
-    before, after = (loader.load(name, keys_, refuses_unused=False).model_dump() for keys_ in ({}, again))
+    before, after = (
+        loader.load(name, keys_, refuses_unused=False).model_dump() for keys_ in ({}, again)
+    )
     assert rounded(after) == rounded(before)
 
 
@@ -150,21 +163,39 @@ def test_fields_know_their_unit_and_their_choices() -> None:
 def test_another_kind_of_a_section_brings_its_keys_and_keeps_those_of_both() -> None:
     """The file's own kind comes back as the file has it; edits of the section go with its kind."""
     at_first = {one.key: one for one in forms.fields("shefex2", {})}
-    assert at_first["camera.shutter.kind"].allowed_values == ("global", "rolling", "frame_transfer", "interline")
-    assert at_first["light.kind"].allowed_values == ("stars",)  # another one needs another start of the motion
+    assert at_first["camera.shutter.kind"].allowed_values == (
+        "global",
+        "rolling",
+        "frame_transfer",
+        "interline",
+    )
+    assert at_first["light.kind"].allowed_values == (
+        "stars",
+    )  # another one needs another start of the motion
     edited = {"tracker.limit_mag": "5.5", "camera.shutter.row_time": "20 us"}
     rolling = forms.with_value("shefex2", edited, "camera.shutter.kind", "rolling")
-    assert rolling == {"tracker.limit_mag": "5.5", "camera.shutter": "{kind: rolling, row_time: 2e-05 s}"}
-    shutter = {one.key: one for one in forms.fields("shefex2", rolling) if one.key.startswith("camera.shutter")}
+    assert rolling == {
+        "tracker.limit_mag": "5.5",
+        "camera.shutter": "{kind: rolling, row_time: 2e-05 s}",
+    }
+    shutter = {
+        one.key: one
+        for one in forms.fields("shefex2", rolling)
+        if one.key.startswith("camera.shutter")
+    }
     assert set(shutter) == {"camera.shutter.kind", "camera.shutter.row_time"}
     assert shutter["camera.shutter.kind"].text == "rolling"
     assert shutter["camera.shutter.row_time"].text == "2e-05 s"
-    back = forms.with_value("shefex2", rolling, "camera.shutter.kind", at_first["camera.shutter.kind"].text)
+    back = forms.with_value(
+        "shefex2", rolling, "camera.shutter.kind", at_first["camera.shutter.kind"].text
+    )
     assert back == {"tracker.limit_mag": "5.5"}
 
 
 def test_a_section_that_is_left_out_can_be_had_and_left_out_again() -> None:
-    assert {one.key: one for one in forms.fields("shefex2", {})}["camera.vignetting.kind"].shown == "none"
+    assert {one.key: one for one in forms.fields("shefex2", {})}[
+        "camera.vignetting.kind"
+    ].shown == "none"
     with_stops = forms.with_value("shefex2", {}, "camera.vignetting.kind", "two_stops")
     assert loader.load("shefex2", with_stops).camera.vignetting.kind == "two_stops"
     assert forms.with_value("shefex2", with_stops, "camera.vignetting.kind", "none") == {}
@@ -193,7 +224,9 @@ def test_an_edit_that_makes_another_one_useless_takes_it_back() -> None:
 
 
 def test_keys_without_effect_are_told() -> None:
-    stars, dome = ({one.key: one for one in forms.fields(name, {})} for name in ("shefex2", "afit_simsat"))
+    stars, dome = (
+        {one.key: one for one in forms.fields(name, {})} for name in ("shefex2", "afit_simsat")
+    )
     assert "LEDs" in dome["tracker.limit_mag"].no_effect
     assert not stars["tracker.limit_mag"].no_effect
     assert stars["tracker.brightness_sigma"].no_effect
@@ -201,7 +234,10 @@ def test_keys_without_effect_are_told() -> None:
     assert thesis["tracker.threshold_sigma"].no_effect
     assert not stars["tracker.threshold_sigma"].no_effect
     assert "default" in stars["tracker.identifier"].allowed_values
-    assert (dome["tracker.solver"].shown, stars["tracker.identifier"].shown) == ("rotation_only", "default")
+    assert (dome["tracker.solver"].shown, stars["tracker.identifier"].shown) == (
+        "rotation_only",
+        "default",
+    )
 
 
 @pytest.mark.slow
@@ -216,7 +252,9 @@ def test_the_loop_is_closed_by_something_else_whether_the_scene_has_a_word_or_a_
 def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:
     outside = tmp_path / "secret.csv"
     outside.write_text("x")
-    with pytest.raises(InputError, match=r"tracker\.map: .* allowed: a file in the scene's own folder"):
+    with pytest.raises(
+        InputError, match=r"tracker\.map: .* allowed: a file in the scene's own folder"
+    ):
         forms.validated_scene("afit_simsat_ideal", {"tracker.map": str(outside)})
 
 
@@ -233,15 +271,23 @@ def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: P
 
 # Marks.
 
-LIGHTS = Lights(np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0]))
+LIGHTS = Lights(
+    np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0])
+)
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 
 
 def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> None:
     result = TrackerResult("solved", SPOTS, 1.0, (0.0, 0.0, 0.0), windows_px=((50.0, 60.0),))
     drawn = {kind: overlay.marks(LIGHTS, result, {kind}, str) for kind in overlay.KINDS}
-    points = {kind: {mark["kind"]: mark["points"] for mark in of_kind["marks"]} for kind, of_kind in drawn.items()}
-    assert points["truth"] == {"truth": [[10.0, 20.0]], "faint": [[50.0, 60.0]]}  # nothing as faint is detected
+    points = {
+        kind: {mark["kind"]: mark["points"] for mark in of_kind["marks"]}
+        for kind, of_kind in drawn.items()
+    }
+    assert points["truth"] == {
+        "truth": [[10.0, 20.0]],
+        "faint": [[50.0, 60.0]],
+    }  # nothing as faint is detected
     assert points["detected"] == {"detected": [[10.1, 20.0], [80.0, 80.0]]}
     assert points["identified"] == {"identified": [[10.1, 20.0]]}
     assert points["false"] == {"false": [[80.0, 80.0]]}
@@ -254,16 +300,27 @@ def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> N
 def test_a_faint_light_beside_a_detection_of_noise_gets_no_tick() -> None:
     noise = Detection(51.0, 60.0, 0.1, 1.0)
     result = TrackerResult("solved", (SPOTS[0], noise), 1.0, (0.0, 0.0, 0.0))
-    solved = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, result, {"truth"}, str)["marks"]}
+    solved = {
+        mark["kind"]: mark["points"]
+        for mark in overlay.marks(LIGHTS, result, {"truth"}, str)["marks"]
+    }
     assert solved == {"truth": [[10.0, 20.0]], "faint": [[50.0, 60.0]]}
     unsolved = TrackerResult("too few", (noise,), 1.0)
-    ticks = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, unsolved, {"truth"}, str)["marks"]}
+    ticks = {
+        mark["kind"]: mark["points"]
+        for mark in overlay.marks(LIGHTS, unsolved, {"truth"}, str)["marks"]
+    }
     assert ticks == {"truth": [[10.0, 20.0], [50.0, 60.0]]}
 
 
 def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> None:
     found = overlay.marks(LIGHTS, TrackerResult("solved", SPOTS, 1.0), (), str)["lights"]
-    assert found == [(10.0, 20.0, 1, 0), (50.0, 60.0, 2, 0), (10.1, 20.0, 1, 1), (80.0, 80.0, -1, 1)]
+    assert found == [
+        (10.0, 20.0, 1, 0),
+        (50.0, 60.0, 2, 0),
+        (10.1, 20.0, 1, 1),
+        (80.0, 80.0, -1, 1),
+    ]
 
 
 # Pixels for the browser.
@@ -284,25 +341,36 @@ def test_other_numbers_are_rounded_to_a_65535th_of_their_range() -> None:
     decoded = offset + step * np.frombuffer(data, np.uint16, offset=16).reshape(40, 50)
     assert step == pytest.approx(np.ptp(image) / 65535)
     np.testing.assert_allclose(decoded, image, rtol=0, atol=0.51 * step)
-    np.testing.assert_array_equal(np.frombuffer(pixels.levels_of(np.full((2, 2), 7.5)).data(), float, 2), [7.5, 1.0])
+    np.testing.assert_array_equal(
+        np.frombuffer(pixels.levels_of(np.full((2, 2), 7.5)).data(), float, 2), [7.5, 1.0]
+    )
 
 
 def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> None:
     """Under the dome by the depth at which its ray meets the surface; under the stars by the rotation alone."""
     for scene, within_rad in (("afit_simsat", 2e-4), ("shefex2", 2e-5)):
-        flight = simulate_motion(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
-        lab, (_, truth) = flight.lab, flight.render(0)
+        flight = simulate_motion(
+            loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"})
+        )
+        lab = flight.lab
+        (_, truth) = flight.render(0)
         lens = lenses.scene_lens(lab)
         pose = lenses.scene_pose(lab, lens, truth)
         camera = lab.scene.camera
-        nodes_px = [np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)]
+        nodes_px = [
+            np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)
+        ]
 
-        def table(values: tuple[float, ...], nodes_px: list[np.ndarray] = nodes_px, n: int = lens.n) -> Any:
+        def table(
+            values: tuple[float, ...], nodes_px: list[np.ndarray] = nodes_px, n: int = lens.n
+        ) -> Any:
             grid = np.array(values, float).reshape(n, n)
             return RegularGridInterpolator(nodes_px[::-1], grid)
 
         xy = truth.sources.flux_xy_px[:20]
-        rays_cam = np.column_stack([table(lens.x)(xy[:, ::-1]), table(lens.y)(xy[:, ::-1]), np.ones(len(xy))])
+        rays_cam = np.column_stack(
+            [table(lens.x)(xy[:, ::-1]), table(lens.y)(xy[:, ::-1]), np.ones(len(xy))]
+        )
         pointed = rays_cam @ np.reshape(pose.rotation, (3, 3)).T
         if pose.depth_m:
             pointed = np.array(pose.place_m) + table(pose.depth_m)(xy[:, ::-1])[:, None] * pointed
@@ -331,7 +399,13 @@ async def knock(guard: Guard, headers: dict[str, str], query: str = "") -> int:
         statuses.append(message.get("status", 0))
 
     values = [(name.encode(), value.encode()) for name, value in headers.items()]
-    scope = {"type": "http", "method": "GET", "path": "/", "headers": values, "query_string": query.encode()}
+    scope = {
+        "type": "http",
+        "method": "GET",
+        "path": "/",
+        "headers": values,
+        "query_string": query.encode(),
+    }
     await guard(scope, None, send)
     return statuses[0]
 
@@ -353,7 +427,9 @@ async def page(scope: dict, receive: object, send) -> None:
         ({"host": "localhost", "content-length": str(10**9)}, "token=right", 413),
     ],
 )
-def test_the_guard_of_a_page_of_this_machine(headers: dict[str, str], query: str, status: int) -> None:
+def test_the_guard_of_a_page_of_this_machine(
+    headers: dict[str, str], query: str, status: int
+) -> None:
     guard = Guard(page, ("127.0.0.1", "localhost"), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
@@ -368,7 +444,9 @@ def test_the_guard_of_a_page_of_this_machine(headers: dict[str, str], query: str
         ({"host": "lab", "cookie": "skysim_gui_8080=wrong"}, "", 401),
     ],
 )
-def test_the_guard_of_a_page_for_others_wants_the_token(headers: dict[str, str], query: str, status: int) -> None:
+def test_the_guard_of_a_page_for_others_wants_the_token(
+    headers: dict[str, str], query: str, status: int
+) -> None:
     guard = Guard(page, ("*",), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
@@ -390,7 +468,8 @@ def test_files_of_the_page_are_asked_for_once(
     path: str, method: str, query: str, headers: dict[str, str], status: int, asked: int
 ) -> None:
     """All other responses are made anew; each answer is whole, and a layer further out may change its headers."""
-    calls, answers = [], list[list[dict]]()
+    calls = []
+    answers = list[list[dict]]()
 
     async def inner(scope: dict, _receive: object, send) -> None:
         calls.append(scope)
@@ -400,7 +479,13 @@ def test_files_of_the_page_are_asked_for_once(
 
     kept = KeptFiles(inner)
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
-    scope = {"type": "http", "method": method, "path": path, "headers": raw, "query_string": query.encode()}
+    scope = {
+        "type": "http",
+        "method": method,
+        "path": path,
+        "headers": raw,
+        "query_string": query.encode(),
+    }
     for _ in range(3):
         answers.append([])
 
@@ -417,10 +502,13 @@ def test_files_of_the_page_are_asked_for_once(
 
 def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() -> None:
     async def inner(scope: dict, _receive: object, send) -> None:
-        await send({"type": "http.response.start", "status": 200, "headers": list(scope["headers"])})
+        await send(
+            {"type": "http.response.start", "status": 200, "headers": list(scope["headers"])}
+        )
         await send({"type": "http.response.body", "body": b""})
 
-    kept, starts = KeptFiles(inner), list[dict]()
+    kept = KeptFiles(inner)
+    starts = list[dict]()
 
     async def send(message: dict) -> None:
         starts.append(message)
@@ -428,13 +516,20 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
     for encoding in (b"gzip", b"identity", b"gzip"):
         scope = {"type": "http", "method": "GET", "path": f"{FILES}/a.js", "query_string": b""}
         asyncio.run(kept(scope | {"headers": [(b"accept-encoding", encoding)]}, None, send))
-    assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [b"gzip", b"identity", b"gzip"]
+    assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [
+        b"gzip",
+        b"identity",
+        b"gzip",
+    ]
 
 
 @pytest.mark.slow
-def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
-    collected, frames = list[float](), TabFrames(lambda _: None)
+    collected = list[float]()
+    frames = TabFrames(lambda _: None)
     monkeypatch.setattr(memory, "release_memory", lambda: collected.append(time.monotonic()))
     monkeypatch.setattr(memory, "QUIET_S", 0.2)
     monkeypatch.setitem(FRAMES, "busy", frames)
@@ -458,8 +553,11 @@ def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(monkeypa
     asyncio.run(close_while_another_plays())
 
 
-def test_closed_pages_are_collected_in_the_end_though_frames_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    collected, frames = list[bool](), TabFrames(lambda _: None)
+def test_closed_pages_are_collected_in_the_end_though_frames_go_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    collected = list[bool]()
+    frames = TabFrames(lambda _: None)
     monkeypatch.setattr(memory, "release_memory", lambda: collected.append(True))
     monkeypatch.setattr(memory, "QUIET_S", 0.05)
     monkeypatch.setattr(memory, "PATIENCE_S", 0.2)
@@ -483,11 +581,23 @@ def test_every_response_has_a_policy_that_no_other_site_frames() -> None:
         sent.append(message)
 
     async def report(_scope: dict, _receive: object, send) -> None:
-        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-security-policy", b"none")]})
+        await send(
+            {
+                "type": "http.response.start",
+                "status": 200,
+                "headers": [(b"content-security-policy", b"none")],
+            }
+        )
 
     for served in (page, report):
         headers = [(b"host", b"a"), (b"cookie", b"skysim_gui_1=right")]
-        scope = {"type": "http", "method": "GET", "path": "/", "headers": headers, "query_string": b""}
+        scope = {
+            "type": "http",
+            "method": "GET",
+            "path": "/",
+            "headers": headers,
+            "query_string": b"",
+        }
         asyncio.run(Guard(served, ("*",), "right", 1)(scope, None, send))
     policies = [dict(message["headers"]) for message in sent]
     assert b"frame-ancestors 'none'" in policies[0][b"content-security-policy"]
@@ -505,7 +615,8 @@ def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: P
 
 
 def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> None:
-    mine, other = "0123456789abcdef", "fedcba9876543210"
+    mine = "0123456789abcdef"
+    other = "fedcba9876543210"
     names = f"monte_carlo_{mine}_tab_1", f"monte_carlo_{other}_tab_1", "afit_sensitivity"
     for name in names:
         (tmp_path / name).mkdir()
@@ -518,7 +629,12 @@ def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> 
 
 
 def test_a_host_is_told_with_or_without_its_port() -> None:
-    assert [host_of(one) for one in ("a:1", "a", "[::1]:8", "[::1]")] == ["a", "a", "[::1]", "[::1]"]
+    assert [host_of(one) for one in ("a:1", "a", "[::1]:8", "[::1]")] == [
+        "a",
+        "a",
+        "[::1]",
+        "[::1]",
+    ]
 
 
 # The worker.
@@ -549,8 +665,12 @@ def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothin
 
 
 @pytest.mark.slow
-def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker, pixels_of, exported = tasks.Worker(), [], []
+def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    worker = tasks.Worker()
+    pixels_of = []
+    exported = []
     worker.open("shefex2", {"exposure.frames": "2"}, False)
     for kept_bytes in (playback.KEPT_BYTES, 0):
         monkeypatch.setattr(playback, "KEPT_BYTES", kept_bytes)
@@ -617,15 +737,21 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             # They are the frames of the command line: the same truth, errors and lights.
             flight = open_flight(loader.load("simsat_slew", {"exposure.frames": "4"}))
             expected = [scoring.score(shot).row for shot in flight.shots()]
-            np.testing.assert_array_equal([row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected])
-            np.testing.assert_array_equal([row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected])
+            np.testing.assert_array_equal(
+                [row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected]
+            )
+            np.testing.assert_array_equal(
+                [row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected]
+            )
             assert len(rows) == 4
             view = await session.run("flight_frame", 2)
             assert view.t_s == rows[2].t_s
             assert view.result.solved
             files = await session.run("export")
             frame, _ = flight.render(2)
-            np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
+            np.testing.assert_array_equal(
+                fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn
+            )
             assert view.pixels.data == pixels.levels_of(frame.image_dn).data()
             with pytest.raises(InputError, match="the flight has no frame 4"):
                 await session.run("flight_frame", 4)
@@ -692,7 +818,10 @@ def test_a_histogram_counts_every_trial_once() -> None:
 
 def test_a_saved_scene_names_its_base_first() -> None:
     text = export.scene_yaml("shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T")
-    assert re.match(r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n", text)
+    assert re.match(
+        r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n",
+        text,
+    )
 
 
 def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
@@ -704,14 +833,19 @@ def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
         image[:2, :3] = 4095
         values = stretch.frame_statistics(image.astype(np.uint16), 4095.0)
         np.testing.assert_allclose(values.sky_dn, 200, rtol=0, atol=0.06 * sigma_dn + 0.01)
-        np.testing.assert_allclose(values.scatter_dn, np.hypot(sigma_dn, 12**-0.5), rtol=0.06, atol=0)
+        np.testing.assert_allclose(
+            values.scatter_dn, np.hypot(sigma_dn, 12**-0.5), rtol=0.06, atol=0
+        )
         assert (values.peak_dn, values.saturated) == (4095, 6)
 
 
 def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> None:
     columns = {
-        **{"trial": np.array([3, 5, 8]), "frames": np.array([1, 2, 1]), "solved": np.array([1, 1, 1])},
-        **{"wrong": np.array([0, 0, 1]), "status": np.array(["solved", "no match", "solved"], dtype=object)},
+        "trial": np.array([3, 5, 8]),
+        "frames": np.array([1, 2, 1]),
+        "solved": np.array([1, 1, 1]),
+        "wrong": np.array([0, 0, 1]),
+        "status": np.array(["solved", "no match", "solved"], dtype=object),
     }
     assert study_process.unsolved(columns) == [(8, "wrong"), (5, "no match")]
 

@@ -40,7 +40,8 @@ ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 def test_a_check_is_that_of_the_command() -> None:
     lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
-    found, expected = planning.check(lab), checks.check(lab)
+    found = planning.check(lab)
+    expected = checks.check(lab)
     assert [name for name, _ in found.facts] == [fact.name for fact in expected.facts]
     assert list(found.findings) == expected.findings
     assert found.findings  # all LEDs saturate
@@ -77,15 +78,21 @@ SLOW_CAMERA = {"exposure.rate_hz": "0.2", "exposure.time": "4.9 s", "exposure.fi
 TILTED = ((-21.0, 8.0, 22.0), (-7.0, -23.0, -154.0), (10.0, 20.0, 60.0))
 
 
-@pytest.mark.parametrize(("overrides", "angles"), [({}, ANGLES), (SLOW_CAMERA, ANGLES), ({}, TILTED)])
-def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(overrides: dict[str, str], angles: Any) -> None:
+@pytest.mark.parametrize(
+    ("overrides", "angles"), [({}, ANGLES), (SLOW_CAMERA, ANGLES), ({}, TILTED)]
+)
+def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(
+    overrides: dict[str, str], angles: Any
+) -> None:
     flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, angles))
-    reference, shown = guidance.plan(flown.motion), flown.exposure
+    reference = guidance.plan(flown.motion)
+    shown = flown.exposure
     begin_s = shown.first_s + np.arange(shown.frames) / shown.rate_hz
     holds = [leg for leg, one in enumerate(flown.motion.maneuver) if one.kind == "hold"]
     assert len(holds) == len(angles)
     for leg, wanted in zip(holds, angles, strict=True):
-        start_s, end_s = reference.start_s[leg], reference.start_s[leg + 1]
+        start_s = reference.start_s[leg]
+        end_s = reference.start_s[leg + 1]
         wxyz = stops.from_angles(np.array([wanted])).as_quat(scalar_first=True)[0]
         assert abs(reference.state_at(start_s)[0] @ wxyz) == pytest.approx(1, abs=1e-9)
         assert np.any((begin_s >= start_s) & (begin_s + shown.time_s <= end_s))
@@ -96,7 +103,11 @@ def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() 
     first, last = (stops.from_angles(np.array([angles]))[0] for angles in TILTED[:2])
     assert greatest_tilt_deg(first, last) == pytest.approx(32.2, abs=0.1)
     assert max(greatest_tilt_deg(one, one) for one in (first, last)) < 24.1
-    overrides = {"vehicle.tilt_stop_deg": "25", "motion.control": "prescribed", "motion.maneuver": "[]"}
+    overrides = {
+        "vehicle.tilt_stop_deg": "25",
+        "motion.control": "prescribed",
+        "motion.maneuver": "[]",
+    }
     flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, TILTED))
     reference = guidance.plan(flown.motion)
     t_s = np.arange(0, reference.duration_s, 0.2)
@@ -105,15 +116,32 @@ def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() 
 
 
 @pytest.mark.parametrize(("pixels", "taken"), [(0.9, [3, 6]), (1.1, [])])
-def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(pixels: float, taken: list[int]) -> None:
+def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(
+    pixels: float, taken: list[int]
+) -> None:
     """Its image moves by less than a pixel. A frame whose exposure lasts beyond the hold does not count."""
-    legs = ", ".join(f"{{kind: slew, roll_deg: {roll}}}, {{kind: hold, duration: 5 s}}" for roll in (3, 0))
-    scene = loader.load("afit_simsat_ideal", {"motion.maneuver": f"[{legs}]", "motion.control": "prescribed"})
-    start_s, exposure_s = guidance.plan(scene.motion).start_s, 0.1
+    legs = ", ".join(
+        f"{{kind: slew, roll_deg: {roll}}}, {{kind: hold, duration: 5 s}}" for roll in (3, 0)
+    )
+    scene = loader.load(
+        "afit_simsat_ideal", {"motion.maneuver": f"[{legs}]", "motion.control": "prescribed"}
+    )
+    start_s = guidance.plan(scene.motion).start_s
+    exposure_s = 0.1
     rate_rad_s = pixels / exposure_s / scene.camera.focal_px
-    t_s = [0.0, start_s[1] - 0.01, start_s[1], start_s[2] - 0.11, start_s[2] - 0.09, start_s[3], start_s[4] - 0.2]
+    t_s = [
+        0.0,
+        start_s[1] - 0.01,
+        start_s[1],
+        start_s[2] - 0.11,
+        start_s[2] - 0.09,
+        start_s[3],
+        start_s[4] - 0.2,
+    ]
     trajectory = SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))
-    flight: Any = SimpleNamespace(lab=SimpleNamespace(scene=scene), is_over=True, trajectory=lambda: trajectory)
+    flight: Any = SimpleNamespace(
+        lab=SimpleNamespace(scene=scene), is_over=True, trajectory=lambda: trajectory
+    )
     views: Any = [SimpleNamespace(t_s=begin, exposure_s=exposure_s) for begin in t_s]
     assert survey.frames_at_rest(flight, views) == (taken, 2)
 
@@ -129,9 +157,11 @@ def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
 @pytest.mark.slow
 def test_a_survey_goes_on_with_the_frames_flown() -> None:
     """Its frames are those at the planned attitudes, and more of them measure more LEDs, with errors as estimated."""
-    worker, bench = Worker(), {"motion.control": "prescribed", "motion.maneuver": "[]"}
+    worker = Worker()
+    bench = {"motion.control": "prescribed", "motion.maneuver": "[]"}
     worker.open("afit_simsat", bench, False)
-    plan, measured = worker.plan_survey(8), 0
+    plan = worker.plan_survey(8)
+    measured = 0
     for count in (8, 16):
         flight_of(worker, survey_flight("afit_simsat", bench, plan.angles_deg))
         assert worker.flight is not None
@@ -146,7 +176,8 @@ def test_a_survey_goes_on_with_the_frames_flown() -> None:
         assert found.measured > measured
         assert found.measured + found.seen_once + found.unseen <= len(found.ids) == 1465
         assert np.sum(found.known > 0) == found.measured
-        plan, measured = found.plan, found.measured
+        plan = found.plan
+        measured = found.measured
     assert found.error_mm is not None
     assert found.sigma_mm is not None
     assert found.before_mm is not None
@@ -184,7 +215,8 @@ def check_map(worker: Worker, found: SurveyFound) -> None:
 @pytest.mark.slow
 def test_a_survey_has_the_frames_of_its_flights_once() -> None:
     """None of another maneuver. Those of two attitudes are too few, which is said, and the next ones are planned."""
-    worker, bench = Worker(), {"motion.control": "prescribed", "exposure.frames": "2"}
+    worker = Worker()
+    bench = {"motion.control": "prescribed", "exposure.frames": "2"}
     worker.open("afit_simsat", bench, False)
     worker.begin_flight()
     with pytest.raises(InputError, match="no survey of this scene: plan one"):
@@ -207,15 +239,32 @@ def test_a_survey_has_the_frames_of_its_flights_once() -> None:
 
 def test_a_survey_that_determines_nothing_says_so() -> None:
     plan = SurveyPlan(ANGLES, (30, 31), 1465, ((4, 0, None), (6, 50, 0.46)))
-    few = {"sigma_mm": None, "before_mm": None, "error_mm": None, "faults": (), "refusal": "too few"}
-    counts = {"frames": 2, "connected": 0, "missed": 1, "measured": 0, "seen_once": 60, "unseen": 1405, "renamed": 0}
+    few = {
+        "sigma_mm": None,
+        "before_mm": None,
+        "error_mm": None,
+        "faults": (),
+        "refusal": "too few",
+    }
+    counts = {
+        "frames": 2,
+        "connected": 0,
+        "missed": 1,
+        "measured": 0,
+        "seen_once": 60,
+        "unseen": 1405,
+        "renamed": 0,
+    }
     refused = SurveyFound(**counts, **few, ids=np.arange(3), known=np.zeros(0), plan=plan)  # type: ignore[arg-type]
     assert survey_lines(refused) == [
         "2 frames: no LED measured; 60 seen once, 1405 not seen.",
         "1 attitudes have no frame: the vehicle did not rest there.",
         "Not determined yet: too few.",
     ]
-    assert prediction_text(plan) == "Predicted of the 1465 LEDs: after 6 frames 50 LEDs to 0.46 mm rms."
+    assert (
+        prediction_text(plan)
+        == "Predicted of the 1465 LEDs: after 6 frames 50 LEDs to 0.46 mm rms."
+    )
 
 
 def test_a_plan_needs_two_frames() -> None:
@@ -245,8 +294,12 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.get_by_text("Predicted of the 1465 LEDs").wait_for()
     wanted = page.locator(".lab-stops .num").nth(5).inner_text()  # the first roll, after five heads
     page.get_by_role("button", name="Point to attitude 1", exact=True).click()
-    assert come(lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006)
-    fly, adjust, save = (page.get_by_role("button", name=name, exact=True) for name in ("Fly", "Adjust", "Map file"))
+    assert come(
+        lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006
+    )
+    fly, adjust, save = (
+        page.get_by_role("button", name=name, exact=True) for name in ("Fly", "Adjust", "Map file")
+    )
     assert save.is_disabled()
     fly.click()
     page.get_by_role("button", name="Stop", exact=True).wait_for()  # of the flight that is computed
@@ -259,7 +312,8 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     with page.expect_download() as download:
         save.click()
     assert download.value.suggested_filename == "afit_simsat_leds.ecsv"
-    of_survey, of_map = page.get_by_text("the brighter the better"), page.get_by_text("drawn in the 3-D view")
+    of_survey = page.get_by_text("the brighter the better")
+    of_map = page.get_by_text("drawn in the 3-D view")
     of_survey.wait_for()
     assert of_map.is_hidden()
     page.get_by_role("button", name="Map", exact=True).click()  # it colors the LEDs anew

@@ -31,11 +31,14 @@ def free() -> Lab:
 def test_a_small_pull_is_a_spring_and_a_long_one_has_a_limit() -> None:
     """A force k d at the lever r: the torque of a spring that swings at PULL_RAD_S, with J the mean moment."""
     turned = Rotation.from_rotvec([0.1, -0.4, 0.3])
-    held, way = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.01, 0.0])
+    held = np.array([0.3, 0.0, 0.4])
+    way = np.array([0.0, 0.01, 0.0])
     grip = Grip(tuple(held), tuple(turned.apply(held + way)))
     stiffness = INERTIA.mean() * PULL_RAD_S**2
     expected = stiffness * np.cross(held, way) / 0.25  # r^2
-    np.testing.assert_allclose(pull_torque_nm(grip, turned, np.diag(INERTIA)), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        pull_torque_nm(grip, turned, np.diag(INERTIA)), expected, rtol=1e-9, atol=1e-12
+    )
     far = Grip(tuple(held), tuple(turned.apply(held + 1000 * way)))
     assert np.linalg.norm(pull_torque_nm(far, turned, np.diag(INERTIA))) == pytest.approx(stiffness)
     along = Grip(tuple(held), tuple(turned.apply(3 * held)))
@@ -71,7 +74,8 @@ def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Lab) ->
     push = Push(free, Rotation.identity())
     offset = math.radians(2)
     grip = Grip((0.5, 0.0, 0.0), (0.5 * math.cos(offset), 0.5 * math.sin(offset), 0.0))
-    turned, half_s = [], math.pi / PULL_RAD_S
+    turned = []
+    half_s = math.pi / PULL_RAD_S
     for _ in range(round(half_s / 0.01)):
         push.advance(grip, 0.01)
         turned.append(push.lab_from_body.as_rotvec()[2])
@@ -94,7 +98,9 @@ def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:
     np.testing.assert_allclose(seen.rate_at(close_s), rate, rtol=0.01, atol=1e-9)
 
 
-@pytest.mark.parametrize(("scene", "reason"), [("collimated_display", "no vehicle"), ("two_heads", "prescribed")])
+@pytest.mark.parametrize(
+    ("scene", "reason"), [("collimated_display", "no vehicle"), ("two_heads", "prescribed")]
+)
 def test_what_is_no_moving_vehicle_is_not_pushed(scene: str, reason: str) -> None:
     lab = build_lab(loader.load(scene, {}))
     with pytest.raises(InputError, match=reason):
@@ -110,9 +116,12 @@ def test_a_drag_of_the_vehicle_moves_it_and_its_frames_and_reset_brings_it_back(
     changed(page, last)  # texts come with the frame
     status(page, "solved")
     page.get_by_role("button", name="outside").click()
-    before, frame, moved = angles(page), source(page), page.locator(".lab-push")
+    before = angles(page)
+    frame = source(page)
+    moved = page.locator(".lab-push")
     box = page.locator(".lab-space > canvas").first.bounding_box()
-    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    x = box["x"] + 0.5 * box["width"]
+    y = box["y"] + 0.5 * box["height"]
     for step in range(20):  # from the middle downwards until the vehicle is under the mouse
         page.mouse.move(x, y + 8 * step)
         page.mouse.down()

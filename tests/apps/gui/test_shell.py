@@ -7,7 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page, opened, panel, pictured, source
+from labpage import (
+    CHROMIUM,
+    NARROW,
+    WIDE,
+    Server,
+    changed,
+    come,
+    onto_the_page,
+    opened,
+    panel,
+    pictured,
+    source,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -28,9 +40,15 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 @pytest.mark.parametrize(
     ("error", "shown"),
     [
-        (InputError("camera.f_number", "", "above 0", OVERRIDES), "camera.f_number: allowed: above 0"),
+        (
+            InputError("camera.f_number", "", "above 0", OVERRIDES),
+            "camera.f_number: allowed: above 0",
+        ),
         (InputError("seed", "-1", "", Where("x.yaml", 3)), "seed: -1 (x.yaml, line 3)"),
-        (InputError("solve.fov_deg", "200", "2 to 120"), "the field of view: 200; allowed: 2 to 120"),
+        (
+            InputError("solve.fov_deg", "200", "2 to 120"),
+            "the field of view: 200; allowed: 2 to 120",
+        ),
         (InputError("survey.tilt_deg", "95", "to 30"), "the tilt: 95; allowed: to 30"),
         (InputError("", "no frame has been rendered"), "no frame has been rendered"),
     ],
@@ -44,13 +62,18 @@ def test_every_parameter_of_a_photo_has_a_label() -> None:
 
 
 def test_actions_are_found_by_their_words_in_any_order() -> None:
-    commands = [Command("show the log", "F10", lambda: None), Command("show the next frame", ".", lambda: None)]
+    commands = [
+        Command("show the log", "F10", lambda: None),
+        Command("show the next frame", ".", lambda: None),
+    ]
     assert matching(commands, "FRAME show") == commands[1:]
     assert matching(commands, "") == commands
     assert matching(commands, "none") == []
 
 
-def test_a_study_beyond_the_number_allowed_is_refused(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_beyond_the_number_allowed_is_refused(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     running = {StudyProcess(tmp_path) for _ in range(MAX_STUDIES)}
     monkeypatch.setattr(StudyProcess, "begun", running)
     StudyProcess.check_count()  # none of them runs
@@ -62,9 +85,21 @@ def test_a_study_beyond_the_number_allowed_is_refused(tmp_path: Any, monkeypatch
 
 EYES = {  # linear RGB as seen: Machado, Oliveira and Fernandes 2009, severity 1
     "normal": np.eye(3),
-    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
-    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritanopia": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
 }
 STATES = ("good", "warn", "bad")
 
@@ -72,9 +107,20 @@ STATES = ("good", "warn", "bad")
 def distance(colors: Iterable[str], eye: str) -> float:
     """The least distance between two of some colors, in Oklab (Ottosson 2020), of which 0.02 is just noticeable."""
     srgb = np.array([[int(color[n : n + 2], 16) / 255 for n in (1, 3, 5)] for color in colors])
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4) @ np.array(EYES[eye]).T
-    cones = [[0.412221, 0.536333, 0.051446], [0.211903, 0.680700, 0.107397], [0.088302, 0.281719, 0.629979]]
-    lab = [[0.210454, 0.793618, -0.004072], [1.977998, -2.428592, 0.450594], [0.025904, 0.782772, -0.808676]]
+    linear = (
+        np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        @ np.array(EYES[eye]).T
+    )
+    cones = [
+        [0.412221, 0.536333, 0.051446],
+        [0.211903, 0.680700, 0.107397],
+        [0.088302, 0.281719, 0.629979],
+    ]
+    lab = [
+        [0.210454, 0.793618, -0.004072],
+        [1.977998, -2.428592, 0.450594],
+        [0.025904, 0.782772, -0.808676],
+    ]
     seen = np.cbrt(np.clip(linear, 0, 1) @ np.array(cones).T) @ np.array(lab).T
     i, j = np.triu_indices(len(seen), 1)
     return float(np.linalg.norm(seen[i] - seen[j], axis=1).min())
@@ -84,7 +130,9 @@ def distance(colors: Iterable[str], eye: str) -> float:
 def test_colors_are_told_apart_by_every_eye(eye: str) -> None:
     """Red and green of equal lightness would be 0.04 apart in deuteranopia."""
     assert distance(["#3f9a52", "#e05555"], "deuteranopia") < 0.04
-    marks = [color for kind, color in overlay.COLORS.items() if kind != "windows"]  # these are dashed
+    marks = [
+        color for kind, color in overlay.COLORS.items() if kind != "windows"
+    ]  # these are dashed
     states = [[theme[name] for name in STATES] for theme in (style.DARK, style.LIGHT)]
     for colors in (style.CURVE_COLORS, marks, *states):
         assert distance(colors, eye) > 0.1
@@ -198,7 +246,8 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
     page.mouse.up()
     assert come(lambda: abs(wide() - before - 80) < 8)
     page.get_by_role("separator", name="Width of the panels").focus()
-    frame, dragged = source(page), wide()
+    frame = source(page)
+    dragged = wide()
     page.keyboard.press("ArrowRight")
     assert come(lambda: abs(wide() - dragged + 24) < 1)
     assert source(page) == frame
@@ -227,13 +276,15 @@ def test_frame_laboratory_and_panel_are_seen_together_in_sizes_of_the_user_s(
 
     def drag(down: float) -> None:
         box = line.bounding_box()
-        x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+        x = box["x"] + 0.5 * box["width"]
+        y = box["y"] + 0.5 * box["height"]
         page.mouse.move(x, y)
         page.mouse.down()
         page.mouse.move(x, y + down, steps=4)
         page.mouse.up()
 
-    first, frame = tall(), source(page)
+    first = tall()
+    frame = source(page)
     panels = page.locator(".lab-panels").bounding_box()
     assert first > 180
     assert panels["height"] > 240
@@ -257,9 +308,12 @@ def test_frame_laboratory_and_panel_are_seen_together_in_sizes_of_the_user_s(
 
 @pytest.mark.browser
 @in_browser
-def test_a_closed_laboratory_is_not_drawn_and_one_that_does_not_change_neither(tab_of_own: Any) -> None:
+def test_a_closed_laboratory_is_not_drawn_and_one_that_does_not_change_neither(
+    tab_of_own: Any,
+) -> None:
     page = tab_of_own
-    line, canvas = page.get_by_role("separator", name="Height of the 3-D view"), page.locator(".lab-space canvas").first
+    line = page.get_by_role("separator", name="Height of the 3-D view")
+    canvas = page.locator(".lab-space canvas").first
 
     def pictures() -> int:
         return int(canvas.get_attribute("data-drawn") or 0)
@@ -267,7 +321,8 @@ def test_a_closed_laboratory_is_not_drawn_and_one_that_does_not_change_neither(t
     def moved(key: str) -> int:
         """How many pictures are drawn for a key."""
         page.wait_for_timeout(1000)
-        before, frame = pictures(), source(page)
+        before = pictures()
+        frame = source(page)
         onto_the_page(page)
         page.keyboard.press(key)
         changed(page, frame)

@@ -75,7 +75,11 @@ def test_an_address_without_a_scene_names_no_view() -> None:
 def test_steps_are_told_from_continuous_changes() -> None:
     view = VIEWS[2]
     assert view.same_step(replace(view, t_s=1.0, angles_deg=(1.0, 2.0, 3.0)))
-    for other in (replace(view, kind="live"), replace(view, overrides={"a": "b"}), replace(view, trial=3)):
+    for other in (
+        replace(view, kind="live"),
+        replace(view, overrides={"a": "b"}),
+        replace(view, trial=3),
+    ):
         assert not view.same_step(other)
 
 
@@ -85,9 +89,13 @@ def test_a_movement_is_one_step_and_replaces_no_other(monkeypatch: pytest.Monkey
     monkeypatch.setattr(history.ui, "run_javascript", sent.append)
     shown = SimpleNamespace(state=VIEWS[0])
     written = history.History.__new__(history.History)
-    written.page, written.home, written.written = shown, "shefex2", None
+    written.page = shown
+    written.home = "shefex2"
+    written.written = None
     written.is_settling = lambda: False
-    written.showing, written.moving, written.unchanged = False, False, 0
+    written.showing = False
+    written.moving = False
+    written.unchanged = 0
     turned = [replace(VIEWS[0], angles_deg=(float(n), 0.0, 0.0)) for n in range(3)]
     edited = replace(turned[2], overrides={"camera.f_number": "2"})
     after = replace(edited, angles_deg=(9.0, 0.0, 0.0))
@@ -181,12 +189,16 @@ def test_undo_and_redo_go_through_moves_and_scenes(browser: Any, server: Server)
         assert come(lambda: np.allclose(angles(page), moved, rtol=0, atol=1e-3))
         page.keyboard.press("Control+Shift+z")
         assert written(page, "scene=collimated_display")
-        assert come(lambda: page.get_by_role("combobox", name="Scene").input_value() == "collimated_display")
+        assert come(
+            lambda: page.get_by_role("combobox", name="Scene").input_value() == "collimated_display"
+        )
 
 
 @pytest.mark.browser
 @in_browser
-def test_the_printed_link_returns_to_the_last_view_and_a_bad_one_is_refused(browser: Any, server: Server) -> None:
+def test_the_printed_link_returns_to_the_last_view_and_a_bad_one_is_refused(
+    browser: Any, server: Server
+) -> None:
     with opened(browser, server.login, NARROW) as page:
         before = angles(page)
         page.keyboard.press("Shift+ArrowLeft")
@@ -203,7 +215,9 @@ def test_the_printed_link_returns_to_the_last_view_and_a_bad_one_is_refused(brow
 
 @pytest.mark.browser
 @in_browser
-def test_a_stopped_study_is_still_shown_after_a_reload_and_goes_on(browser: Any, server: Server) -> None:
+def test_a_stopped_study_is_still_shown_after_a_reload_and_goes_on(
+    browser: Any, server: Server
+) -> None:
     with opened(browser, server.login, NARROW) as page:
         panel(page, "Monte Carlo")
         page.get_by_label("noise, px").fill("7")

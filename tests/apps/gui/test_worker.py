@@ -28,7 +28,10 @@ from labpage import (
 )
 
 pytest_plugins = ["labpage"]
-pytestmark = [pytest.mark.browser, pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"),
+]
 
 
 def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
@@ -46,7 +49,9 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     simulate(page, 8)
     page.get_by_text(re.compile(r"^\d of 8 frames solved; rms: cross")).wait_for()
     clock = page.get_by_text(re.compile(r"^\d+\.\d\d s +\d/8$"))
-    page.get_by_role("button", name="Previous frame").click()  # a flight that is computed plays: pause it
+    page.get_by_role(
+        "button", name="Previous frame"
+    ).click()  # a flight that is computed plays: pause it
     chosen(page, "Speed", "5×")
     onto_the_page(page)
     page.keyboard.press("Control+k")
@@ -62,7 +67,9 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     clock.filter(has_text="7/8").wait_for()
     strips = page.locator(".nicegui-echart:visible").first
     box = strips.bounding_box()
-    page.mouse.click(box["x"] + 52 + 0.03 * (box["width"] - 64), box["y"] + 70)  # early in the first strip
+    page.mouse.click(
+        box["x"] + 52 + 0.03 * (box["width"] - 64), box["y"] + 70
+    )  # early in the first strip
     clock.filter(has_text="1/8").wait_for()
     with page.expect_download() as comes:
         page.get_by_role("button", name="CSV").click()
@@ -86,7 +93,9 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     page.get_by_role("status").filter(has_text="filter requires the section filter").wait_for()
 
 
-def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(second: Any, server: Server) -> None:
+def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(
+    second: Any, server: Server
+) -> None:
     panel(second, "Monte Carlo")
     second.get_by_label("noise, px").fill("8")
     second.get_by_label("runs, F8").fill("5000")
@@ -118,7 +127,9 @@ def test_two_tabs_do_not_disturb_one_another(page: Any, second: Any) -> None:
     np.testing.assert_array_equal(angles(page), still)
 
 
-def test_closing_a_tab_ends_its_worker_and_its_study(page: Any, second: Any, server: Server) -> None:
+def test_closing_a_tab_ends_its_worker_and_its_study(
+    page: Any, second: Any, server: Server
+) -> None:
     assert server.come_to("gui.template", 3) == 3  # two tabs' and the one that they are forked from
     assert server.children("study")
     second.close()
@@ -126,7 +137,9 @@ def test_closing_a_tab_ends_its_worker_and_its_study(page: Any, second: Any, ser
     assert server.come_to("gui.template", 2) == 2
 
 
-def test_a_worker_that_is_killed_is_told_and_another_takes_its_place(page: Any, server: Server) -> None:
+def test_a_worker_that_is_killed_is_told_and_another_takes_its_place(
+    page: Any, server: Server
+) -> None:
     for worker in server.children("gui.template"):
         worker.kill()
     page.keyboard.press("1")
@@ -142,14 +155,25 @@ def test_a_page_for_others_takes_its_token_and_no_other_site_s_word(
     browser: Any, server: Server, tmp_path: Path
 ) -> None:
     assert server.status(Host="evil.example") == 403
-    assert server.status("_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="http://evil.example") == 403
+    assert (
+        server.status(
+            "_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="http://evil.example"
+        )
+        == 403
+    )
     with Server(tmp_path, host="0.0.0.0") as others:
         for one in (server, others):
-            assert [one.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")] == [401] * 4
+            assert [
+                one.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")
+            ] == [401] * 4
             assert one.status("report/%00", Cookie=f"skysim_gui_{one.port}={TOKEN}") == 404
         with opened(browser, others.login, NARROW) as page:
             assert "token" not in page.url
             status(page, "solved")
-            files = page.evaluate("performance.getEntriesByType('resource').map(one => new URL(one.name).pathname)")
+            files = page.evaluate(
+                "performance.getEntriesByType('resource').map(one => new URL(one.name).pathname)"
+            )
             kept = [path for path in files if path.startswith("/_nicegui/")]
-            assert {others.status(path[1:]) for path in kept} == {401}  # also of files that the server keeps
+            assert {others.status(path[1:]) for path in kept} == {
+                401
+            }  # also of files that the server keeps

@@ -39,7 +39,10 @@ OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
     """The frames of a run of the scene."""
-    return [shot.frame.image_dn for shot in open_flight(loader.load("shefex2", OVERRIDES)).shots(solves=False)]
+    return [
+        shot.frame.image_dn
+        for shot in open_flight(loader.load("shefex2", OVERRIDES)).shots(solves=False)
+    ]
 
 
 def streamed_flight(*, endless: bool = False) -> Flight:
@@ -50,7 +53,9 @@ def streamed_flight(*, endless: bool = False) -> Flight:
 def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
     pixels = np.arange(12, dtype="<u2").reshape(3, 4) if pixels is None else pixels
     shape = {"width": pixels.shape[1], "height": pixels.shape[0], "dtype": pixels.dtype.str}
-    return Packet({"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape}, pixels, {})
+    return Packet(
+        {"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape}, pixels, {}
+    )
 
 
 @pytest.mark.parametrize("dtype", ["<u2", "<f8"])
@@ -139,7 +144,8 @@ def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
 
 
 def test_a_slow_sink_delays_nothing_and_its_drops_are_counted() -> None:
-    released, received = threading.Event(), list[int]()
+    released = threading.Event()
+    received = list[int]()
 
     def take(one: Packet) -> None:
         released.wait(10)
@@ -159,7 +165,9 @@ def test_a_slow_sink_delays_nothing_and_its_drops_are_counted() -> None:
     assert (sink.sent, sink.dropped, sink.fault) == (0, 1, "the reader has closed the pipe")
 
 
-def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """For example a pipe without a reader."""
     monkeypatch.setattr(sinks, "CLOSE_TIMEOUT_S", 0.3)
     released = threading.Event()
@@ -190,7 +198,9 @@ def test_a_failing_sink_reports_its_fault_and_is_not_waited_for() -> None:
     assert (sink.sent, sink.dropped, sink.fault) == (0, 5, "ValueError: no such thing")
 
 
-def test_a_folder_receives_every_frame_with_its_truth(tmp_path: Path, frames: list[np.ndarray]) -> None:
+def test_a_folder_receives_every_frame_with_its_truth(
+    tmp_path: Path, frames: list[np.ndarray]
+) -> None:
     sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
     command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--json", *sets]
     done = CliRunner().invoke(main.app, command)
@@ -270,14 +280,18 @@ def test_a_client_that_disconnects_during_a_response_is_ignored(
 ) -> None:
     hub[0].publish(packet(1, pixels=np.zeros((3000, 3000), "<u2")))
     with socket.create_connection(("127.0.0.1", int(hub[1].rpartition(":")[2])), 10) as client:
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset by closing
+        client.setsockopt(
+            socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+        )  # reset by closing
         client.sendall(b"GET /frame.raw HTTP/1.0\r\n\r\n")
         assert client.recv(100)
     time.sleep(0.3)
     assert capfd.readouterr().err == ""
 
 
-def test_counters_of_disconnected_clients_are_bounded_and_summed(hub: tuple[http.FrameHub, str]) -> None:
+def test_counters_of_disconnected_clients_are_bounded_and_summed(
+    hub: tuple[http.FrameHub, str],
+) -> None:
     """A hundred clients take a frame each: counters of the newest are kept one by one, of the others as a sum."""
     stays = urllib.request.urlopen(hub[1] + "/stream.raw", timeout=10)
     assert unpack(stays) is not None
@@ -286,7 +300,9 @@ def test_counters_of_disconnected_clients_are_bounded_and_summed(hub: tuple[http
             assert unpack(raw) is not None
     until = time.monotonic() + 60
     index = 0
-    while len(hub[0].disconnected) + hub[0].earlier["clients"] < 100:  # who left is found out by sending
+    while (
+        len(hub[0].disconnected) + hub[0].earlier["clients"] < 100
+    ):  # who left is found out by sending
         assert time.monotonic() < until
         index += 1
         hub[0].publish(packet(index))
@@ -299,9 +315,13 @@ def test_counters_of_disconnected_clients_are_bounded_and_summed(hub: tuple[http
     assert result["clients"][0]["sent"] in (index, index + 1)
 
 
-@pytest.mark.parametrize("path", ["/", "/frame.png", "/frame.raw", "/truth.json", "/stream.raw", "/stream.mjpg"])
+@pytest.mark.parametrize(
+    "path", ["/", "/frame.png", "/frame.raw", "/truth.json", "/stream.raw", "/stream.mjpg"]
+)
 def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], path: str) -> None:
-    with urllib.request.urlopen(urllib.request.Request(hub[1] + path, method="HEAD"), timeout=10) as result:
+    with urllib.request.urlopen(
+        urllib.request.Request(hub[1] + path, method="HEAD"), timeout=10
+    ) as result:
         assert result.status == 200
         assert result.read() == b""
     assert hub[0].clients == []
@@ -313,7 +333,8 @@ def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], 
 def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> None:
     """The clock is set forward by ten days; the free rotation does not depend on it."""
     flight = streamed_flight(endless=True)
-    scene, simulation = flight.lab.scene, flight.motion.simulation
+    scene = flight.lab.scene
+    simulation = flight.motion.simulation
     size_bytes = simulation.states.nbytes
     offset_s = 10 * 86_400
     simulation.step = simulation.first_step = round(offset_s / simulation.step_s)
@@ -321,7 +342,9 @@ def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> No
     shots = list(islice(flight.shots(solves=False), FRAMES + 1))
     mids_s = [shot.frame.t_mid_s - offset_s for shot in shots]
     first_s = scene.exposure.first_s + scene.exposure.time_s / 2
-    np.testing.assert_allclose(mids_s, first_s + np.arange(len(shots)) / scene.exposure.rate_hz, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        mids_s, first_s + np.arange(len(shots)) / scene.exposure.rate_hz, rtol=0, atol=1e-8
+    )
     assert simulation.states.nbytes == size_bytes
     rotation = shots[-1].truth.cam_from_lab * shots[0].truth.cam_from_lab.inv()
     rate_rad_s = np.radians(np.linalg.norm(scene.motion.rate_deg_s))
@@ -329,8 +352,19 @@ def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> No
 
 
 @pytest.mark.long
-def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
+def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(
+    tmp_path: Path,
+) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "skysim",
+        "stream",
+        "shefex2",
+        "--set",
+        "light.limit_mag=5",
+        "--endless",
+    ]
     stream = subprocess.Popen([*command, "--folder", str(tmp_path), "--json"], stdout=-1)
     until = time.monotonic() + 300
     while not (tmp_path / "frame_000002.json").exists():
@@ -341,15 +375,28 @@ def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(tmp
     result = json.loads(stream.communicate(timeout=60)[0])
     assert stream.returncode == 0
     stems = {path.stem for path in tmp_path.iterdir()}
-    assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{end}" for stem in stems for end in ("png", "json")}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{stem}.{end}" for stem in stems for end in ("png", "json")
+    }
     assert len(stems) == result["sinks"]["folder"]["sent"] >= 3
     with pytest.raises(InputError, match="either --frames N or --endless"):
-        CliRunner().invoke(main.app, [*command[3:], "--frames", "3", "--pipe", "-"], catch_exceptions=False)
+        CliRunner().invoke(
+            main.app, [*command[3:], "--frames", "3", "--pipe", "-"], catch_exceptions=False
+        )
 
 
 @pytest.mark.long
 def test_a_stream_ends_with_the_reader_of_its_pipe_and_at_sigterm(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "skysim", "stream", "shefex2", "--set", "light.limit_mag=5", "--endless"]
+    command = [
+        sys.executable,
+        "-m",
+        "skysim",
+        "stream",
+        "shefex2",
+        "--set",
+        "light.limit_mag=5",
+        "--endless",
+    ]
     piped = subprocess.Popen([*command, "--pipe", "-", "--speed", "0"], stdout=-1, stderr=-1)
     assert piped.stdout is not None
     assert piped.stderr is not None

@@ -23,7 +23,9 @@ COUNT = 6
 
 def places(rng: np.random.Generator, count: int = COUNT) -> tuple[Floats, Floats]:
     """(K, 3) LEDs from the bearing and from the pupil, m, in camera axes and in the camera's field."""
-    rays = np.column_stack([rng.uniform(-0.2, 0.2, (count, 2)), np.ones(count)]) * rng.uniform(0.8, 1.5, (count, 1))
+    rays = np.column_stack([rng.uniform(-0.2, 0.2, (count, 2)), np.ones(count)]) * rng.uniform(
+        0.8, 1.5, (count, 1)
+    )
     return rays + np.array([*rng.normal(0, 0.02, 2), 0.3]), rays
 
 
@@ -45,15 +47,20 @@ def covariances(rng: np.random.Generator, size: int, count: int = COUNT) -> Floa
 @given(rng=SEEDS)
 def test_tangents_change_as_their_derivatives_say(rng: np.random.Generator) -> None:
     bearing, pupil = places(rng)
-    step_m, turned_rad = rng.normal(0, 1e-6, pupil.shape), rng.normal(0, 1e-6, 3)
+    step_m = rng.normal(0, 1e-6, pupil.shape)
+    turned_rad = rng.normal(0, 1e-6, 3)
     view = systematic.geometry(bearing, pupil)
     assert_allclose(view.tangent, tangents(pupil), rtol=0, atol=1e-15)
     gradient = nearfield.tangent_gradients(pupil)
     moved = tangents(pupil + step_m) - view.tangent
     assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-11)
-    assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)  # along the ray nothing changes
+    assert_allclose(
+        np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14
+    )  # along the ray nothing changes
     jacobian = nearfield.tangent_jacobian(bearing, pupil)
-    rotated = tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing) - view.tangent
+    rotated = (
+        tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing) - view.tangent
+    )
     assert_allclose((jacobian @ turned_rad).reshape(-1, 2), rotated, rtol=0, atol=1e-11)
     assert_allclose(view.jacobian.reshape(-1, 3), jacobian, rtol=0, atol=0)
     assert_allclose(view.gradient, gradient, rtol=0, atol=0)
@@ -62,7 +69,9 @@ def test_tangents_change_as_their_derivatives_say(rng: np.random.Generator) -> N
 @law(systematic.response, systematic.from_common, systematic.residual_products)
 @given(rng=SEEDS)
 def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) -> None:
-    view, sigma, turned_rad = systematic.geometry(*places(rng)), sigmas(rng), rng.normal(0, 1e-4, 3)
+    view = systematic.geometry(*places(rng))
+    sigma = sigmas(rng)
+    turned_rad = rng.normal(0, 1e-4, 3)
     change = view.jacobian @ turned_rad
     found = np.einsum("kai,ki->a", systematic.response(view, sigma), change)
     assert_allclose(found, turned_rad, rtol=0, atol=1e-15)
@@ -72,14 +81,19 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
     products = systematic.residual_products(view, sigma, np.concatenate([change[None], other]))
     assert_allclose(products[0], 0, rtol=0, atol=1e-10 * np.abs(change / sigma[:, None]).sum() ** 2)
     assert_covariance(products)
-    assert (np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))).all()  # a fit adds no residual
+    assert (
+        np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))
+    ).all()  # a fit adds no residual
 
 
 @law(systematic.with_focal)
 @given(rng=SEEDS)
-def test_a_fitted_focal_length_takes_a_change_of_scale_to_itself_and_no_rotation(rng: np.random.Generator) -> None:
+def test_a_fitted_focal_length_takes_a_change_of_scale_to_itself_and_no_rotation(
+    rng: np.random.Generator,
+) -> None:
     """And the covariances with it are those of the inverse of the whole information, a rotation's block of it."""
-    view, sigma = systematic.geometry(*places(rng)), sigmas(rng)
+    view = systematic.geometry(*places(rng))
+    sigma = sigmas(rng)
     joint = systematic.with_focal(view)
     scaled = 1e-3 * view.tangent
     answer = np.einsum("kai,ki->a", systematic.response(joint, sigma), scaled)
@@ -98,8 +112,11 @@ def test_a_fitted_focal_length_takes_a_change_of_scale_to_itself_and_no_rotation
 
 @law(systematic.isotropic, systematic.from_independent)
 @given(rng=SEEDS)
-def test_the_weights_own_errors_have_the_inverse_of_the_information(rng: np.random.Generator) -> None:
-    view, sigma = systematic.geometry(*places(rng)), sigmas(rng)
+def test_the_weights_own_errors_have_the_inverse_of_the_information(
+    rng: np.random.Generator,
+) -> None:
+    view = systematic.geometry(*places(rng))
+    sigma = sigmas(rng)
     errors = systematic.isotropic(sigma)
     assert_allclose(errors[:, 0, 0], sigma**2, rtol=1e-12, atol=0)
     assert_allclose(errors[:, 0, 1], 0, rtol=0, atol=0)
@@ -112,16 +129,23 @@ def test_the_weights_own_errors_have_the_inverse_of_the_information(rng: np.rand
 @law(systematic.with_survey)
 @given(rng=SEEDS)
 def test_without_survey_errors_a_covariance_is_the_solver_s(rng: np.random.Generator) -> None:
-    view, sigma = systematic.geometry(*places(rng)), sigmas(rng)
-    solver = systematic.from_independent(view, sigma, systematic.isotropic(sigma)) + covariances(rng, 3)[0]
+    view = systematic.geometry(*places(rng))
+    sigma = sigmas(rng)
+    solver = (
+        systematic.from_independent(view, sigma, systematic.isotropic(sigma))
+        + covariances(rng, 3)[0]
+    )
     nothing = np.zeros((COUNT, 2, 2))
     total, part = systematic.with_survey(
         solver, view, sigma, systematic.isotropic(sigma), nothing, np.empty((0, COUNT, 2))
     )
     assert_allclose(total, solver, rtol=0, atol=1e-7 * np.abs(solver).max())
     assert_allclose(part, 0, rtol=0, atol=0)
-    own, common = covariances(rng, 2), rng.normal(0, 1e-5, (2, COUNT, 2))
-    total, part = systematic.with_survey(solver, view, sigma, systematic.isotropic(sigma), own, common)
+    own = covariances(rng, 2)
+    common = rng.normal(0, 1e-5, (2, COUNT, 2))
+    total, part = systematic.with_survey(
+        solver, view, sigma, systematic.isotropic(sigma), own, common
+    )
     assert_covariance(part)
     assert_allclose(total - part, solver, rtol=0, atol=1e-7 * np.abs(total).max())
 
@@ -130,7 +154,8 @@ def test_without_survey_errors_a_covariance_is_the_solver_s(rng: np.random.Gener
 @given(rng=SEEDS)
 def test_a_focal_length_s_error_grows_from_the_principal_point(rng: np.random.Generator) -> None:
     xy_px = rng.uniform(0, [999, 799], (COUNT, 2))
-    rays, sigma = CAMERA.rays(xy_px), sigmas(rng)
+    rays = CAMERA.rays(xy_px)
+    sigma = sigmas(rng)
     longer = replace(CAMERA, focal_px=CAMERA.focal_px * (1 + FOCAL_SIGMA))
     moved_px = np.linalg.norm(longer.pixels(rays) - xy_px, axis=1)
     assert_allclose(systematic.focal_error_px(CAMERA, xy_px), moved_px, rtol=1e-9, atol=1e-9)
@@ -151,13 +176,21 @@ def test_a_focal_length_s_error_grows_from_the_principal_point(rng: np.random.Ge
 
 @law(dome_tracker.led_sigma_rad)
 @given(rng=SEEDS)
-def test_round_errors_of_leds_on_a_sphere_are_angles_from_the_camera(rng: np.random.Generator) -> None:
+def test_round_errors_of_leds_on_a_sphere_are_angles_from_the_camera(
+    rng: np.random.Generator,
+) -> None:
     """An error along the line from the bearing moves no direction. The least distance is the radius less the lever."""
-    along, sigma_m = units(rng, COUNT), rng.uniform(1e-4, 1e-3)
+    along = units(rng, COUNT)
+    sigma_m = rng.uniform(1e-4, 1e-3)
     leds = LedMap(np.arange(COUNT), 1.2 * along, np.zeros(3), np.full(3, 1.2), sigma_m=sigma_m)
     arm = Lever(np.array([0, 0, rng.uniform(0, 0.4)]), turn(rng))
     expected = np.full(COUNT, sigma_m / (1.2 - arm.camera_body_m[2]))
     assert_allclose(dome_tracker.led_sigma_rad(leds, arm), expected, rtol=1e-12, atol=0)
     radial = 1e-4 * np.einsum("ni,nj->nij", along, along)
     each = sigma_m**2 * np.tile(np.eye(3), (COUNT, 1, 1)) + radial
-    assert_allclose(dome_tracker.led_sigma_rad(replace(leds, covariance_m2=each), arm), expected, rtol=1e-9, atol=0)
+    assert_allclose(
+        dome_tracker.led_sigma_rad(replace(leds, covariance_m2=each), arm),
+        expected,
+        rtol=1e-9,
+        atol=0,
+    )

@@ -19,7 +19,11 @@ MEASURED = (np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))  
 
 
 def leds_in_view(
-    rng: np.random.Generator, body_from_lab: Rotation, lever: Lever, count: int, surface: tuple = SPHERE
+    rng: np.random.Generator,
+    body_from_lab: Rotation,
+    lever: Lever,
+    count: int,
+    surface: tuple = SPHERE,
 ) -> LedMap:
     """Lights where rays through random pixels meet a surface."""
     leds = LedMap(np.arange(count), np.zeros((count, 3)), *surface)
@@ -38,7 +42,9 @@ def true_rays(body_from_lab: Rotation, leds: LedMap, lever: Lever) -> np.ndarray
 def tilted(rng: np.random.Generator, tilt_rad: float) -> Rotation:
     about = rng.uniform(0, 2 * np.pi)
     axis = np.array([np.cos(about), np.sin(about), 0])
-    return Rotation.from_rotvec(tilt_rad * axis) * Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)])
+    return Rotation.from_rotvec(tilt_rad * axis) * Rotation.from_rotvec(
+        [0, 0, rng.uniform(0, 2 * np.pi)]
+    )
 
 
 def nudged(rng: np.random.Generator, rotation: Rotation, by_rad: float) -> Rotation:
@@ -91,7 +97,9 @@ def test_points_on_a_sphere_lie_on_it_and_on_their_rays() -> None:
 
 
 def test_a_camera_outside_its_sphere_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"camera 1\.3 m from the bearing; allowed: inside the sphere of 1\.2 m"):
+    with pytest.raises(
+        ValueError, match=r"camera 1\.3 m from the bearing; allowed: inside the sphere of 1\.2 m"
+    ):
         dome_map.on_sphere(np.array([[0.0, 0, 1]]), np.array([1.3, 0, 0]), 1.2)
 
 
@@ -103,7 +111,9 @@ def test_points_on_an_ellipsoid_satisfy_its_equation_and_lie_on_their_rays() -> 
     center, axes = MEASURED
     points = dome_map.on_surface(rays, origin, LedMap(np.arange(0), np.zeros((0, 3)), center, axes))
     # 1e-14: rounding of a quadratic's root.
-    np.testing.assert_allclose(np.sum(((points - center) / axes) ** 2, axis=1), 1, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        np.sum(((points - center) / axes) ** 2, axis=1), 1, rtol=0, atol=1e-14
+    )
     np.testing.assert_allclose(np.cross(points - origin, rays), 0, rtol=0, atol=1e-14)
     assert np.sum((points - origin) * rays, axis=1).min() > 0
 
@@ -137,7 +147,8 @@ def test_a_ray_that_misses_has_no_point() -> None:
 @pytest.mark.parametrize("lever", [LEVER, ASKEW])
 def test_the_jacobian_is_the_projection_s_derivative(lever: Lever) -> None:
     rng = np.random.default_rng(53)
-    truth, step = tilted(rng, 0.4), 1e-6
+    truth = tilted(rng, 0.4)
+    step = 1e-6
     leds = leds_in_view(rng, truth, lever, 6)
     unit_camera = Camera(2, 2, 1.0, (0.0, 0.0))
     cam_from_body = lever.cam_from_body
@@ -157,7 +168,9 @@ def test_the_jacobian_is_the_projection_s_derivative(lever: Lever) -> None:
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED], ids=["sphere", "ellipsoid"])
 @pytest.mark.parametrize("lever", [LEVER, ASKEW], ids=["axial", "askew"])
 @pytest.mark.parametrize("count", [2, 5, 20])
-def test_the_exact_solve_is_exact_from_five_degrees_off(count: int, lever: Lever, surface: tuple) -> None:
+def test_the_exact_solve_is_exact_from_five_degrees_off(
+    count: int, lever: Lever, surface: tuple
+) -> None:
     rng = np.random.default_rng(54)
     for _ in range(30):
         truth = tilted(rng, np.radians(30))
@@ -175,14 +188,19 @@ def test_the_exact_solve_is_exact_from_five_degrees_off(count: int, lever: Lever
         assert angle_rad(found, truth) < 1e-13 / min(separation_m / 0.1, 1)
 
 
-def monte_carlo(lever: Lever, count: int, surface: tuple, seed: int, trials: int) -> tuple[np.ndarray, np.ndarray]:
+def monte_carlo(
+    lever: Lever, count: int, surface: tuple, seed: int, trials: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors (trials, 3) in body axes and the covariances claimed, for centroids of 0.1 px."""
     rng = np.random.default_rng(seed)
-    errors, claimed = [], []
+    errors = []
+    claimed = []
     for _ in range(trials):
         truth = tilted(rng, np.radians(15))
         leds = leds_in_view(rng, truth, lever, count, surface)
-        pixels = dome_map.project(truth, leds.position_m, lever, CAMERA) + rng.normal(0, 0.1, (count, 2))
+        pixels = dome_map.project(truth, leds.position_m, lever, CAMERA) + rng.normal(
+            0, 0.1, (count, 2)
+        )
         found, spread = nearfield.rotation_only(
             CAMERA.rays(pixels),
             np.full(count, 0.1 / CAMERA.focal_px),
@@ -308,6 +326,9 @@ def test_lights_that_the_rays_cannot_be_are_refused() -> None:
 
 def test_a_camera_beyond_the_nearest_light_is_refused() -> None:
     leds = LedMap(np.arange(2), np.array([[0.0, 0, 0.35], [0, 0, 1.2]]), *SPHERE)
-    with pytest.raises(ImageError, match=r"0\.381 m from the bearing; allowed: less than the nearest LED's 0\.350 m"):
+    with pytest.raises(
+        ImageError,
+        match=r"0\.381 m from the bearing; allowed: less than the nearest LED's 0\.350 m",
+    ):
         dome_map.check_lever(leds, LEVER)
     dome_map.check_lever(LedMap(leds.id[1:], leds.position_m[1:], *SPHERE), LEVER)

@@ -91,13 +91,21 @@ def test_the_reference_s_whole_table(method: str, surface: str) -> None:
 @pytest.mark.parametrize("method", EXACT)
 def test_an_exact_method_is_exact_under_every_surface(method: str, surface: str) -> None:
     one = bench.GEOMETRIES[surface]
-    worst = max(np.abs(bench.errors_deg(method, one, tilt, 8, seed=71)).max() for tilt in one.tilts_deg[1::2])
+    worst = max(
+        np.abs(bench.errors_deg(method, one, tilt, 8, seed=71)).max()
+        for tilt in one.tilts_deg[1::2]
+    )
     # The issue's bar, degrees; a pattern's two fits close together cost the six-DoF solve some digits.
     assert worst < 1e-9
 
 
 def test_rays_on_the_true_sphere_are_exact_too() -> None:
-    assert np.abs(bench.errors_deg("ray_on_surface", bench.GEOMETRIES["sphere"], 30, 30, seed=72)).max() < 1e-11
+    assert (
+        np.abs(
+            bench.errors_deg("ray_on_surface", bench.GEOMETRIES["sphere"], 30, 30, seed=72)
+        ).max()
+        < 1e-11
+    )
 
 
 def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
@@ -135,8 +143,10 @@ def noise_alone(
 
     The errors are counted from what the method says without noise; for an exact one that is the truth.
     """
-    rng, one = np.random.default_rng(seed), bench.GEOMETRIES[surface]
-    errors, claimed = np.empty((trials, 3)), np.empty((trials, 3, 3))
+    rng = np.random.default_rng(seed)
+    one = bench.GEOMETRIES[surface]
+    errors = np.empty((trials, 3))
+    claimed = np.empty((trials, 3, 3))
     for n in range(trials):
         clean = bench.trial(one, tilt, rng)
         pixels = clean.pixels + noise_px * rng.standard_normal(clean.pixels.shape)
@@ -184,9 +194,12 @@ def test_the_place_unknown_costs_a_thousand_in_cross() -> None:
     """Reference section 5: .206 deg against .00021, the median sigma on one axis, five lights, .1 px, 15 deg."""
     sigma_deg = {}
     for method in ("pnp", "rotation_only"):
-        rng, one = np.random.default_rng(78), bench.GEOMETRIES["measured ellipsoid"]
+        rng = np.random.default_rng(78)
+        one = bench.GEOMETRIES["measured ellipsoid"]
         claimed = [bench.solved(method, one, bench.trial(one, 15, rng))[1] for _ in range(100)]
-        sigma_deg[method] = np.degrees(np.median([np.sqrt(np.trace(c[:2, :2]) / 2) for c in claimed]))
+        sigma_deg[method] = np.degrees(
+            np.median([np.sqrt(np.trace(c[:2, :2]) / 2) for c in claimed])
+        )
     # 100 patterns, whose sigmas spread by half: the median to 1.25 * .5 / sqrt(100) = 6 %; the exact one's by a tenth.
     assert sigma_deg["pnp"] == pytest.approx(0.206, rel=3 * 0.06)
     assert sigma_deg["rotation_only"] == pytest.approx(0.00021, rel=3 * 0.02)
@@ -216,16 +229,20 @@ def test_an_update_of_the_distances_leaves_a_small_share_of_the_error(
 @pytest.mark.parametrize("method", SOLVERS)
 def test_an_askew_camera_and_its_body_axes(method: str) -> None:
     """A camera turned on its mount sees the same: its body is the straight one's, turned, and so is the covariance."""
-    rng, one = np.random.default_rng(81), bench.GEOMETRIES["measured ellipsoid"]
+    rng = np.random.default_rng(81)
+    one = bench.GEOMETRIES["measured ellipsoid"]
     mount = Rotation.from_euler("xyz", [0.4, -0.7, 1.1])  # cam_from_body
     straight = bench.trial(one, 20, rng, 0.1)
-    rays, sigma = one.camera.rays(straight.pixels), np.full(5, 1e-5)
+    rays = one.camera.rays(straight.pixels)
+    sigma = np.full(5, 1e-5)
     here = rays, sigma, straight.leds.position_m, straight.leds
     cam_from_lab, spread_cam = SOLVERS[method](*here, one.lever, straight.start)
     askew = Lever(mount.inv().apply(one.lever.camera_body_m), mount)
     body_from_lab, spread_body = SOLVERS[method](*here, askew, mount.inv() * straight.start)
     # A sum of squares tells rounding to 1e-8 of a deviation; the six-DoF solve stops by it, in a flat valley.
-    assert (mount * body_from_lab * cam_from_lab.inv()).magnitude() < 1e-5 * np.sqrt(np.trace(spread_cam))
+    assert (mount * body_from_lab * cam_from_lab.inv()).magnitude() < 1e-5 * np.sqrt(
+        np.trace(spread_cam)
+    )
     in_camera = mount.as_matrix() @ spread_body @ mount.as_matrix().T
     np.testing.assert_allclose(in_camera, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max())
 
@@ -233,8 +250,12 @@ def test_an_askew_camera_and_its_body_axes(method: str) -> None:
 def test_what_a_method_cannot_do_is_refused() -> None:
     one = bench.GEOMETRIES["sphere"]
     clean = bench.trial(one, 10, np.random.default_rng(82))
-    rays, sigma, place = one.camera.rays(clean.pixels), np.full(5, 1e-5), clean.leds.position_m
-    with pytest.raises(ValueError, match="3 rays do not determine the camera's position; 4 are needed"):
+    rays = one.camera.rays(clean.pixels)
+    sigma = np.full(5, 1e-5)
+    place = clean.leds.position_m
+    with pytest.raises(
+        ValueError, match="3 rays do not determine the camera's position; 4 are needed"
+    ):
         nearfield.pnp(rays[:3], sigma[:3], place[:3], clean.leds, one.lever, clean.truth)
     same = np.tile(place[0], (5, 1))
     with pytest.raises(ValueError, match=r"position|parallel"):

@@ -11,7 +11,8 @@ from estimator.core.types import ra_dec_roll_rad
 from estimator.core.vectors import quaternion_xyzw
 
 ARCSEC_RAD = np.pi / 180 / 3600
-FOV_RAD, WIDTH_PX = np.radians(14.87), 659
+FOV_RAD = np.radians(14.87)
+WIDTH_PX = 659
 FOCAL_PX = (WIDTH_PX - 1) / 2 / np.tan(FOV_RAD / 2)
 
 
@@ -19,16 +20,21 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def in_field(rng: np.random.Generator, *shape: int, half: float = np.tan(FOV_RAD / 2)) -> np.ndarray:
+def in_field(
+    rng: np.random.Generator, *shape: int, half: float = np.tan(FOV_RAD / 2)
+) -> np.ndarray:
     """Directions about the boresight, uniform in a square field."""
-    return unit(np.concatenate([rng.uniform(-half, half, (*shape, 2)), np.ones((*shape, 1))], axis=-1))
+    return unit(
+        np.concatenate([rng.uniform(-half, half, (*shape, 2)), np.ones((*shape, 1))], axis=-1)
+    )
 
 
 # All stars' optimum; TRIAD's is that of two.
 OPTIMAL = {name: solver for name, solver in SOLVERS.items() if name != "triad"}
 COSTLY = "davenport", "svd", "esoq2"  # to compile
 CASES = {
-    name: pytest.param(solve, id=name, marks=[pytest.mark.slow] * (name in COSTLY)) for name, solve in SOLVERS.items()
+    name: pytest.param(solve, id=name, marks=[pytest.mark.slow] * (name in COSTLY))
+    for name, solve in SOLVERS.items()
 }
 every_solver = pytest.mark.parametrize("solve", CASES.values())
 every_optimal = pytest.mark.parametrize("solve", [CASES[name] for name in OPTIMAL])
@@ -44,7 +50,8 @@ def error_rad(a: Rotation, b: Rotation) -> float:
 def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
     rng = np.random.default_rng(40)
     for _ in range(100):
-        ref, truth = unit(rng.normal(size=(count, 3))), Rotation.random(rng=rng)
+        ref = unit(rng.normal(size=(count, 3)))
+        truth = Rotation.random(rng=rng)
         sigma = rng.uniform(1e-5, 1e-3, count)
         cam = unit(truth.apply(ref) + sigma[:, None] * rng.normal(size=(count, 3)))
         oracle, _ = Rotation.align_vectors(cam, ref, weights=1 / sigma**2)
@@ -56,7 +63,8 @@ def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
 def test_quest_is_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> None:
     rng = np.random.default_rng(41)
     for _ in range(100):
-        truth, seen = Rotation.random(rng=rng), in_field(rng, count)
+        truth = Rotation.random(rng=rng)
+        seen = in_field(rng, count)
         cam = unit(seen + 1e-5 * rng.normal(size=seen.shape))
         ref = truth.inv().apply(seen)
         oracle, _ = Rotation.align_vectors(cam, ref)
@@ -74,7 +82,10 @@ def test_directions_close_together_keep_their_digits(half_rad: float, solve: Sol
         truth = Rotation.random(rng=rng)
         cam = half_rad * np.array([[1, 0], [-0.5, 0.9], [-0.5, -0.9]]) * rng.uniform(0.5, 1, (3, 1))
         cam = unit(np.column_stack([cam, np.ones(3)]))
-        assert error_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth) < 20 * 2.2e-16 / half_rad
+        assert (
+            error_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth)
+            < 20 * 2.2e-16 / half_rad
+        )
 
 
 @pytest.mark.slow
@@ -82,7 +93,8 @@ def test_directions_close_together_keep_their_digits(half_rad: float, solve: Sol
 def test_directions_on_one_great_circle_are_enough(solve: Solver) -> None:
     rng = np.random.default_rng(43)
     for _ in range(50):
-        angle, truth = rng.uniform(0, 0.2, 6), Rotation.random(rng=rng)
+        angle = rng.uniform(0, 0.2, 6)
+        truth = Rotation.random(rng=rng)
         cam = np.column_stack([np.sin(angle), 1e-9 * rng.normal(size=6), np.cos(angle)])
         cam = unit(cam)
         # 1e-13: rounding over a spread of 0.06 rad.
@@ -113,7 +125,9 @@ def test_half_turns_about_any_axis(axis: str, short_of_rad: float, solve: Solver
             ref = in_field(rng, count) if count == 8 else unit(rng.normal(size=(count, 3)))
             cross = np.linalg.norm(np.cross(ref[0], ref[1]))
             # Rounding over the angle between the directions.
-            assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14 / min(cross, 0.1)
+            assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14 / min(
+                cross, 0.1
+            )
 
 
 QUARTER_TURNS = list(Rotation.create_group("O"))
@@ -122,7 +136,9 @@ QUARTER_TURNS = list(Rotation.create_group("O"))
 @every_solver
 @pytest.mark.parametrize("truth", QUARTER_TURNS, ids=range(24))
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_axes_themselves_in_all_24_orientations_of_a_cube(truth: Rotation, count: int, solve: Solver) -> None:
+def test_the_axes_themselves_in_all_24_orientations_of_a_cube(
+    truth: Rotation, count: int, solve: Solver
+) -> None:
     # Exact zeros and ones: where a quaternion's parts vanish altogether.
     ref = np.eye(3)[:count]
     assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14  # rounding
@@ -155,7 +171,8 @@ def test_parallel_directions_are_refused(vectors: np.ndarray, solve: Solver) -> 
 
 @every_solver
 def test_stars_that_are_one_in_the_camera_or_one_in_the_catalog_are_refused(solve: Solver) -> None:
-    distinct, identical = np.eye(3)[:2], np.eye(3)[[0, 0]]
+    distinct = np.eye(3)[:2]
+    identical = np.eye(3)[[0, 0]]
     for cam, ref in ((distinct, identical), (identical, distinct)):
         with pytest.raises(ValueError, match="all vectors are parallel"):
             solve(cam, ref, np.ones(2))
@@ -229,7 +246,8 @@ def test_all_methods_give_the_same_optimum_on_the_same_data(case: str) -> None:
         answers = Rotation.concatenate([solve(cam, ref, sigma) for solve in solvers.values()])
         assert (answers * answers[0].inv()).magnitude().max() < 1e-10
         # An optimum: the gradient of Wahba's loss, sum(w a x cam), vanishes to the rounding of its terms.
-        rotated, weight = answers[0].apply(ref), sigma**-2 / np.sum(sigma**-2)
+        rotated = answers[0].apply(ref)
+        weight = sigma**-2 / np.sum(sigma**-2)
         assert np.abs(weight @ np.cross(rotated, cam)).max() < 4e-16
 
 
@@ -243,7 +261,8 @@ RAW = {
 
 def davenport_matrix(B: np.ndarray) -> np.ndarray:
     """K of Davenport's q-method for active quaternions (x, y, z, w): q' K q = tr(A(q) B')."""
-    S, trace = B + B.T, np.trace(B)
+    S = B + B.T
+    trace = np.trace(B)
     z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
     return np.block([[S - trace * np.eye(3), z[:, None]], [z[None], np.array([[trace]])]])
 
@@ -255,7 +274,8 @@ def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_tur
     # Over the whole sky the bare methods need no refinement: K q = x q, x the greatest eigenvalue (numpy's).
     rng = np.random.default_rng(51)
     for _ in range(200):
-        ref, sigma = unit(rng.normal(size=(6, 3))), rng.uniform(1e-4, 1e-2, 6)
+        ref = unit(rng.normal(size=(6, 3)))
+        sigma = rng.uniform(1e-4, 1e-2, 6)
         axis = unit(rng.normal(size=3))
         truth = Rotation.from_rotvec(np.pi * axis) if half_turn else Rotation.random(rng=rng)
         cam = unit(truth.apply(ref) + sigma[:, None] * rng.normal(size=ref.shape))
@@ -283,30 +303,40 @@ def test_each_bare_method_stands_at_half_a_turn(name: str, axis: str) -> None:
 @pytest.mark.slow
 def test_no_method_leaves_its_arrays() -> None:
     """NumPy refuses an index beyond an array; compiled code would read and write what lies behind it."""
-    plain, rng = interpreted("estimator.attitude.wahba"), np.random.default_rng(56)
+    plain = interpreted("estimator.attitude.wahba")
+    rng = np.random.default_rng(56)
     for truth in [*QUARTER_TURNS, *Rotation.random(20, rng=rng)]:
         ref = unit(rng.normal(size=(4, 3)))
-        cam, weight = unit(truth.apply(ref) + 1e-4 * rng.normal(size=ref.shape)), rng.uniform(1, 9, 4)
+        cam = unit(truth.apply(ref) + 1e-4 * rng.normal(size=ref.shape))
+        weight = rng.uniform(1, 9, 4)
         B = plain.profile(cam, ref, weight)
         np.testing.assert_allclose(B, kernel.profile(cam, ref, weight), rtol=0, atol=1e-15)
         for name in RAW:
             # Of a raw method the rounding is over the gap of the two largest eigenvalues.
             found = getattr(plain, f"raw_{name}")(B)
             np.testing.assert_allclose(found, RAW[name](B), rtol=0, atol=1e-10, err_msg=name)
-        for one, other in zip(plain.wahba(cam, ref, weight), kernel.wahba(cam, ref, weight), strict=True):
+        for one, other in zip(
+            plain.wahba(cam, ref, weight), kernel.wahba(cam, ref, weight), strict=True
+        ):
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-13)
         np.testing.assert_allclose(
-            plain.raw_triad(cam, ref, weight), kernel.raw_triad(cam, ref, weight), rtol=0, atol=1e-13
+            plain.raw_triad(cam, ref, weight),
+            kernel.raw_triad(cam, ref, weight),
+            rtol=0,
+            atol=1e-13,
         )
 
 
 @pytest.mark.slow
 def test_the_bare_quest_loses_in_a_narrow_field_what_the_polish_brings_back() -> None:
-    rng, worst = np.random.default_rng(52), 0.0
+    rng = np.random.default_rng(52)
+    worst = 0.0
     for _ in range(50):
         cam, ref, sigma = same_data("two close stars", rng)
         B = np.einsum("n,ni,nj->ij", sigma**-2 / np.sum(sigma**-2), cam, ref)
-        worst = max(worst, error_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma)))
+        worst = max(
+            worst, error_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma))
+        )
     assert worst > 1e-10  # what the methods are to agree to
 
 
@@ -317,7 +347,8 @@ def test_triad_of_a_perfect_star_and_another_is_black_s_triad() -> None:
     # Black 1964: the first star's direction is met exactly; the second sets the plane alone.
     rng = np.random.default_rng(53)
     for _ in range(50):
-        ref, truth = unit(rng.normal(size=(2, 3))), Rotation.random(rng=rng)
+        ref = unit(rng.normal(size=(2, 3)))
+        truth = Rotation.random(rng=rng)
         cam = unit(truth.apply(ref) + 0.01 * rng.normal(size=(2, 3)))
 
         def triad_of(v: np.ndarray) -> np.ndarray:
@@ -329,11 +360,14 @@ def test_triad_of_a_perfect_star_and_another_is_black_s_triad() -> None:
         assert error_rad(SOLVERS["triad"](cam, ref, np.array([1.0, 1e7])), black) < 1e-14
 
 
-@pytest.mark.parametrize("half", [np.tan(FOV_RAD / 2), 5.0], ids=["a star tracker's field", "nearly half the sky"])
+@pytest.mark.parametrize(
+    "half", [np.tan(FOV_RAD / 2), 5.0], ids=["a star tracker's field", "nearly half the sky"]
+)
 def test_triad_rests_on_the_pair_with_the_least_worst_variance(half: float) -> None:
     rng = np.random.default_rng(54)
     for _ in range(50):
-        cam, sigma = in_field(rng, 8, half=half), rng.uniform(1e-5, 1e-4, 8)
+        cam = in_field(rng, 8, half=half)
+        sigma = rng.uniform(1e-5, 1e-4, 8)
 
         def worst(pair: tuple[int, int]) -> float:
             rows = list(pair)
@@ -360,10 +394,16 @@ def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
     for _ in range(50):
         cam, ref, sigma = same_data("many stars", rng)
         found, spread = kernel.wahba(cam, ref, sigma**-2)
-        assert error_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13  # rounding over the field
+        assert (
+            error_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13
+        )  # rounding over the field
         assert np.abs(found @ found.T - np.eye(3)).max() < 1e-15
-        information = np.einsum("n,nij->ij", sigma**-2, np.eye(3) - cam[:, :, None] * cam[:, None, :])
-        assert np.abs(spread @ information - np.eye(3)).max() < 1e-11  # rounding over its condition, 300
+        information = np.einsum(
+            "n,nij->ij", sigma**-2, np.eye(3) - cam[:, :, None] * cam[:, None, :]
+        )
+        assert (
+            np.abs(spread @ information - np.eye(3)).max() < 1e-11
+        )  # rounding over its condition, 300
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -372,20 +412,31 @@ def test_quaternions_and_matrices_are_scipy_s(axis: str, angle_rad: float) -> No
     rotation = Rotation.from_rotvec(angle_rad * unit(np.array(AXES[axis], dtype=float)))
     found = quaternion_xyzw(rotation.as_matrix())
     # Either sign is the same turn.
-    assert min(np.abs(found - rotation.as_quat()).max(), np.abs(found + rotation.as_quat()).max()) < 1e-15
-    assert np.abs(kernel.matrix_of(tuple(3 * rotation.as_quat())) - rotation.as_matrix()).max() < 1e-15
+    assert (
+        min(np.abs(found - rotation.as_quat()).max(), np.abs(found + rotation.as_quat()).max())
+        < 1e-15
+    )
+    assert (
+        np.abs(kernel.matrix_of(tuple(3 * rotation.as_quat())) - rotation.as_matrix()).max() < 1e-15
+    )
 
 
-def monte_carlo(count: int, half: float, trials: int, seed: int, name: str = "quest") -> tuple[np.ndarray, np.ndarray]:
+def monte_carlo(
+    count: int, half: float, trials: int, seed: int, name: str = "quest"
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors (trials, 3) in camera axes and the covariances claimed, at 0.1 px a star and axis."""
     rng = np.random.default_rng(seed)
     sigma = np.full(count, 0.1 / FOCAL_PX)
-    errors, claimed = [], []
+    errors = []
+    claimed = []
     for _ in range(trials):
-        truth, seen = Rotation.random(rng=rng), in_field(rng, count, half=half)
+        truth = Rotation.random(rng=rng)
+        seen = in_field(rng, count, half=half)
         tangent = seen[:, :2] / seen[:, 2:] + sigma[:, None] * rng.normal(size=(count, 2))
         cam = unit(np.column_stack([tangent, np.ones(count)]))
-        errors.append((SOLVERS[name](cam, truth.inv().apply(seen), sigma) * truth.inv()).as_rotvec())
+        errors.append(
+            (SOLVERS[name](cam, truth.inv().apply(seen), sigma) * truth.inv()).as_rotvec()
+        )
         claimed.append(covariance(cam, sigma, name))
     return np.array(errors), np.array(claimed)
 
@@ -454,7 +505,9 @@ def test_right_ascension_declination_and_roll_by_hand(case: str) -> None:
 
 def from_angles(ra: float, dec: float, roll: float) -> Rotation:
     """cam_from_icrs by three turns: Z by the right ascension, Y by the declination, then roll about the sight."""
-    to_sight = Rotation.from_euler("ZYX", [ra, -dec, -roll])  # intrinsic: carries +X to the sight, +Z to up
+    to_sight = Rotation.from_euler(
+        "ZYX", [ra, -dec, -roll]
+    )  # intrinsic: carries +X to the sight, +Z to up
     axes = to_sight.apply([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     return Rotation.from_matrix(axes)
 

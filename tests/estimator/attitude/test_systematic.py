@@ -30,7 +30,8 @@ def leds_in_view(count: int, seed: int) -> Floats:
     tangent = rng.uniform(-1, 1, (count, 2)) * [0.085, 0.062]
     rays = LEVER.cam_from_body.inv().apply(np.column_stack([tangent, np.ones(count)]))
     along = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    b, c = along @ LEVER.camera_body_m, LEVER.camera_body_m @ LEVER.camera_body_m - 1.2**2
+    b = along @ LEVER.camera_body_m
+    c = LEVER.camera_body_m @ LEVER.camera_body_m - 1.2**2
     return TRUTH.inv().apply(LEVER.camera_body_m + (-b + np.sqrt(b**2 - c))[:, None] * along)
 
 
@@ -42,7 +43,12 @@ def seen(position_m: Floats) -> Floats:
 def solved(rays: Floats, sigma_rad: Floats, position_m: Floats) -> Floats:
     """(3,) error of the rotation in camera axes, from rays and believed places."""
     found, _ = rotation_only(
-        rays, sigma_rad, position_m, LedMap(np.arange(len(rays)), position_m, *SURFACE), LEVER, TRUTH
+        rays,
+        sigma_rad,
+        position_m,
+        LedMap(np.arange(len(rays)), position_m, *SURFACE),
+        LEVER,
+        TRUTH,
     )
     return (LEVER.cam_from_body * found * TRUTH.inv() * LEVER.cam_from_body.inv()).as_rotvec()
 
@@ -64,10 +70,16 @@ def unit(vectors: Floats) -> Floats:
 
 
 def test_equal_errors_have_the_covariance_of_the_solver() -> None:
-    position_m, sigma = leds_in_view(8, 1), np.full(8, 3e-5)
+    position_m = leds_in_view(8, 1)
+    sigma = np.full(8, 3e-5)
     view = view_of(position_m)
     _, covariance = rotation_only(
-        unit(seen(position_m)), sigma, position_m, LedMap(np.arange(8), position_m, *SURFACE), LEVER, TRUTH
+        unit(seen(position_m)),
+        sigma,
+        position_m,
+        LedMap(np.arange(8), position_m, *SURFACE),
+        LEVER,
+        TRUTH,
     )
     R = LEVER.cam_from_body.as_matrix()
     ours = systematic.from_independent(view, sigma, systematic.isotropic(sigma))
@@ -77,22 +89,31 @@ def test_equal_errors_have_the_covariance_of_the_solver() -> None:
 @pytest.mark.slow
 def test_own_errors_that_differ_by_led_and_direction_have_the_claimed_covariance() -> None:
     """LEDs believed off along one axis of the lab, by 0.1 mm to 1 mm, and solved with equal weights."""
-    position_m, sigma = leds_in_view(7, 2), np.full(7, 1e-4)
+    position_m = leds_in_view(7, 2)
+    sigma = np.full(7, 1e-4)
     rng = np.random.default_rng(3)
     direction = unit(rng.normal(size=(7, 3))) * rng.uniform(1e-4, 1e-3, (7, 1))
     covariance_m2 = np.einsum("ni,nj->nij", direction, direction)
     view = view_of(position_m)
     by_place = view.gradient @ (LEVER.cam_from_body * TRUTH).as_matrix()
-    claimed = systematic.from_independent(view, sigma, by_place @ covariance_m2 @ np.moveaxis(by_place, 1, 2))
+    claimed = systematic.from_independent(
+        view, sigma, by_place @ covariance_m2 @ np.moveaxis(by_place, 1, 2)
+    )
     rays = unit(seen(position_m))
-    errors = np.array([solved(rays, sigma, position_m + direction * rng.standard_normal((7, 1))) for _ in range(800)])
+    errors = np.array(
+        [
+            solved(rays, sigma, position_m + direction * rng.standard_normal((7, 1)))
+            for _ in range(800)
+        ]
+    )
     assert_covariance(errors, claimed)
 
 
 @pytest.mark.slow
 def test_common_errors_have_the_claimed_covariance() -> None:
     """A map shifted and turned as a whole, and a focal length that is wrong."""
-    position_m, sigma = leds_in_view(7, 4), np.full(7, 1e-4)
+    position_m = leds_in_view(7, 4)
+    sigma = np.full(7, 1e-4)
     rng = np.random.default_rng(5)
     fields = np.array([np.tile([5e-4, 0, 0], (7, 1)), 4e-4 * np.cross([0.3, 0, 1.0], position_m)])
     view = view_of(position_m)
@@ -134,15 +155,22 @@ def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
 
     def tracker_of(seed: int) -> tuple[DomeTracker, Floats]:
         rng = np.random.default_rng(seed)
-        drawn = rng.multivariate_normal(np.zeros(3), own, len(position_m)) + shift * rng.standard_normal(3)
+        drawn = rng.multivariate_normal(
+            np.zeros(3), own, len(position_m)
+        ) + shift * rng.standard_normal(3)
         map_ = LedMap(
             *(np.arange(len(position_m)), position_m + drawn, *SURFACE, None),
             sigma_m=float(np.sqrt(np.trace(own) / 3)),
             covariance_m2=np.tile(own, (len(position_m), 1, 1)),
             common_m=np.array([np.tile(s, (len(position_m), 1)) for s in np.diag(shift)]),
         )
-        camera = Camera(1600, 1200, CAMERA.focal_px * (1 + focal * rng.standard_normal()), CAMERA.center_px)
-        camera = Camera(*(camera.width_px, camera.height_px, camera.focal_px, camera.center_px), focal_sigma=focal)
+        camera = Camera(
+            1600, 1200, CAMERA.focal_px * (1 + focal * rng.standard_normal()), CAMERA.center_px
+        )
+        camera = Camera(
+            *(camera.width_px, camera.height_px, camera.focal_px, camera.center_px),
+            focal_sigma=focal,
+        )
         xy_px = CAMERA.pixels(seen(position_m))
         xy_px = xy_px[np.nan_to_num(xy_px, nan=-1).min(axis=1) > 5]
         xy_px = xy_px[(xy_px < [1595, 1195]).all(axis=1)]
@@ -164,9 +192,11 @@ def test_the_star_tracker_claims_the_error_of_its_focal_length(focal: float) -> 
     cam_from_ref = Rotation.from_euler("xyz", [80, 10, 30], degrees=True)
     rows, exact_px = tracker.field_matcher.in_field(camera, cam_from_ref)
     chosen = exact_px[:, 0] > 900
-    rows, exact_px = rows[chosen], exact_px[chosen]
+    rows = rows[chosen]
+    exact_px = exact_px[chosen]
     assert len(rows) >= 5
-    rng, squares = np.random.default_rng(8), []
+    rng = np.random.default_rng(8)
+    squares = []
     for _ in range(1000):
         scale = 1 + focal * rng.standard_normal()
         xy_px = camera.center_px + (exact_px - camera.center_px) * scale

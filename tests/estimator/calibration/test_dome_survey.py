@@ -28,18 +28,27 @@ AFIT_LEVER = Lever(np.array([0.003, -0.002, 15 * INCH]), Rotation.from_rotvec([0
 SMALL = Camera(800, 600, 900.0, (398.0, 303.0), (-0.08, 0.03, 0.001, -0.0007, 0.0))
 
 
-def pixels(body_from_lab: Rotation, place_m: np.ndarray, lever: Lever, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def pixels(
+    body_from_lab: Rotation, place_m: np.ndarray, lever: Lever, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and whether they are on the chip, by trigonometry of its own: angle off axis, azimuth, Brown's law."""
     q = lever.cam_from_body.apply(body_from_lab.apply(place_m) - lever.camera_body_m)
     off = np.arccos(q[:, 2] / np.linalg.norm(q, axis=1))
     azimuth = np.arctan2(q[:, 1], q[:, 0])
     ahead = off < 0.7
     r = np.tan(np.where(ahead, off, 0))
-    x, y = r * np.cos(azimuth), r * np.sin(azimuth)
+    x = r * np.cos(azimuth)
+    y = r * np.sin(azimuth)
     k1, k2, p1, p2, k3 = camera.distortion
     radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
-    u = camera.focal_px * (x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2)) + camera.center_px[0]
-    v = camera.focal_px * (y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y) + camera.center_px[1]
+    u = (
+        camera.focal_px * (x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2))
+        + camera.center_px[0]
+    )
+    v = (
+        camera.focal_px * (y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y)
+        + camera.center_px[1]
+    )
     on_chip = ahead & (abs(u - 799.5 * camera.width_px / 1600) < camera.width_px / 2)
     on_chip &= abs(v - camera.height_px / 2 + 0.5) < camera.height_px / 2
     return np.column_stack([u, v]), on_chip
@@ -51,21 +60,29 @@ def dome(count: int, half_deg: float) -> np.ndarray:
     z = 1 - n / count * (1 - np.cos(np.radians(half_deg)))
     turn = n * np.pi * (3 - np.sqrt(5))
     along = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
-    return dome_map.on_surface(along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M))
+    return dome_map.on_surface(
+        along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M)
+    )
 
 
 def attitudes(rng: np.random.Generator, count: int, tilt_deg: float) -> Rotation:
     """Tilts evenly over the cap, all yaws."""
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     about = rng.uniform(0, 2 * np.pi, count)
-    lean = Rotation.from_rotvec(tilt[:, None] * np.column_stack([np.cos(about), np.sin(about), 0 * about]))
+    lean = Rotation.from_rotvec(
+        tilt[:, None] * np.column_stack([np.cos(about), np.sin(about), 0 * about])
+    )
     return lean * Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, count)[:, None])
 
 
 def small_dome(seed: int, frames: int = 40) -> tuple[np.ndarray, Rotation, Lever]:
     rng = np.random.default_rng(seed)
     place = dome(60, 42) + rng.normal(0, 0.005, (60, 3))
-    return place, attitudes(rng, frames, 25), Lever(np.array([0.02, -0.03, 0.38]), AFIT_LEVER.cam_from_body)
+    return (
+        place,
+        attitudes(rng, frames, 25),
+        Lever(np.array([0.02, -0.03, 0.38]), AFIT_LEVER.cam_from_body),
+    )
 
 
 def filmed(
@@ -101,7 +118,9 @@ def small_survey(
     rng = np.random.default_rng(start_seed)
     start = leds_of(place + rng.normal(0, 0.002, place.shape))
     believed = Lever(lever.camera_body_m + rng.normal(0, 0.005, 3), lever.cam_from_body)
-    camera = replace(SMALL, focal_px=1.01 * SMALL.focal_px, center_px=(399.5, 299.5), distortion=(0.0,) * 5)
+    camera = replace(
+        SMALL, focal_px=1.01 * SMALL.focal_px, center_px=(399.5, 299.5), distortion=(0.0,) * 5
+    )
     return survey(frames, start, believed, camera, fit_distortion=True, **how), place, turned, lever
 
 
@@ -124,16 +143,15 @@ def test_the_derivatives_are_the_residuals_slopes(block: str) -> None:
     seen = dome_survey._collect(frames, len(place))
     bundle = dome_survey._start_bundle(frames, leds_of(place), lever, SMALL, 8)
     exact = getattr(ba.linearize(bundle, seen), block)
-    lights, size, first = (
-        3 * len(place),
-        3 * 3 + 3 + 8,
-        {"by_led": 0, "by_rotation": 0, "by_shared": 9}[block],
-    )
+    lights = 3 * len(place)
+    size = 3 * 3 + 3 + 8
+    first = {"by_led": 0, "by_rotation": 0, "by_shared": 9}[block]
     for m in [0, len(seen.led) // 2, len(seen.led) - 1]:
         rows = {"by_led": seen.led, "by_rotation": seen.frame, "by_shared": 0 * seen.led}[block]
         one = seen.take([m])
         for n in range(exact.shape[2]):
-            led, rest = np.zeros(lights), np.zeros(size)
+            led = np.zeros(lights)
+            rest = np.zeros(size)
             column = first + 3 * rows[m] + n
             # 1 mm, 1 mrad and 1e-3 of the lens's numbers would bend; 1e-6 rounds at 1e-9 of the slopes.
             h = 1e-3 if block == "by_shared" and 3 <= n < 6 else 1e-6
@@ -161,7 +179,9 @@ def test_the_free_moves_change_no_pixel() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [{}, {"loss": "cauchy"}, {"known_length": (0, 7, 0.5)}, {"reference_frame": 4}])
+@pytest.mark.parametrize(
+    "how", [{}, {"loss": "cauchy"}, {"known_length": (0, 7, 0.5)}, {"reference_frame": 4}]
+)
 def test_noise_free_frames_give_all_back(how: dict) -> None:
     found, place, turned, lever = small_survey(0.0, 5, **how)
     assert found.status == "converged"
@@ -171,9 +191,14 @@ def test_noise_free_frames_give_all_back(how: dict) -> None:
     size, turn = size_and_turn(found.leds.position_m[found.surveyed], place[found.surveyed])
     # 1e-9 of a meter and a half, as the issue asks; the rest to the same.
     np.testing.assert_allclose(
-        size * turn.apply(found.leds.position_m[found.surveyed]), place[found.surveyed], rtol=0, atol=1e-9
+        size * turn.apply(found.leds.position_m[found.surveyed]),
+        place[found.surveyed],
+        rtol=0,
+        atol=1e-9,
     )
-    np.testing.assert_allclose(size * found.lever.camera_body_m, lever.camera_body_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        size * found.lever.camera_body_m, lever.camera_body_m, rtol=0, atol=1e-9
+    )
     back = found.body_from_lab * turn.inv() * turned.inv()
     assert back.magnitude().max() < 1e-9
     assert found.camera.focal_px == pytest.approx(SMALL.focal_px, rel=1e-9)
@@ -187,10 +212,14 @@ def test_a_known_length_sets_the_size_of_lights_and_lever_and_nothing_else() -> 
     half = np.linalg.norm(place[2] - place[9]) / 2
     by_length, *_ = small_survey(0.01, 6, known_length=(2, 9, half))
     kept = by_map.surveyed
-    assert np.linalg.norm(by_length.leds.position_m[2] - by_length.leds.position_m[9]) == pytest.approx(half)
+    assert np.linalg.norm(
+        by_length.leds.position_m[2] - by_length.leds.position_m[9]
+    ) == pytest.approx(half)
     # Both end at one minimum; the steps stop below 1e-6 of a standard deviation, 1e-9 of a meter here.
     np.testing.assert_allclose(by_length.leds.position_m[kept], place[kept] / 2, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(by_length.lever.camera_body_m, by_map.lever.camera_body_m / 2, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        by_length.lever.camera_body_m, by_map.lever.camera_body_m / 2, rtol=0, atol=1e-8
+    )
     assert (by_length.body_from_lab * by_map.body_from_lab.inv()).magnitude().max() < 1e-8
     assert by_length.camera.focal_px == pytest.approx(by_map.camera.focal_px, rel=1e-8)
 
@@ -213,35 +242,52 @@ def test_a_reference_frame_keeps_its_attitude() -> None:
     frames = filmed(np.random.default_rng(9), turned, place, lever, SMALL, 0.02)
     assert (found.body_from_lab[4] * frames[4].body_from_lab.inv()).magnitude() < 1e-14
     # Held, it has no variance; the others have.
-    sigma = np.sqrt(np.maximum(np.einsum("fii->fi", found.attitude_covariance_rad2), 0))  # rounding about none
+    sigma = np.sqrt(
+        np.maximum(np.einsum("fii->fi", found.attitude_covariance_rad2), 0)
+    )  # rounding about none
     assert sigma[4].max() < 1e-3 * np.delete(sigma, 4, axis=0).min()
 
 
 def gauged(
-    start: np.ndarray, kept: np.ndarray, length_known: bool, place: np.ndarray, turned: Rotation, lever: Lever
+    start: np.ndarray,
+    kept: np.ndarray,
+    length_known: bool,
+    place: np.ndarray,
+    turned: Rotation,
+    lever: Lever,
 ) -> tuple[np.ndarray, Rotation, np.ndarray]:
     """The truth, turned and grown as the survey says it holds the gauge: least squares onto the start map."""
     turn = Rotation.align_vectors(start[kept], place[kept])[0]
-    size = 1.0 if length_known else np.sum(start[kept] ** 2) / np.sum(start[kept] * turn.apply(place[kept]))
+    size = (
+        1.0
+        if length_known
+        else np.sum(start[kept] ** 2) / np.sum(start[kept] * turn.apply(place[kept]))
+    )
     return size * turn.apply(place), turned * turn.inv(), size * lever.camera_body_m
 
 
 @pytest.mark.parametrize(
     ("sigma_m", "length_known"),
-    [pytest.param(np.inf, False, marks=pytest.mark.slow), pytest.param(0.002, True, marks=pytest.mark.long)],
+    [
+        pytest.param(np.inf, False, marks=pytest.mark.slow),
+        pytest.param(0.002, True, marks=pytest.mark.long),
+    ],
     ids=["start and its size", "measured and length"],
 )
 def test_the_covariance_is_the_scatter(sigma_m: float, length_known: bool) -> None:
     place, turned, lever = small_dome(21)
     rng = np.random.default_rng(22)
     length = (0, 7, float(np.linalg.norm(place[0] - place[7]))) if length_known else None
-    runs, distance = 20, []
+    runs = 20
+    distance = []
     for _ in range(runs):
         start = place + rng.normal(0, 0.002, place.shape)
         frames = filmed(rng, turned, place, lever, SMALL, 0.01, imu_deg=0.1)
         found = survey(frames, leds_of(start), lever, SMALL, length, leds_sigma_m=sigma_m)
         kept = found.surveyed
-        true_place, true_turned, true_lever = gauged(start, kept, length_known, place, turned, lever)
+        true_place, true_turned, true_lever = gauged(
+            start, kept, length_known, place, turned, lever
+        )
         lens = [found.camera.focal_px, *found.camera.center_px]
         both = [
             ([found.lever.camera_body_m - true_lever], [found.lever_covariance_m2]),
@@ -249,7 +295,9 @@ def test_the_covariance_is_the_scatter(sigma_m: float, length_known: bool) -> No
             ((found.leds.position_m - true_place)[kept], found.led_covariance_m2[kept]),
             ((found.body_from_lab * true_turned.inv()).as_rotvec(), found.attitude_covariance_rad2),
         ]
-        distance.append([np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(c), e)) / 3 for e, c in both])
+        distance.append(
+            [np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(c), e)) / 3 for e, c in both]
+        )
     lever_ratio, lens_ratio, led_ratio, turn_ratio = np.mean(distance, axis=0)
     # Chi-square of 3 degrees over 3, mean of 20: 1 with deviation sqrt(2 / 60) = 0.183; three of them. Lights and
     # attitudes average over many besides, but share the weak moves: their means scatter less, by an unknown amount.
@@ -257,12 +305,16 @@ def test_the_covariance_is_the_scatter(sigma_m: float, length_known: bool) -> No
         assert ratio == pytest.approx(1, abs=0.55)
 
 
-def misnamed(rng: np.random.Generator, frames: list[DomeFrame], lights: int, share: float) -> list[DomeFrame]:
+def misnamed(
+    rng: np.random.Generator, frames: list[DomeFrame], lights: int, share: float
+) -> list[DomeFrame]:
     """The same frames with a share of their lights called by another's row."""
     wrong = []
     for frame in frames:
         other = (frame.led + rng.integers(1, lights, len(frame.led))) % lights
-        wrong.append(replace(frame, led=np.where(rng.random(len(frame.led)) < share, other, frame.led)))
+        wrong.append(
+            replace(frame, led=np.where(rng.random(len(frame.led)) < share, other, frame.led))
+        )
     return wrong
 
 
@@ -287,8 +339,12 @@ def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
     assert wrong <= told
     # Some right ones go too: 5 sigma in two dimensions are 4e-6 of Gaussian noise, so none of a thousand.
     assert all(frames[k].led[row] != mixed[k].led[row] for k, row in told)
-    assert robust.misfit == pytest.approx(1, abs=4 / np.sqrt(2 * 700))  # some 700 degrees of freedom
-    rms = [np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2)) for found in (clean, robust)]
+    assert robust.misfit == pytest.approx(
+        1, abs=4 / np.sqrt(2 * 700)
+    )  # some 700 degrees of freedom
+    rms = [
+        np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2)) for found in (clean, robust)
+    ]
     # 5 % fewer sightings: some 3 % more error; a fifth leaves room for chance.
     assert rms[1] < 1.2 * rms[0]
 
@@ -312,7 +368,11 @@ def test_a_light_seen_once_stays_at_its_start_and_is_not_called_surveyed() -> No
     once = [frames[0]]
     for frame in frames[1:]:
         rest = frame.led != chosen
-        once.append(replace(frame, led=frame.led[rest], xy_px=frame.xy_px[rest], sigma_px=frame.sigma_px[rest]))
+        once.append(
+            replace(
+                frame, led=frame.led[rest], xy_px=frame.xy_px[rest], sigma_px=frame.sigma_px[rest]
+            )
+        )
     start = leds_of(place + rng.normal(0, 0.002, place.shape))
     found = survey(once, start, lever, SMALL, leds_sigma_m=0.002)
     assert not found.surveyed[chosen]
@@ -328,7 +388,9 @@ def test_a_light_seen_often_from_one_place_has_no_distance() -> None:
     turned = Rotation.from_euler("z", np.linspace(0, 6, 20)[:, None])
     lever = Lever(np.array([0.0, 0.0, 0.38]), Rotation.identity())
     frames = filmed(np.random.default_rng(36), turned, place, lever, SMALL, 0.1, imu_deg=0.0)
-    with pytest.raises(ValueError, match=r"^survey: 0 usable coordinates for \d+ unknowns; take more frames$"):
+    with pytest.raises(
+        ValueError, match=r"^survey: 0 usable coordinates for \d+ unknowns; take more frames$"
+    ):
         survey(frames, leds_of(place), lever, SMALL)
 
 
@@ -337,14 +399,18 @@ def test_frames_in_two_groups_are_refused() -> None:
     rng = np.random.default_rng(38)
     near = attitudes(rng, 16, 4)
     narrow = replace(SMALL, focal_px=2500.0)
-    apart = [near[:8] * Rotation.from_rotvec([0.45, 0, 0]), near[8:] * Rotation.from_rotvec([-0.45, 0, 0])]
+    apart = [
+        near[:8] * Rotation.from_rotvec([0.45, 0, 0]),
+        near[8:] * Rotation.from_rotvec([-0.45, 0, 0]),
+    ]
     crowd = dome(600, 42)
     frames = filmed(rng, Rotation.concatenate(apart), crowd, lever, narrow, 0.1)
     # The great lean comes first, in the lab: each group stays at its own side of the dome, whatever its yaws.
     seen = [set(frame.led.tolist()) for frame in frames]
     assert all(len(one & other) < 2 for one in seen[:8] for other in seen[8:])
     with pytest.raises(
-        ValueError, match=r"the frames are not connected; 8 of 16, frame \d+ first, share fewer than two"
+        ValueError,
+        match=r"the frames are not connected; 8 of 16, frame \d+ first, share fewer than two",
     ):
         survey(frames, leds_of(crowd), lever, narrow)
 
@@ -361,7 +427,10 @@ def test_frames_in_two_groups_are_refused() -> None:
         ({"known_length": (59, 3, 0.1)}, r"known_length ends at LED row 59, which is not surveyed"),
         ({"reference_frame": 40}, r"reference_frame is 40; allowed: 0 to 39"),
         ({"leds_sigma_m": 0.0}, r"leds_sigma_m is 0.0; allowed: above 0"),
-        ({"assumed": Assumed(np.zeros(3), 0.005, 900.0, 9.0)}, r"an assumed lever .*; allowed: a finite leds_sigma_m"),
+        (
+            {"assumed": Assumed(np.zeros(3), 0.005, 900.0, 9.0)},
+            r"an assumed lever .*; allowed: a finite leds_sigma_m",
+        ),
     ],
 )
 def test_a_wrong_question_is_answered_in_one_line(change: dict, message: str) -> None:
@@ -379,20 +448,26 @@ def test_malformed_frames_are_refused_by_number() -> None:
             replace(frames[3], sigma_px=0 * frames[3].sigma_px),
             r"frame 3 has a pixel that is not finite or a sigma",
         ),
-        (replace(frames[3], led=frames[3].led[1:]), r"frame 3 has \d+ LEDs, but xy_px and sigma_px are"),
+        (
+            replace(frames[3], led=frames[3].led[1:]),
+            r"frame 3 has \d+ LEDs, but xy_px and sigma_px are",
+        ),
     ]:
         with pytest.raises(ValueError, match=f"^survey: {message}"):
             survey([*frames[:3], wrong, *frames[4:]], *asked)
     with pytest.raises(ValueError, match=r"^survey: no frames"):
         survey([], *asked)
-    with pytest.raises(ValueError, match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames"):
+    with pytest.raises(
+        ValueError, match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames"
+    ):
         survey(frames[:3], *asked)
 
 
 def test_the_turns_between_two_sets_of_attitudes_are_found() -> None:
     rng = np.random.default_rng(41)
     ours = attitudes(rng, 30, 25)
-    left, right = Rotation.from_rotvec([0.3, -0.2, 2.0]), Rotation.from_rotvec([-0.1, 0.4, -1.5])
+    left = Rotation.from_rotvec([0.3, -0.2, 2.0])
+    right = Rotation.from_rotvec([-0.1, 0.4, -1.5])
     found_left, found_right = align_attitudes(ours, left * ours * right)
     # Rounding of thirty attitudes.
     assert (found_left * left.inv()).magnitude() < 1e-13
@@ -406,13 +481,16 @@ def test_the_turns_between_two_sets_of_attitudes_are_found() -> None:
     assert np.degrees(np.abs((left.inv().apply(errors))[:2])).max() < 5 * np.sqrt(2 / 600)
 
 
-def afit_errors_deg(found: DomeSurvey, rng: np.random.Generator, place: np.ndarray, trials: int) -> tuple[float, float]:
+def afit_errors_deg(
+    found: DomeSurvey, rng: np.random.Generator, place: np.ndarray, trials: int
+) -> tuple[float, float]:
     """rms cross and roll of new frames, to 25 degrees of tilt, solved with what the survey found."""
     turned = attitudes(rng, trials, 25)
     solved = []
     for frame in filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.5):
         known = found.surveyed[frame.led]
-        led, xy = frame.led[known], frame.xy_px[known]
+        led = frame.led[known]
+        xy = frame.xy_px[known]
         sigma = np.full(len(led), 0.1 / found.camera.focal_px)
         solved.append(
             nearfield.rotation_only(
@@ -426,8 +504,11 @@ def afit_errors_deg(found: DomeSurvey, rng: np.random.Generator, place: np.ndarr
         )
     # The turns of lab and body that the pixels cannot tell are those between the survey's frames and the truth's.
     error = AFIT_LEVER.cam_from_body.apply(errors_rad(Rotation.concatenate(solved), turned))
-    cross, roll = np.hypot(error[:, 0], error[:, 1]), error[:, 2]
-    return float(np.degrees(np.sqrt(np.mean(cross**2)))), float(np.degrees(np.sqrt(np.mean(roll**2))))
+    cross = np.hypot(error[:, 0], error[:, 1])
+    roll = error[:, 2]
+    return float(np.degrees(np.sqrt(np.mean(cross**2)))), float(
+        np.degrees(np.sqrt(np.mean(roll**2)))
+    )
 
 
 @pytest.mark.long
@@ -459,9 +540,13 @@ def test_the_afit_dome_surveys_itself(begin: str) -> None:
     wrong = begin == "imu and wrong names"
     if wrong:
         frames = misnamed(rng, frames, 1400, 0.05)
-    began_s, worked_s = perf_counter(), process_time()
-    found = survey(frames, start, believed, camera, loss="cauchy" if wrong else "linear", leds_sigma_m=0.002)
-    took_s, worked_s = perf_counter() - began_s, process_time() - worked_s
+    began_s = perf_counter()
+    worked_s = process_time()
+    found = survey(
+        frames, start, believed, camera, loss="cauchy" if wrong else "linear", leds_sigma_m=0.002
+    )
+    took_s = perf_counter() - began_s
+    worked_s = process_time() - worked_s
     cross, roll = afit_errors_deg(found, rng, place, 300)
     print(
         f"{begin}: {np.mean([len(f.led) for f in frames]):.1f} in the field, {found.surveyed.sum()} surveyed, "
@@ -482,7 +567,8 @@ def test_the_afit_dome_surveys_itself(begin: str) -> None:
 def test_the_three_weak_moves_are_conformal_maps() -> None:
     """Without a map, the attitudes' worst errors are the sphere's boosts: boresight b turns by b x n, n fixed."""
     rng = np.random.default_rng(3)
-    place, turned = dome(700, 28), attitudes(rng, 200, 20)
+    place = dome(700, 28)
+    turned = attitudes(rng, 200, 20)
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.0)
     seen = dome_survey._collect(frames, 700)
     whole = dome_survey._start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
@@ -494,12 +580,18 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     count = 3 * len(R_body_from_lab)
     in_lab = block_diag(*R_body_from_lab.transpose(0, 2, 1))
     # Turns of the lab and of the body, the same in every frame, are no errors.
-    common = np.hstack([np.tile(np.eye(3), (count // 3, 1)), R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3)])
+    common = np.hstack(
+        [np.tile(np.eye(3), (count // 3, 1)), R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3)]
+    )
     axes, _ = np.linalg.qr(common)
     without = np.eye(count) - axes @ axes.T
-    moves = np.linalg.eigh(without @ in_lab @ spread[:count, :count] @ in_lab.T @ without)[1][:, ::-1]
+    moves = np.linalg.eigh(without @ in_lab @ spread[:count, :count] @ in_lab.T @ without)[1][
+        :, ::-1
+    ]
     boresight = np.einsum("kji,j->ki", R_body_from_lab, AFIT_LEVER.cam_from_body.as_matrix()[2])
-    boosts, _ = np.linalg.qr(without @ np.stack([np.cross(boresight, n).ravel() for n in np.eye(3)], axis=1))
+    boosts, _ = np.linalg.qr(
+        without @ np.stack([np.cross(boresight, n).ravel() for n in np.eye(3)], axis=1)
+    )
     share = np.linalg.norm(boosts.T @ moves[:, :6], axis=0)
     # Three vectors among 600: a move of another kind would have a share of some sqrt(3 / 600) = 0.07.
     assert share[:3].min() > 0.95

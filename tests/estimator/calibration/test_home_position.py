@@ -25,7 +25,8 @@ from estimator.core.errors import ImageError
 
 # AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in, LEDs 8 mm apart.
 CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))
-R_M, M_M = 1.2192, 0.381
+R_M = 1.2192
+M_M = 0.381
 LEVER = Lever(np.array([0.0, 0.0, M_M]), Rotation.identity())
 SPHERE = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.full(3, R_M))
 PLACES_MM = np.array(
@@ -45,7 +46,8 @@ PLACES_MM = np.array(
     ]
 )
 MAGNITUDE = np.linspace(160, 20, len(PLACES_MM))
-NOISE_PX, NOISE_MAG = 0.3, 2.0
+NOISE_PX = 0.3
+NOISE_MAG = 2.0
 SIGMA_M = (R_M - M_M) * NOISE_PX / CAMERA.focal_px  # of a coordinate: eq. 43 is linear in pixels
 ARCSEC = np.pi / 648_000
 # Each law below is broken by chance once in ten thousand; the draws are fixed.
@@ -95,7 +97,8 @@ def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
     point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
     np.testing.assert_allclose(reach_m, R_M - M_M, rtol=0, atol=1e-15)
-    read, true = unit(point + LEVER.camera_body_m), unit(on_sphere(rays, LEVER.camera_body_m, R_M))
+    read = unit(point + LEVER.camera_body_m)
+    true = unit(on_sphere(rays, LEVER.camera_body_m, R_M))
     return float((np.arccos(read[0] @ read[1]) - np.arccos(true[0] @ true[1])) / ARCSEC)
 
 
@@ -144,23 +147,32 @@ IMU_RAD = 1.9861e-3 / R_M  # .0933 degree: Table 9's epsilon_position, were it a
 @pytest.fixture(scope="module")
 def stops() -> list[Sighting]:
     """300 stops of two frames, truly all at home, the IMU wrong by IMU_RAD about each axis at each stop."""
-    rng, level = np.random.default_rng(62), Rotation.identity()
+    rng = np.random.default_rng(62)
+    level = Rotation.identity()
     wrong = Rotation.from_rotvec(rng.normal(0, IMU_RAD, (300, 3)))
-    return [sighting(rng, dome(), level, imu, stop) for stop, imu in enumerate(wrong) for _ in range(2)]
+    return [
+        sighting(rng, dome(), level, imu, stop) for stop, imu in enumerate(wrong) for _ in range(2)
+    ]
 
 
-def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(stops: list[Sighting]) -> None:
+def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(
+    stops: list[Sighting],
+) -> None:
     found = calibrate(stops, CAMERA, SPHERE, LEVER)
     # All LEDs share the IMU's 300 errors of x and of y; their yaw moves an LED 13 mm out by a hundredth of that.
     low, high = greatest_sd(2, 299)
     assert low < found.epsilon_pos_m / np.hypot(R_M * IMU_RAD, SIGMA_M) < high
-    np.testing.assert_allclose(found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3)  # places are off by .2 mm
+    np.testing.assert_allclose(
+        found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3
+    )  # places are off by .2 mm
     # An angle between LEDs needs no IMU: as at one place.
     sigma = np.sqrt(2) * SIGMA_M / R_M
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
 
 
-def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(stops: list[Sighting]) -> None:
+def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(
+    stops: list[Sighting],
+) -> None:
     # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
     found = calibrate(stops, CAMERA, SPHERE, LEVER, statistic="averaged")
     # The deviation of two frames has the mean sqrt(2 / pi) and, by that, the spread sqrt(pi / 2 - 1); 24 coordinates.
@@ -171,8 +183,17 @@ def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(stops: li
 
 def test_stops_apart_show_the_geometry_s_own_error_without_noise() -> None:
     # Five of AFIT's stops (Table 6) and no noise: what spread is left is eq. 44's on a dome seen from M.
-    stops = np.radians([[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]])
-    rng, spread = np.random.default_rng(63), {}
+    stops = np.radians(
+        [
+            [0, 0, 0],
+            [-0.009, 2.3, 0.007],
+            [0.25, -2.1, 0.004],
+            [3.3, -0.14, -0.028],
+            [-1.9, 0.28, 0.19],
+        ]
+    )
+    rng = np.random.default_rng(63)
+    spread = {}
     for sine in (False, True):
         seen = [
             sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
@@ -198,7 +219,9 @@ def test_the_spreads_by_hand() -> None:
     # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3; at either stop sqrt(2).
     by_hand = {"pooled": [np.sqrt(104 / 3), np.nan, 0], "averaged": [root, np.nan, np.nan]}
     for name, expected in by_hand.items():
-        np.testing.assert_allclose(DEVIATIONS[name](value, group, stop), expected, rtol=1e-15, atol=0)
+        np.testing.assert_allclose(
+            DEVIATIONS[name](value, group, stop), expected, rtol=1e-15, atol=0
+        )
 
 
 # ---- the catalog -------------------------------------------------------------------------------------------------
@@ -242,16 +265,22 @@ def test_the_covariance_is_the_noise_s(home: HomeCatalog) -> None:
 
 
 def test_the_sample_covariance_is_numpy_s_and_none_of_one_sample() -> None:
-    lab_m, led = np.random.default_rng(14).normal(size=(9, 3)), np.array([0, 2, 0, 1, 2, 0, 2, 0, 2])
+    lab_m = np.random.default_rng(14).normal(size=(9, 3))
+    led = np.array([0, 2, 0, 1, 2, 0, 2, 0, 2])
     covariance = _covariance(lab_m, led)
     for row in (0, 2):
-        np.testing.assert_allclose(covariance[row], np.cov(lab_m[led == row], rowvar=False), rtol=1e-12)
+        np.testing.assert_allclose(
+            covariance[row], np.cov(lab_m[led == row], rowvar=False), rtol=1e-12
+        )
     assert np.isnan(covariance[1]).all()
 
 
 def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> None:
-    rng, wrong = np.random.default_rng(65), Rotation.from_rotvec([2e-3, 0, 0])
-    seen = at_home(rng, 20) + [sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)]
+    rng = np.random.default_rng(65)
+    wrong = Rotation.from_rotvec([2e-3, 0, 0])
+    seen = at_home(rng, 20) + [
+        sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)
+    ]
     home, both = (calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False))
     assert home.samples.tolist() == [20] * 12
     assert both.samples.tolist() == [40] * 12
@@ -263,9 +292,13 @@ def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> No
 
 
 def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
-    rng, level = np.random.default_rng(66), Rotation.identity()
+    rng = np.random.default_rng(66)
+    level = Rotation.identity()
     few = replace(dome(), id=dome().id[:4], position_m=dome().position_m[:4])
-    seen = [sighting(rng, few, level, level, 0), *(sighting(rng, dome(), level, level, 1) for _ in range(3))]
+    seen = [
+        sighting(rng, few, level, level, 0),
+        *(sighting(rng, dome(), level, level, 1) for _ in range(3)),
+    ]
     assert sorted(calibrate(seen, CAMERA, SPHERE, LEVER).id) == [100, 101, 102, 103]
     assert len(calibrate(seen, CAMERA, SPHERE, LEVER, home_only=False)) == 12
 
@@ -273,7 +306,8 @@ def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
 def test_a_camera_mounted_askew_gives_the_same_places() -> None:
     # cam_from_body turned about the boresight, the pupil aside: mapping back must undo both.
     askew = Lever(np.array([0.004, -0.003, M_M]), Rotation.from_euler("z", 0.7))
-    rng, level = np.random.default_rng(67), Rotation.identity()
+    rng = np.random.default_rng(67)
+    level = Rotation.identity()
     seen = [sighting(rng, dome(), level, level, 0, noise_px=0.0, lever=askew) for _ in range(2)]
     found = calibrate(seen, CAMERA, SPHERE, askew)
     off = found.position_m - dome().position_m
@@ -281,11 +315,20 @@ def test_a_camera_mounted_askew_gives_the_same_places() -> None:
     assert np.abs(off[:, :2]).max() < 0.12e-3 * 0.02 * 1.3
 
 
-def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(home: HomeCatalog) -> None:
-    oval = LedMap(np.arange(0), np.zeros((0, 3)), np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))
+def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(
+    home: HomeCatalog,
+) -> None:
+    oval = LedMap(
+        np.arange(0),
+        np.zeros((0, 3)),
+        np.array([0.0, 0.003, 0.492]),
+        np.array([0.9876, 0.9876, 0.7264]),
+    )
     leds = led_map(home, oval)
     scaled = (leds.position_m - oval.center_m) / oval.semi_axes_m
-    np.testing.assert_allclose(np.sum(scaled**2, axis=1), 1, rtol=0, atol=1e-14)  # a quadratic's rounding
+    np.testing.assert_allclose(
+        np.sum(scaled**2, axis=1), 1, rtol=0, atol=1e-14
+    )  # a quadratic's rounding
     np.testing.assert_allclose(unit(leds.position_m), home.vectors, rtol=0, atol=1e-15)
     assert (leds.id == home.id).all()
 
@@ -319,5 +362,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line() -> None:
 
 def test_a_direction_that_misses_the_surface_is_named(home: HomeCatalog) -> None:
     beside = LedMap(np.arange(0), np.zeros((0, 3)), np.array([5.0, 0, 0]), np.ones(3))
-    with pytest.raises(ImageError, match="LED 100: its direction from the bearing does not intersect"):
+    with pytest.raises(
+        ImageError, match="LED 100: its direction from the bearing does not intersect"
+    ):
         led_map(home, beside)

@@ -29,14 +29,25 @@ def drawn_states(rng: np.random.Generator, count: int) -> States:
     return States(rotations.as_quat().T, *(1e-2 * rng.standard_normal((2, 3, count))))
 
 
-@law(States.take, States.rotation, States.moved, States.minus, dynamics.cross, dynamics.turn, dynamics.moved_on)
+@law(
+    States.take,
+    States.rotation,
+    States.moved,
+    States.minus,
+    dynamics.cross,
+    dynamics.turn,
+    dynamics.moved_on,
+)
 @given(rng=SEEDS)
 def test_a_change_of_states_is_found_again(rng: np.random.Generator) -> None:
-    states, change = drawn_states(rng, 5), 0.1 * rng.standard_normal((STATE, 5))
+    states = drawn_states(rng, 5)
+    change = 0.1 * rng.standard_normal((STATE, 5))
     np.testing.assert_allclose(states.moved(change).minus(states), change, rtol=0, atol=1e-12)
     a, b = rng.standard_normal((2, 3, 5))
     np.testing.assert_allclose(dynamics.cross(a, b), np.cross(a, b, axis=0), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(dynamics.turn(states.quaternion, a).T, states.rotation.apply(a.T), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        dynamics.turn(states.quaternion, a).T, states.rotation.apply(a.T), rtol=0, atol=1e-12
+    )
     back = dynamics.turn(states.quaternion, dynamics.turn(states.quaternion, a), inverse=True)
     np.testing.assert_allclose(back, a, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(states.take(slice(1, 3)).momentum, states.momentum[:, 1:3])
@@ -56,7 +67,8 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Gen
     after = motion.integrate(begin, begin + 3.0, states, 2.0)
     np.testing.assert_allclose(after.momentum, states.momentum, rtol=0, atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(after.quaternion, axis=0), 1, rtol=1e-12)
-    rate, short = motion.rate(states, motion.stored(begin)), 1e-5
+    rate = motion.rate(states, motion.stored(begin))
+    short = 1e-5
     turned = motion.integrate(begin, begin + short, states, 2.0).minus(states)[:3] / short
     np.testing.assert_allclose(turned, rate, rtol=0, atol=1e-4)
     spin = motion.slope(begin, states).quaternion
@@ -70,9 +82,13 @@ def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
     assumed, _ = prior(SMALL, rng)
     states = batch.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))
     link = dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed)
-    change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal((STATE, 6))
+    change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal(
+        (STATE, 6)
+    )
     by = 1e-3 * assumed.sigma * rng.standard_normal(20)
-    other = dynamics.transition(RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed)
+    other = dynamics.transition(
+        RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed
+    )
     expected = np.einsum("kij,jk->ik", link.by_state, change) + (link.by_parameter @ by).T
     scale = np.repeat([1e-6, 1e-8, 1e-10], 3)[:, None]
     np.testing.assert_allclose((other.after.minus(link.after) - expected) / scale, 0, atol=1)
@@ -96,16 +112,19 @@ def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
 def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) -> None:
     """The band of the states and their elimination against a dense inverse; more records, smaller errors."""
     assumed, vehicle = prior(SMALL, rng)
-    lab, values = vehicle.lab, assumed.values
+    lab = vehicle.lab
+    values = assumed.values
     states = batch.first_states(RECORD, lab, values)
     part = batch.reduced(RECORD, states, lab, values, assumed)
     rows = batch.whitened_links(RECORD, states, lab, values, assumed)
-    count, size = len(RECORD.t_s), len(values)
+    count = len(RECORD.t_s)
+    size = len(values)
     whole = np.zeros((STATE * count + size + 1,) * 2)
     for k, row in enumerate(rows):
         at = np.r_[STATE * k : STATE * (k + 2), STATE * count : len(whole)]
         whole[np.ix_(at, at)] += row.T @ row
-    diagonal, border = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, size + 1))
+    diagonal = np.zeros((count, STATE, STATE))
+    border = np.zeros((count, STATE, size + 1))
     corner = np.zeros((size + 1, size + 1))
     batch.add_measured(RECORD, states, lab, values, (diagonal, border, corner))
     whole[STATE * count :, STATE * count :] += corner
@@ -113,7 +132,8 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
         at = slice(STATE * k, STATE * (k + 1))
         whole[at, at] += diagonal[k]
         whole[at, STATE * count :] += border[k]
-    inner, outer = whole[: STATE * count, : STATE * count], whole[: STATE * count, STATE * count :]
+    inner = whole[: STATE * count, : STATE * count]
+    outer = whole[: STATE * count, STATE * count :]
     schur = whole[STATE * count :, STATE * count :] - outer.T @ np.linalg.solve(inner, outer)
     scale = np.outer(assumed.sigma, assumed.sigma)
     np.testing.assert_allclose(part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4)
@@ -123,26 +143,40 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
 
 @law(batch.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True)
 @given(rng=SEEDS, at=some.integers(2, 24))
-def test_what_is_considered_is_what_the_error_of_an_attitude_changes(rng: np.random.Generator, at: int) -> None:
+def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
+    rng: np.random.Generator, at: int
+) -> None:
     """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e."""
     assumed, vehicle = prior(SMALL, rng)
     error = 2e-5 * rng.standard_normal(3)
     systematic = np.zeros((len(RECORD.t_s), 3, 3))
     systematic[at] = np.outer(error, error)
-    shared = replace(RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic, systematic_rad2=systematic)
+    shared = replace(
+        RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic, systematic_rad2=systematic
+    )
     np.testing.assert_allclose(shared.noise_rad2, RECORD.covariance_rad2, rtol=1e-12)
     np.testing.assert_allclose(shared.with_noise(3.0).noise_rad2, 3 * shared.noise_rad2, rtol=1e-12)
     np.testing.assert_array_equal(shared.with_noise(3.0).systematic_rad2, systematic)
     turns = np.zeros((len(RECORD.t_s), 3))
     turns[at] = error
     turned = replace(RECORD, lab_from_body=RECORD.lab_from_body * Rotation.from_rotvec(turns))
-    before, after, considered = (batch.estimate_mass([one], vehicle.lab, assumed) for one in (RECORD, turned, shared))
+    before, after, considered = (
+        batch.estimate_mass([one], vehicle.lab, assumed) for one in (RECORD, turned, shared)
+    )
     change = (after.values - before.values) / before.sigma
     added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
-    np.testing.assert_allclose(added, np.outer(change, change), rtol=0.05, atol=0.02 * change @ change)
+    np.testing.assert_allclose(
+        added, np.outer(change, change), rtol=0.05, atol=0.02 * change @ change
+    )
 
 
-@law(MassEstimate.inertia_kg_m2, MassEstimate.moment_kg_m, MassEstimate.sigma, inertia_matrix, inertia_six)
+@law(
+    MassEstimate.inertia_kg_m2,
+    MassEstimate.moment_kg_m,
+    MassEstimate.sigma,
+    inertia_matrix,
+    inertia_six,
+)
 @given(rng=SEEDS)
 def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
     half = rng.standard_normal((3, 3))
@@ -156,7 +190,12 @@ def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
 
 
 @law(
-    recursive.filter_mass, recursive.filter_from, recursive.cut, recursive.first_covariance, recursive.joseph, slow=True
+    recursive.filter_mass,
+    recursive.filter_from,
+    recursive.cut,
+    recursive.first_covariance,
+    recursive.joseph,
+    slow=True,
 )
 @given(rng=SEEDS)
 def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
@@ -180,7 +219,9 @@ def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
 def test_a_longer_record_is_surer() -> None:
     assumed, vehicle = prior(SMALL, np.random.default_rng(3))
     short, long = (
-        batch.estimate_mass([recursive.cut(RECORD, slice(0, n))], vehicle.lab, Prior(SMALL.truth, assumed.sigma)).sigma
+        batch.estimate_mass(
+            [recursive.cut(RECORD, slice(0, n))], vehicle.lab, Prior(SMALL.truth, assumed.sigma)
+        ).sigma
         for n in (12, 26)
     )
     assert (long <= short * (1 + 1e-3)).all()
@@ -194,6 +235,8 @@ def test_a_momentum_is_scaled_as_the_inertia(rng: np.random.Generator, factor: f
     scaled = np.concatenate([factor * assumed.values[:6], assumed.values[6:]])
     states = drawn_states(rng, 4)
     found = dynamics.momentum_scale(RECORD, states, scaled, assumed.values)
-    np.testing.assert_allclose(found, np.tile(np.eye(3) / factor, (4, 1, 1)), rtol=0, atol=1e-9 / factor)
+    np.testing.assert_allclose(
+        found, np.tile(np.eye(3) / factor, (4, 1, 1)), rtol=0, atol=1e-9 / factor
+    )
     inverse = dynamics.inverse_inertia(RECORD, scaled)
     np.testing.assert_allclose(inverse @ inertia_matrix(scaled[:6]), np.eye(3), rtol=0, atol=1e-9)

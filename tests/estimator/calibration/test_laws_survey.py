@@ -28,7 +28,8 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
-LIGHTS, FRAMES = 14, 6
+LIGHTS = 14
+FRAMES = 6
 CAMERA = Camera(640, 480, 400.0, (318.0, 241.0), (-0.05, 0.01, 1e-3, -1e-3, 0.0))
 LENS = np.array([CAMERA.focal_px, *CAMERA.center_px, *CAMERA.distortion])
 
@@ -36,8 +37,11 @@ LENS = np.array([CAMERA.focal_px, *CAMERA.center_px, *CAMERA.distortion])
 def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sightings]:
     """Lights overhead, all of them seen in every frame of a camera that leans and turns."""
     across = rng.uniform(-0.4, 0.4, (LIGHTS, 2))
-    place = np.column_stack([across, 1.2 - 0.3 * np.sum(across**2, axis=1) + rng.uniform(-0.1, 0.1, LIGHTS)])
-    lean, yaw = 0.25 * units(rng, FRAMES), rng.uniform(0, 2 * np.pi, FRAMES)
+    place = np.column_stack(
+        [across, 1.2 - 0.3 * np.sum(across**2, axis=1) + rng.uniform(-0.1, 0.1, LIGHTS)]
+    )
+    lean = 0.25 * units(rng, FRAMES)
+    yaw = rng.uniform(0, 2 * np.pi, FRAMES)
     turned = Rotation.from_rotvec(lean * [1, 1, 0]) * Rotation.from_rotvec(yaw[:, None] * [0, 0, 1])
     true = Bundle(
         *(
@@ -75,13 +79,22 @@ def whole_matrix(terms: ba.NormalEquations) -> Floats:
 def test_the_rows_are_the_residuals_slopes(rng: np.random.Generator) -> None:
     true, seen = dome(rng)
     seen = seen.take(rng.permutation(len(seen.led))[:20])
-    rows, step = ba.linearize(true, seen), 1e-6
-    led, rest = rng.normal(size=3 * LIGHTS), rng.normal(size=3 * FRAMES + 6)
-    moved = [ba.residuals(true.apply_step(sign * step * led, sign * step * rest), seen) for sign in (-1, 1)]
+    rows = ba.linearize(true, seen)
+    step = 1e-6
+    led = rng.normal(size=3 * LIGHTS)
+    rest = rng.normal(size=3 * FRAMES + 6)
+    moved = [
+        ba.residuals(true.apply_step(sign * step * led, sign * step * rest), seen)
+        for sign in (-1, 1)
+    ]
     by_led = np.einsum("mai,mi->ma", rows.by_led, led.reshape(-1, 3)[seen.led])
-    by_rotation = np.einsum("mai,mi->ma", rows.by_rotation, rest[: 3 * FRAMES].reshape(-1, 3)[seen.frame])
+    by_rotation = np.einsum(
+        "mai,mi->ma", rows.by_rotation, rest[: 3 * FRAMES].reshape(-1, 3)[seen.frame]
+    )
     slope = by_led + by_rotation + rows.by_shared @ rest[3 * FRAMES :]
-    np.testing.assert_allclose((moved[0] - moved[1]) / (2 * step), slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        (moved[0] - moved[1]) / (2 * step), slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max()
+    )
     np.testing.assert_allclose(rows.residual, ba.residuals(true, seen), rtol=0, atol=1e-9)
 
 
@@ -95,11 +108,14 @@ def test_the_rows_are_the_residuals_slopes(rng: np.random.Generator) -> None:
     Bundle.cost,
 )
 @given(rng=SEEDS, damping=some.floats(1e-6, 1), width=some.floats(0.5, 9))
-def test_lights_eliminated_are_the_whole_system_solved(rng: np.random.Generator, damping: float, width: float) -> None:
+def test_lights_eliminated_are_the_whole_system_solved(
+    rng: np.random.Generator, damping: float, width: float
+) -> None:
     true, seen = dome(rng, 0.1)
     bundle = nudged(rng, true, 1e-3)
     weight = rng.uniform(0.1, 1, len(seen.led))
-    terms, (led_free, rest_free) = ba.normal_equations(bundle, seen, weight), ba.gauge_freedoms(bundle)
+    terms = ba.normal_equations(bundle, seen, weight)
+    (led_free, rest_free) = ba.gauge_freedoms(bundle)
     whole = whole_matrix(terms)
     assert_covariance(whole)
     still = whole @ np.concatenate([led_free, rest_free])  # they change no pixel
@@ -118,25 +134,40 @@ def test_lights_eliminated_are_the_whole_system_solved(rng: np.random.Generator,
 
 
 @law(Assumed.less, Assumed.weight, Bundle.cost, ba.normal_equations)
-@given(rng=SEEDS, lever_m=some.floats(0, 0.1), focal_px=some.floats(0, 20), list_m=some.floats(1e-4, 0.1))
+@given(
+    rng=SEEDS,
+    lever_m=some.floats(0, 0.1),
+    focal_px=some.floats(0, 20),
+    list_m=some.floats(1e-4, 0.1),
+)
 def test_what_is_assumed_is_a_measurement_of_its_weight(
     rng: np.random.Generator, lever_m: float, focal_px: float, list_m: float
 ) -> None:
     """The right-hand sides are half the cost's falling slope, and the matrix has 1 / sigma^2 more for each value."""
     true, seen = dome(rng, 0.1)
-    assumed = Assumed(true.camera_body_m + rng.normal(0, 0.01, 3), lever_m, LENS[0] + rng.normal(0, 5), focal_px)
+    assumed = Assumed(
+        true.camera_body_m + rng.normal(0, 0.01, 3), lever_m, LENS[0] + rng.normal(0, 5), focal_px
+    )
     bundle = replace(nudged(rng, true, 1e-3), map_sigma_m=list_m)
-    known, every = replace(bundle, assumed=assumed), np.ones(len(seen.led))
+    known = replace(bundle, assumed=assumed)
+    every = np.ones(len(seen.led))
     terms = ba.normal_equations(known, seen, every)
     more = np.diag(terms.rest - ba.normal_equations(bundle, seen, every).rest)
     sigma = np.maximum([lever_m] * 3 + [focal_px], ba.EXACT * np.array([1, 1, 1, assumed.focal_px]))
     np.testing.assert_allclose(more[3 * FRAMES : 3 * FRAMES + 4], sigma**-2.0, rtol=1e-3, atol=1e-3)
     assert np.abs(np.delete(more, np.s_[3 * FRAMES : 3 * FRAMES + 4])).max() == 0
-    led, rest, step = rng.normal(size=3 * LIGHTS), rng.normal(size=3 * FRAMES + 6), 1e-7
-    costs = [known.apply_step(sign * step * led, sign * step * rest).cost(seen, np.inf)[0] for sign in (-1, 1)]
+    led = rng.normal(size=3 * LIGHTS)
+    rest = rng.normal(size=3 * FRAMES + 6)
+    step = 1e-7
+    costs = [
+        known.apply_step(sign * step * led, sign * step * rest).cost(seen, np.inf)[0]
+        for sign in (-1, 1)
+    ]
     slope = (costs[0] - costs[1]) / (2 * step)
     pull = 2 * (terms.rhs_led @ led + terms.rhs_rest @ rest)
-    np.testing.assert_allclose(slope, pull, rtol=1e-3, atol=1e-5 * max(costs) + 1e-9 * max(costs) / step)
+    np.testing.assert_allclose(
+        slope, pull, rtol=1e-3, atol=1e-5 * max(costs) + 1e-9 * max(costs) / step
+    )
 
 
 @law(dome_survey.redundancy, dome_survey.check_redundancy)
@@ -149,7 +180,9 @@ def test_redundant_coordinates_are_those_that_the_unknowns_do_not_follow(
     seen = seen.take(rng.permutation(len(seen.led))[:rows])
     every = np.ones(rows)
     pixels = whole_matrix(ba.normal_equations(true, seen, every))
-    known = replace(true, map_sigma_m=list_m, assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0))
+    known = replace(
+        true, map_sigma_m=list_m, assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0)
+    )
     terms = ba.normal_equations(known, seen, every)
     part = Subset(known, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(rows))
     covariances = ba.covariance(terms, known)
@@ -165,7 +198,9 @@ def test_redundant_coordinates_are_those_that_the_unknowns_do_not_follow(
 
 @law(ba.adjust, ba.fit_attitudes, ba.covariance_in_gauge)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
-def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generator, by: float) -> None:
+def test_an_adjustment_comes_to_rest_where_the_pixels_are(
+    rng: np.random.Generator, by: float
+) -> None:
     true, seen = dome(rng)
     start = nudged(rng, true, by)
     turned = ba.fit_attitudes(start, seen, 3)
@@ -176,7 +211,9 @@ def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generat
     gauge = Gauge(None, None, true.position_m, true.R_body_from_lab)
     part = Subset(found, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     terms = ba.normal_equations(found, seen, np.ones(len(seen.led)))
-    by_led, by_rotation, shared = ba.covariance_in_gauge(terms, found, *gauge.constraints(found, part))
+    by_led, by_rotation, shared = ba.covariance_in_gauge(
+        terms, found, *gauge.constraints(found, part)
+    )
     for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
 
@@ -184,7 +221,8 @@ def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generat
 @pytest.mark.slow
 def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levenberg-Marquardt takes a step only if the cost falls; from this far off the first steps often overshoot."""
-    normal_equations, costs = ba.normal_equations, list[float]()
+    normal_equations = ba.normal_equations
+    costs = list[float]()
 
     def recorded(bundle: Bundle, sightings: Sightings, weight: Floats) -> Any:
         costs.append(bundle.cost(sightings, np.inf)[0])
@@ -203,7 +241,8 @@ def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatc
 @law(Gauge.check, Gauge.transform, Gauge.constraints, Subset.insert_into)
 @given(
     rng=SEEDS,
-    length=some.none() | some.tuples(some.integers(-1, 15), some.integers(-1, 15), some.floats(0.1, 2)),
+    length=some.none()
+    | some.tuples(some.integers(-1, 15), some.integers(-1, 15), some.floats(0.1, 2)),
     frame=some.none() | some.integers(-1, 7),
 )
 def test_a_gauge_moves_no_pixel(
@@ -211,24 +250,36 @@ def test_a_gauge_moves_no_pixel(
 ) -> None:
     true, seen = dome(rng)
     asked = answered(lambda: Gauge(length, frame, true.position_m, true.R_body_from_lab))
-    rows = length is None or (length[0] != length[1] and all(0 <= end < LIGHTS for end in length[:2]))
+    rows = length is None or (
+        length[0] != length[1] and all(0 <= end < LIGHTS for end in length[:2])
+    )
     assert (asked is not None) == (rows and (frame is None or 0 <= frame < FRAMES))
     gauge = asked or Gauge((0, 1, 0.5), 2, true.position_m, true.R_body_from_lab)
     part = Subset(true, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     gauge.check(part)
     found = nudged(rng, true, 0.01)
     once = gauge.transform(found, part)
-    np.testing.assert_allclose(ba.residuals(once, seen), ba.residuals(found, seen), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(gauge.transform(once, part).position_m, once.position_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        ba.residuals(once, seen), ba.residuals(found, seen), rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        gauge.transform(once, part).position_m, once.position_m, rtol=0, atol=1e-9
+    )
     np.testing.assert_array_equal(part.insert_into(true, once).position_m, once.position_m)
     by_led, by_rest = gauge.constraints(once, part)
     assert by_led.shape == (3 * LIGHTS, 4)
     led_free, rest_free = ba.gauge_freedoms(once)
-    assert np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4  # it leaves nothing free
+    assert (
+        np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4
+    )  # it leaves nothing free
     if gauge.length is not None:  # its constraint is the known length's slope
-        ends, moved = list(gauge.length[:2]), rng.normal(0, 1e-6, once.position_m.shape)
+        ends = list(gauge.length[:2])
+        moved = rng.normal(0, 1e-6, once.position_m.shape)
         change_m = np.diff(
-            [np.linalg.norm(at[ends[0]] - at[ends[1]]) for at in (once.position_m, once.position_m + moved)]
+            [
+                np.linalg.norm(at[ends[0]] - at[ends[1]])
+                for at in (once.position_m, once.position_m + moved)
+            ]
         )
         np.testing.assert_allclose(moved.ravel() @ by_led[:, 3], change_m[0], rtol=0, atol=1e-10)
 
@@ -237,7 +288,8 @@ def test_a_gauge_moves_no_pixel(
 @given(rng=SEEDS, count=some.integers(3, 12))
 def test_two_turns_between_attitudes_are_found(rng: np.random.Generator, count: int) -> None:
     ours = Rotation.random(count, rng=rng)
-    left, right = turn(rng, 0.5), turn(rng, 3)
+    left = turn(rng, 0.5)
+    right = turn(rng, 3)
     theirs = left * ours * right
     found_left, found_right = align_attitudes(ours, theirs)
     assert ((found_left * ours * found_right) * theirs.inv()).magnitude().max() < 1e-9
@@ -256,13 +308,19 @@ def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Gener
     for k in range(FRAMES):
         truth = Rotation.from_matrix(true.R_body_from_lab[k])
         xy = project(truth, true.position_m, arm, CAMERA) + rng.normal(0, 0.1, (LIGHTS, 2))
-        frames.append(DomeFrame(np.arange(LIGHTS), xy, np.full(LIGHTS, 0.1), turn(rng, 0.01) * truth))
+        frames.append(
+            DomeFrame(np.arange(LIGHTS), xy, np.full(LIGHTS, 0.1), turn(rng, 0.01) * truth)
+        )
     told = answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=0.01))
     assert told is not None
     assert told.status == "converged"
     assert 0 < told.focal_sigma_px < 100
     assert told.surveyed_leds.id.tolist() == np.flatnonzero(told.surveyed).tolist()
-    for matrix in (*told.led_covariance_m2[told.surveyed], told.lever_covariance_m2, told.lens_covariance):
+    for matrix in (
+        *told.led_covariance_m2[told.surveyed],
+        told.lever_covariance_m2,
+        told.lens_covariance,
+    ):
         assert_covariance(matrix)
 
 
@@ -276,15 +334,27 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     true, seen = dome(rng, 0.1)
     turned = Rotation.from_matrix(true.R_body_from_lab)
     arm = Lever(true.camera_body_m, Rotation.from_matrix(true.R_cam_from_body))
-    leds = LedMap(np.arange(LIGHTS), true.position_m + rng.normal(0, 0.002, (LIGHTS, 3)), np.zeros(3), np.full(3, 1.2))
+    leds = LedMap(
+        np.arange(LIGHTS),
+        true.position_m + rng.normal(0, 0.002, (LIGHTS, 3)),
+        np.zeros(3),
+        np.full(3, 1.2),
+    )
     rows = [seen.frame == k for k in range(FRAMES)]
-    frames = [DomeFrame(seen.led[k], seen.xy_px[k], seen.sigma_px[k], turned[n]) for n, k in enumerate(rows)]
+    frames = [
+        DomeFrame(seen.led[k], seen.xy_px[k], seen.sigma_px[k], turned[n])
+        for n, k in enumerate(rows)
+    ]
     assumed = Assumed(true.camera_body_m, lever_m, CAMERA.focal_px, focal_px)
     found = survey(frames, leds, arm, CAMERA, leds_sigma_m=0.002, assumed=assumed)
     assert found.surveyed.all()
     lens = np.array([found.camera.focal_px, *found.camera.center_px, *CAMERA.distortion])
-    attitudes, place_m, at_m = found.body_from_lab.as_matrix(), found.leds.position_m, found.lever.camera_body_m
-    bundle = Bundle(place_m, attitudes, at_m, true.R_cam_from_body, lens, 3, leds.position_m, 0.002, assumed)
+    attitudes = found.body_from_lab.as_matrix()
+    place_m = found.leds.position_m
+    at_m = found.lever.camera_body_m
+    bundle = Bundle(
+        place_m, attitudes, at_m, true.R_cam_from_body, lens, 3, leds.position_m, 0.002, assumed
+    )
     every = ba.linearize(bundle, seen)
     jacobian = np.zeros((len(seen.led), 2, 3 * LIGHTS + 3 * FRAMES + 6))
     for n, (led, frame) in enumerate(zip(seen.led, seen.frame, strict=True)):
@@ -292,14 +362,20 @@ def test_the_misfit_is_over_what_the_pixels_determine(
         jacobian[n, :, 3 * (LIGHTS + frame) : 3 * (LIGHTS + frame) + 3] = every.by_rotation[n]
     jacobian[:, :, -6:] = every.by_shared
     jacobian = jacobian.reshape(2 * len(seen.led), -1)
-    by_pixels, before = jacobian.T @ jacobian, np.zeros(jacobian.shape[1])
-    before[: 3 * LIGHTS], before[-6:-2] = 0.002**-2, assumed.weight
+    by_pixels = jacobian.T @ jacobian
+    before = np.zeros(jacobian.shape[1])
+    before[: 3 * LIGHTS] = 0.002**-2
+    before[-6:-2] = assumed.weight
     determined = np.trace(np.linalg.solve(by_pixels + np.diag(before), by_pixels))
     wanted = np.sqrt(np.sum(every.residual**2) / (2 * len(seen.led) - determined))
     assert found.misfit == pytest.approx(wanted, rel=1e-3)
     terms = ba.normal_equations(bundle, seen, np.ones(len(seen.led)))
-    led_step, rest_step = ba.step(terms, ba.eliminate_lights(terms, np.zeros((len(terms.rest), 0)), 0.0))
-    assert terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6  # at rest where all measurements agree best
+    led_step, rest_step = ba.step(
+        terms, ba.eliminate_lights(terms, np.zeros((len(terms.rest), 0)), 0.0)
+    )
+    assert (
+        terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6
+    )  # at rest where all measurements agree best
     assert np.linalg.norm(at_m - true.camera_body_m) < 6 * np.sqrt(3) * max(lever_m, ba.EXACT)
 
 
@@ -329,7 +405,8 @@ def test_any_frames_are_a_survey_or_refused(
 
 def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotation]:
     """Star fields all over the sensor, a tenth of a pixel off."""
-    truths, frames = Rotation.random(count, rng=rng), []
+    truths = Rotation.random(count, rng=rng)
+    frames = []
     for k in range(count):
         xy = rng.uniform(0, [639, 479], (25, 2))
         vectors = truths[k].inv().apply(CAMERA.rays(xy))
@@ -368,8 +445,11 @@ class Namer:
     """A tracker that knows what it sees: the light's row in the list is its name."""
 
     def __init__(self, frames: list[StarFrame], seen: bool) -> None:
-        vectors, count = np.concatenate([frame.vectors_ref for frame in frames]), 25 * len(frames)
-        self.stars = StarCatalog(np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count), 2000.0)
+        vectors = np.concatenate([frame.vectors_ref for frame in frames])
+        count = 25 * len(frames)
+        self.stars = StarCatalog(
+            np.arange(count), vectors, 0 * vectors, np.zeros(count), np.zeros(count), 2000.0
+        )
         self.seen = seen
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
@@ -380,10 +460,17 @@ class Namer:
 
 @law(star_field.self_calibrate)
 @given(rng=SEEDS, seen=some.booleans())
-def test_a_camera_calibrates_itself_by_the_stars_that_are_named(rng: np.random.Generator, seen: bool) -> None:
+def test_a_camera_calibrates_itself_by_the_stars_that_are_named(
+    rng: np.random.Generator, seen: bool
+) -> None:
     frames, _ = filmed(rng, 5)
-    lights = [Centroids(one.xy_px, one.sigma_px, np.arange(1.0, 26.0) + 25 * k) for k, one in enumerate(frames)]
+    lights = [
+        Centroids(one.xy_px, one.sigma_px, np.arange(1.0, 26.0) + 25 * k)
+        for k, one in enumerate(frames)
+    ]
     namer = Namer(frames, seen)
-    told = answered(lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01)))
+    told = answered(
+        lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01))
+    )
     assert (told is not None) == seen
     assert told is None or star_field.disagreement_px(told.camera, CAMERA) < 0.5

@@ -23,13 +23,27 @@ from estimator.core.camera import Camera
 
 
 @pytest.mark.slow
-@law(*(survey_plan.predict, SurveyAccuracy.led_rms_m, SurveyModel.visible, ba.covariance, connected_subset), slow=True)
+@law(
+    *(
+        survey_plan.predict,
+        SurveyAccuracy.led_rms_m,
+        SurveyModel.visible,
+        ba.covariance,
+        connected_subset,
+    ),
+    slow=True,
+)
 @given(rng=SEEDS, factor=some.floats(0.1, 10))
-def test_errors_grow_with_noise_and_list_and_shrink_with_frames(rng: np.random.Generator, factor: float) -> None:
-    assumed, held = model(50), attitudes(rng, 30)
+def test_errors_grow_with_noise_and_list_and_shrink_with_frames(
+    rng: np.random.Generator, factor: float
+) -> None:
+    assumed = model(50)
+    held = attitudes(rng, 30)
     seen = assumed.visible(held)
     first = answered(lambda: survey_plan.predict(assumed, held[:25], seen[:25]))
-    larger = replace(assumed, sigma_px=factor * assumed.sigma_px, leds_sigma_m=factor * assumed.leds_sigma_m)
+    larger = replace(
+        assumed, sigma_px=factor * assumed.sigma_px, leds_sigma_m=factor * assumed.leds_sigma_m
+    )
     scaled = answered(lambda: survey_plan.predict(larger, held[:25], seen[:25]))
     every = answered(lambda: survey_plan.predict(assumed, held, seen))
     if first is None or every is None or scaled is None:
@@ -46,7 +60,8 @@ def test_errors_grow_with_noise_and_list_and_shrink_with_frames(rng: np.random.G
 @law(survey_plan.choose)
 @given(rng=SEEDS, count=some.integers(1, 12))
 def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: int) -> None:
-    assumed, candidates = model(80), attitudes(rng, 60)
+    assumed = model(80)
+    candidates = attitudes(rng, 60)
     shown = assumed.visible(candidates)
     plan = survey_plan.choose(assumed, candidates, shown, 12)
     assert survey_plan.choose(assumed, candidates, shown, count) == plan[:count]
@@ -60,15 +75,21 @@ def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: 
 
 @law(dome_survey.ray_angles)
 @given(rng=SEEDS, half_rad=some.floats(1e-3, 0.5))
-def test_rays_from_a_circle_cross_at_its_half_angle(rng: np.random.Generator, half_rad: float) -> None:
+def test_rays_from_a_circle_cross_at_its_half_angle(
+    rng: np.random.Generator, half_rad: float
+) -> None:
     """Seen from the light, the cameras lie on a cone of this half angle. A light of one ray or none has none."""
     around = rng.uniform(0, 2 * np.pi) + np.arange(5) * 2 * np.pi / 5
-    cone = np.column_stack([np.sin(half_rad) * np.cos(around), np.sin(half_rad) * np.sin(around), 0 * around])
+    cone = np.column_stack(
+        [np.sin(half_rad) * np.cos(around), np.sin(half_rad) * np.sin(around), 0 * around]
+    )
     cone[:, 2] = -np.cos(half_rad)
-    turn, at_m = Rotation.random(rng=rng), rng.normal(size=3)
+    turn = Rotation.random(rng=rng)
+    at_m = rng.normal(size=3)
     camera_m = at_m + rng.uniform(0.1, 3, (5, 1)) * turn.apply(cone)
     lights_m = np.array([at_m, at_m + 1, at_m - 1])
-    frame, led = np.array([0, 1, 2, 3, 4, 2]), np.array([0, 0, 0, 0, 0, 1])
+    frame = np.array([0, 1, 2, 3, 4, 2])
+    led = np.array([0, 0, 0, 0, 0, 1])
     angle_rad = dome_survey.ray_angles(lights_m, camera_m, frame, led)
     assert np.sin(half_rad) == pytest.approx(angle_rad[0], rel=1e-6)
     np.testing.assert_allclose(angle_rad[1:], 0, atol=1e-7)
@@ -77,13 +98,17 @@ def test_rays_from_a_circle_cross_at_its_half_angle(rng: np.random.Generator, ha
 @law(HeldFrames.shown, HeldFrames.rays)
 @given(rng=SEEDS)
 def test_rays_of_pixels_lead_to_the_leds(rng: np.random.Generator) -> None:
-    assumed, held = model(60), attitudes(rng, 6)
+    assumed = model(60)
+    held = attitudes(rng, 6)
     frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
     shown = frames.shown(5.0, 10.0)
     assert not (shown & ~assumed.visible(held)).any()
     frame, led = np.nonzero(shown)
     xy_px = np.array(
-        [pixels(assumed, assumed.leds.position_m, held[int(k)])[n] for k, n in zip(frame, led, strict=True)]
+        [
+            pixels(assumed, assumed.leds.position_m, held[int(k)])[n]
+            for k, n in zip(frame, led, strict=True)
+        ]
     )
     origins, directions = frames.rays(frame, xy_px.reshape(-1, 2))
     toward = assumed.leds.position_m[led] - origins
@@ -103,7 +128,9 @@ def test_what_was_seen_or_rarely_shown_is_not_dark(rng: np.random.Generator) -> 
 
 @law(survey_faults.displaced)
 @given(rng=SEEDS, size=some.floats(1e-5, 1e-1), far=some.floats(12, 1e3))
-def test_an_led_far_from_the_list_is_displaced(rng: np.random.Generator, size: float, far: float) -> None:
+def test_an_led_far_from_the_list_is_displaced(
+    rng: np.random.Generator, size: float, far: float
+) -> None:
     listed = rng.normal(0, 1, (60, 3))
     found = listed + size * rng.normal(0, 1, (60, 3))
     found[7] = listed[7] + [far * size, 0, 0]
@@ -120,7 +147,8 @@ def test_an_led_far_from_the_list_is_displaced(rng: np.random.Generator, size: f
 @law(survey_faults.stray_lights)
 @given(rng=SEEDS)
 def test_a_light_at_rest_is_found_and_a_pixel_s_fault_is_not(rng: np.random.Generator) -> None:
-    assumed, held = model(60), attitudes(rng, 40)
+    assumed = model(60)
+    held = attitudes(rng, 40)
     frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
     place_m = assumed.leds.position_m[3] * 1.003
     xy_px = np.array([pixels(assumed, place_m[None], one)[0] for one in held])
@@ -144,10 +172,14 @@ def test_strays_are_named_by_the_nearest_places(rng: np.random.Generator, count:
     assert survey_faults.name_strays(strays, np.arange(0), listed, 0.1) == []
 
 
-LIST_M, CLOSE_M = 0.001, 0.004  # error of a list, and distance of LEDs that it may have in the wrong order
+# error of a list, and distance of LEDs that it may have in the wrong order
+LIST_M = 0.001
+CLOSE_M = 0.004
 
 
-def close_group(rng: np.random.Generator, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, LightTable]:
+def close_group(
+    rng: np.random.Generator, levels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, LightTable]:
     """List, places, covariance and light of four LEDs in a row, and 56 far from one another, of these levels."""
     place_m = 10 * rng.normal(0, 1, (60, 3))
     place_m[:4] = place_m[0] + CLOSE_M * np.arange(4)[:, None] * [1.0, 0.0, 0.0]
@@ -169,7 +201,9 @@ def test_of_equal_leds_the_names_are_the_nearest_of_all_orders(rng: np.random.Ge
     best = min(orders, key=lambda order: cost[range(4), order].sum())
     np.testing.assert_array_equal(rows, np.arange(60))
     _, sigma_m = survey_faults.displaced(listed, place_m, covariance)
-    plausible = cost[range(4), best].max() < 20 * sigma_m**2  # well below the quantile: 26 for 60 LEDs
+    plausible = (
+        cost[range(4), best].max() < 20 * sigma_m**2
+    )  # well below the quantile: 26 for 60 LEDs
     assert (new[:4].tolist() == best.tolist()) or not plausible
     np.testing.assert_array_equal(new[4:], np.arange(4, 60))
 
@@ -191,7 +225,10 @@ def test_light_names_leds_that_the_list_has_in_the_wrong_order(rng: np.random.Ge
     exchanged = replace(table, light=table.light[:, far])
     rows, same = survey_faults.names(exchanged, listed, place_m, covariance)
     np.testing.assert_array_equal(same, rows)
-    assert [(one.led, one.shows) for one in survey_faults.exchanged(exchanged)[0]] == [(10, 20), (20, 10)]
+    assert [(one.led, one.shows) for one in survey_faults.exchanged(exchanged)[0]] == [
+        (10, 20),
+        (20, 10),
+    ]
     none = survey_faults.names(table, listed, place_m, np.full((60, 3, 3), np.nan))
     assert [len(one) for one in none] == [0, 0]
 
@@ -214,7 +251,9 @@ def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> No
 
 @law(survey_faults.exchanged)
 @given(rng=SEEDS, gain=some.floats(0.1, 10))
-def test_exchanged_lights_are_named_whatever_the_gain(rng: np.random.Generator, gain: float) -> None:
+def test_exchanged_lights_are_named_whatever_the_gain(
+    rng: np.random.Generator, gain: float
+) -> None:
     levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
     shown = np.ones((10, 12), dtype=bool)
     light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))
@@ -233,7 +272,8 @@ def test_exchanged_lights_are_named_whatever_the_gain(rng: np.random.Generator, 
 @law(Gauge.is_map)
 @given(rng=SEEDS)
 def test_a_gauge_is_the_map_s_unless_a_length_or_a_frame_is_given(rng: np.random.Generator) -> None:
-    place_m, held = rng.normal(0, 1, (4, 3)), attitudes(rng, 2).as_matrix()
+    place_m = rng.normal(0, 1, (4, 3))
+    held = attitudes(rng, 2).as_matrix()
     assert Gauge(None, None, place_m, held).is_map
     assert not Gauge((0, 1, 1.0), None, place_m, held).is_map
     assert not Gauge(None, 1, place_m, held).is_map

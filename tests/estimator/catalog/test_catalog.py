@@ -18,7 +18,11 @@ from estimator.core.errors import ImageError
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 180 / 3600
 MAS_RAD = ARCSEC_RAD / 1000
-DATES = [datetime.datetime(1995, 1, 3), datetime.datetime(2016, 6, 21, 7, 30), datetime.datetime(2027, 10, 9)]
+DATES = [
+    datetime.datetime(1995, 1, 3),
+    datetime.datetime(2016, 6, 21, 7, 30),
+    datetime.datetime(2027, 10, 9),
+]
 EPOCH_YR = 1991.25
 EPOCH = b"#   epoch_jyear: 1991.25\n"
 HEADER = EPOCH + b"hip,ra_deg,dec_deg,pm_ra_mas_yr,pm_dec_mas_yr,parallax_mas,v_mag"
@@ -63,8 +67,13 @@ def oracle() -> SkyCoord:
 
 @pytest.mark.filterwarnings("ignore:ERFA function")  # negative parallaxes, set aside below
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime) -> None:
-    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+def test_apparent_places_are_skycoord_s(
+    stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime
+) -> None:
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+    ):
         time = Time(date, scale="utc")
         wanted = oracle.apply_space_motion(new_obstime=time).transform_to(GCRS(obstime=time))
     wanted = wanted.cartesian.xyz.value.T
@@ -76,7 +85,9 @@ def test_apparent_places_are_skycoord_s(stars: StarCatalog, oracle: SkyCoord, da
     off_mas = separation_rad(in_file_s_order, wanted) / MAS_RAD
     assert np.mean(off_mas < 2) > 0.99
     # A negative parallax has no place in SkyCoord. Near the Sun its own 0.005 au from the barycenter shows.
-    far = in_file_s_order @ here.position_au > -np.cos(np.radians(15)) * np.linalg.norm(here.position_au)
+    far = in_file_s_order @ here.position_au > -np.cos(np.radians(15)) * np.linalg.norm(
+        here.position_au
+    )
     fair = far & (columns_of_the_file()["parallax_mas"] > 0)
     assert fair.sum() > 7500
     # The classical law of aberration is up to 0.51 mas off the relativistic; 0.15 for the Sun's place.
@@ -95,7 +106,9 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
         EPOCH_YR,
     )
     beta = 29_800 / 299_792_458
-    far = Observer(1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0]))  # where no Sun bends light
+    far = Observer(
+        1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0])
+    )  # where no Sun bends light
     seen = catalog.apparent(star, far)
     relativistic = np.arccos((np.cos(angle) + beta) / (1 + beta * np.cos(angle)))
     off_mas = np.abs(np.arctan2(seen[:, 1], seen[:, 0]) - relativistic) / MAS_RAD
@@ -104,7 +117,9 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
 
 def test_a_star_like_barnard_s_drifts_ten_arcseconds_a_year() -> None:
     # 10.36"/yr for 20 years, northward from dec +4.7: a rotation towards the pole but for the cube of 207".
-    start, end = (catalog.at_epoch(made_up((1, 269.4, 4.7, 0, 10_360, 0, 9.5)), 1991.25 + t) for t in (0, 20))
+    start, end = (
+        catalog.at_epoch(made_up((1, 269.4, 4.7, 0, 10_360, 0, 9.5)), 1991.25 + t) for t in (0, 20)
+    )
     moved = np.degrees(np.arcsin(end[0, 2]) - np.arcsin(start[0, 2])) * 3600
     assert moved == pytest.approx(207.2, abs=1e-3)
 
@@ -122,13 +137,19 @@ def test_parallax_leans_toward_the_sun() -> None:
     still = np.zeros(3)
     star = made_up((1, 90, 0, 0, 0, 750, 5))
     near = catalog.apparent(star, Observer(1991.25, np.array([1.0, 0, 0]), still))
-    bare = catalog.apparent(made_up((1, 90, 0, 0, 0, 0, 5)), Observer(1991.25, np.array([1.0, 0, 0]), still))
+    bare = catalog.apparent(
+        made_up((1, 90, 0, 0, 0, 0, 5)), Observer(1991.25, np.array([1.0, 0, 0]), still)
+    )
     # 1e-11 rad: half the square of 0.75".
     np.testing.assert_allclose(near - bare, [[-0.75 * ARCSEC_RAD, 0, 0]], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(("elongation_deg", "bent_mas"), [(90, 4.07), (45, 9.83), (10, 46.5), (180, 0)])
-def test_the_sun_bends_light_away_by_the_textbook_s_amounts(elongation_deg: float, bent_mas: float) -> None:
+@pytest.mark.parametrize(
+    ("elongation_deg", "bent_mas"), [(90, 4.07), (45, 9.83), (10, 46.5), (180, 0)]
+)
+def test_the_sun_bends_light_away_by_the_textbook_s_amounts(
+    elongation_deg: float, bent_mas: float
+) -> None:
     # 4.07 mas cot(psi / 2) at 1 au (Will 2014; IERS Conventions 2010, chapter 11). The Sun is toward -x.
     star = made_up((1, 180 - elongation_deg, 0, 0, 0, 0, 5))
     seen = catalog.apparent(star, Observer(1991.25, np.array([1.0, 0, 0]), np.zeros(3)))[0]
@@ -177,7 +198,9 @@ def test_the_center_of_light_leans_toward_the_brighter_star() -> None:
 
 def test_a_chain_of_close_stars_is_one_and_a_star_farther_off_stays() -> None:
     chain = [(k, 50, k * 9 / 3600, 0, 0, 0, 5.0) for k in range(4)]
-    merged = catalog.merge_doubles(made_up(*chain, (9, 50, -11 / 3600, 0, 0, 0, 3.0)), 10 * ARCSEC_RAD)
+    merged = catalog.merge_doubles(
+        made_up(*chain, (9, 50, -11 / 3600, 0, 0, 0, 3.0)), 10 * ARCSEC_RAD
+    )
     assert merged.id.tolist() == [9, 0]
     assert merged.v_mag[1] == pytest.approx(5 - 2.5 * np.log10(4), abs=1e-12)
 
@@ -216,17 +239,23 @@ def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
     assert stars.v_mag[0] == -1.46
     ra, dec = np.radians([(6 + 45 / 60 + 8.9 / 3600) * 15, -(16 + 42 / 60 + 58 / 3600)])
     sirius = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
-    assert separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD  # J2000, 8.75 years at 1.34"/yr
+    assert (
+        separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD
+    )  # J2000, 8.75 years at 1.34"/yr
     assert np.all(np.diff(stars.v_mag) >= 0)
     np.testing.assert_allclose(np.linalg.norm(stars.vectors, axis=1), 1, rtol=0, atol=1e-15)
     # A drift is tangent; 1e-20 is rounding of some 1e-5 rad/yr at most.
-    np.testing.assert_allclose(np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-20)
+    np.testing.assert_allclose(
+        np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-20
+    )
 
 
 def test_a_file_parted_by_blanks_is_read_too(tmp_path: Path) -> None:
     path = tmp_path / "blanks.ecsv"
     path.write_bytes(
-        b"# %ECSV 1.0\n" + HEADER.replace(b",", b" ") + b"\n1 10.0 20.0 0 0 0 5.5\n2 30.0 40.0 0 0 0 1.5\n"
+        b"# %ECSV 1.0\n"
+        + HEADER.replace(b",", b" ")
+        + b"\n1 10.0 20.0 0 0 0 5.5\n2 30.0 40.0 0 0 0 1.5\n"
     )
     assert catalog.read(path).id.tolist() == [2, 1]
 
@@ -248,7 +277,9 @@ UNREADABLE = {
 def test_what_is_no_catalog_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(UNREADABLE[name])
-    with pytest.raises(ImageError, match=r"not a star catalog .*allowed: ECSV with hip, ra_deg") as refusal:
+    with pytest.raises(
+        ImageError, match=r"not a star catalog .*allowed: ECSV with hip, ra_deg"
+    ) as refusal:
         catalog.read(path)
     assert "\n" not in str(refusal.value)
 

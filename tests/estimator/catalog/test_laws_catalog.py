@@ -13,7 +13,16 @@ from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 from numpy.typing import NDArray
 
-from estimator.catalog import catalog, pair_buckets, pair_index, ptase, quad_index, shefex, sky_index, spatial_grid
+from estimator.catalog import (
+    catalog,
+    pair_buckets,
+    pair_index,
+    ptase,
+    quad_index,
+    shefex,
+    sky_index,
+    spatial_grid,
+)
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
@@ -34,17 +43,28 @@ def apart(a: NDArray, b: NDArray) -> NDArray:
 
 @law(catalog.from_columns, catalog.at_epoch, catalog.apparent, catalog.unit)
 @given(rng=SEEDS, year=some.floats(1900, 2100))
-def test_stars_move_across_the_sky_and_no_farther_than_they_can(rng: np.random.Generator, year: float) -> None:
+def test_stars_move_across_the_sky_and_no_farther_than_they_can(
+    rng: np.random.Generator, year: float
+) -> None:
     stars = drawn(rng)
-    np.testing.assert_allclose(np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(catalog.at_epoch(stars, stars.epoch_yr), stars.vectors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        catalog.at_epoch(stars, stars.epoch_yr), stars.vectors, rtol=0, atol=1e-15
+    )
     np.testing.assert_allclose(catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15)
     there = catalog.Observer(year, units(rng, 1)[0], 3e4 * units(rng, 1)[0])
     seen = catalog.apparent(stars, there)
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 1, rtol=0, atol=1e-12)
     moved = np.linalg.norm(seen - catalog.at_epoch(stars, year), axis=1)
-    away = np.linalg.norm(seen + there.position_au, axis=1)  # near the Sun light is bent by more than a bit
-    assert (moved < 1.01e-4 + stars.parallax_rad + 2 * catalog.SUN_DEFLECTION_RAD / np.maximum(away, 1e-9)).all()
+    away = np.linalg.norm(
+        seen + there.position_au, axis=1
+    )  # near the Sun light is bent by more than a bit
+    assert (
+        moved
+        < 1.01e-4 + stars.parallax_rad + 2 * catalog.SUN_DEFLECTION_RAD / np.maximum(away, 1e-9)
+    ).all()
 
 
 @law(catalog.on_earth)
@@ -60,14 +80,20 @@ def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.d
 
 @law(StarCatalog.take, catalog.brighter_than, catalog.limit_for_density, shefex.asymmetric)
 @given(rng=SEEDS, limit=some.floats(-2, 7), wanted=some.floats(0, 1e3))
-def test_a_catalog_s_subset_is_what_was_asked_for(rng: np.random.Generator, limit: float, wanted: float) -> None:
+def test_a_catalog_s_subset_is_what_was_asked_for(
+    rng: np.random.Generator, limit: float, wanted: float
+) -> None:
     stars = drawn(rng)
     bright = catalog.brighter_than(stars, limit)
-    assert bright.id.tolist() == [n for n, mag in zip(stars.id, stars.v_mag, strict=True) if mag <= limit]
+    assert bright.id.tolist() == [
+        n for n, mag in zip(stars.id, stars.v_mag, strict=True) if mag <= limit
+    ]
     south = shefex.asymmetric(stars, limit, limit + 1)
     assert set(bright.id) <= set(south.id) <= set(catalog.brighter_than(stars, limit + 1).id)
     density = catalog.limit_for_density(stars, 1.0, wanted)
-    assert len(catalog.brighter_than(stars, density)) == np.clip(int(wanted * 4 * np.pi), 1, len(stars))
+    assert len(catalog.brighter_than(stars, density)) == np.clip(
+        int(wanted * 4 * np.pi), 1, len(stars)
+    )
 
 
 @law(shefex.thin, shefex.uniform)
@@ -106,7 +132,9 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     _, mag = catalog.light_centers(stars.vectors, stars.v_mag, groups)
     merged = catalog.merge_doubles(stars, near_rad)
     for told in (mag, merged.v_mag):
-        np.testing.assert_allclose(np.sum(10 ** (-0.4 * told)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0)
+        np.testing.assert_allclose(
+            np.sum(10 ** (-0.4 * told)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
+        )
     assert set(merged.id) <= set(stars.id)
     assert (np.diff(merged.v_mag) >= 0).all()
 
@@ -114,7 +142,9 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
 @pytest.mark.long
 @law(catalog.read, catalog.columns, ptase.read_cat)
 @given(
-    rows=some.lists(some.lists(some.floats() | some.text(max_size=5), min_size=5, max_size=8), max_size=3),
+    rows=some.lists(
+        some.lists(some.floats() | some.text(max_size=5), min_size=5, max_size=8), max_size=3
+    ),
     rng=SEEDS,
 )
 def test_any_table_is_a_catalog_or_is_none(
@@ -136,7 +166,9 @@ def test_any_table_is_a_catalog_or_is_none(
 
 @law(ptase.proc_cat, ptase.histogram, ptase.log)
 @given(rng=SEEDS, near_rad=some.floats(0, 1), step_mag=some.floats(0.1, 2))
-def test_a_prepared_catalog_counts_every_star(rng: np.random.Generator, near_rad: float, step_mag: float) -> None:
+def test_a_prepared_catalog_counts_every_star(
+    rng: np.random.Generator, near_rad: float, step_mag: float
+) -> None:
     stars = drawn(rng)
     raw = ptase.OnBoard(stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0)
     told = ptase.proc_cat(raw, near_rad)
@@ -161,8 +193,11 @@ def test_a_prepared_catalog_counts_every_star(rng: np.random.Generator, near_rad
     SkyIndex.bytes,
 )
 @given(rng=SEEDS, most_rad=some.floats(0.3, 3.2), count=some.integers(8, 50))
-def test_three_indexes_hold_the_pairs_that_there_are(rng: np.random.Generator, most_rad: float, count: int) -> None:
-    vectors, mag = units(rng, count), np.sort(rng.uniform(0, 6, count))
+def test_three_indexes_hold_the_pairs_that_there_are(
+    rng: np.random.Generator, most_rad: float, count: int
+) -> None:
+    vectors = units(rng, count)
+    mag = np.sort(rng.uniform(0, 6, count))
     every = apart(vectors, vectors)[np.triu_indices(count, 1)]
     pairs = int(np.count_nonzero(every <= most_rad))
     for build in (pair_index.build, lambda *told: sky_index.build(told[0], mag, told[1])):
@@ -180,7 +215,9 @@ def test_three_indexes_hold_the_pairs_that_there_are(rng: np.random.Generator, m
     z = slope * np.arange(len(kvector)) + offset
     assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
     bare = sky_index.build_without_pairs(vectors, mag)
-    assert bare.bytes == sum(part.nbytes for part in (*bare, *bare.cells) if isinstance(part, np.ndarray))
+    assert bare.bytes == sum(
+        part.nbytes for part in (*bare, *bare.cells) if isinstance(part, np.ndarray)
+    )
     assert set(bare.cell_star.tolist()) == set(range(count))
 
 
@@ -193,8 +230,12 @@ def test_any_array_is_indexed_or_refused(vectors: NDArray, mag: NDArray, most_ra
 
 @law(quad_index.build)
 @given(rng=SEEDS, count=some.integers(8, 50), height_rad=ANY)
-def test_quads_are_of_four_stars_and_by_their_cell(rng: np.random.Generator, count: int, height_rad: float) -> None:
-    index = quad_index.build(sky_index.build(units(rng, count), np.sort(rng.uniform(0, 6, count)), 3.2), height_rad)
+def test_quads_are_of_four_stars_and_by_their_cell(
+    rng: np.random.Generator, count: int, height_rad: float
+) -> None:
+    index = quad_index.build(
+        sky_index.build(units(rng, count), np.sort(rng.uniform(0, 6, count)), 3.2), height_rad
+    )
     assert len(index.star) == len(index.code) == index.first[-1]
     assert all(len(set(star)) == 4 for star in index.star.tolist())
     assert not len(index.code) or np.abs(index.code).max() <= 1

@@ -25,26 +25,39 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @law(refraction.raised, refraction.lowered, SiteAir.seen, SiteAir.without_air)
 @given(rng=SEEDS, pressure_hpa=some.floats(300, 1100), temperature_c=some.floats(-60, 45))
-def test_what_is_raised_is_lowered_again(rng: np.random.Generator, pressure_hpa: float, temperature_c: float) -> None:
+def test_what_is_raised_is_lowered_again(
+    rng: np.random.Generator, pressure_hpa: float, temperature_c: float
+) -> None:
     constants = refraction.refraction_constants(pressure_hpa, temperature_c, 6e-7)
-    directions, zenith = units(rng, 200), units(rng, 1)[0]
+    directions = units(rng, 200)
+    zenith = units(rng, 1)[0]
     up = refraction.raised(directions, zenith, *constants)
     high = up @ zenith > np.sin(np.radians(6.0))
     assert (up @ zenith >= directions @ zenith - 1e-15).all()
-    np.testing.assert_allclose(refraction.lowered(up, zenith, *constants)[high], directions[high], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(np.cross(up, directions) @ zenith, 0, rtol=0, atol=1e-12)  # in a vertical plane
+    np.testing.assert_allclose(
+        refraction.lowered(up, zenith, *constants)[high], directions[high], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.cross(up, directions) @ zenith, 0, rtol=0, atol=1e-12
+    )  # in a vertical plane
     air = SiteAir(50.0, 8.0, "2012-06-24T23:00", pressure_hpa, temperature_c)
     seen = air.seen(directions, 100.0)
-    np.testing.assert_allclose(seen, refraction.raised(directions, air.zenith(100.0), *constants), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        seen, refraction.raised(directions, air.zenith(100.0), *constants), rtol=0, atol=1e-15
+    )
     high = seen @ air.zenith(100.0) > np.sin(np.radians(6.0))
-    np.testing.assert_allclose(air.without_air(seen, 100.0)[high], directions[high], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        air.without_air(seen, 100.0)[high], directions[high], rtol=0, atol=1e-9
+    )
     none = SiteAir(50.0, 8.0, "2012-06-24T23:00", 0.0)
     np.testing.assert_allclose(none.seen(directions, 0.0), directions, rtol=0, atol=1e-15)
 
 
 @law(refraction.refraction_constants)
 @given(some.floats(500, 1060), some.floats(-20, 30), some.floats(4.5e-7, 1e-6))
-def test_refraction_is_erfa_s(pressure_hpa: float, temperature_c: float, wavelength_m: float) -> None:
+def test_refraction_is_erfa_s(
+    pressure_hpa: float, temperature_c: float, wavelength_m: float
+) -> None:
     """SOFA's A and B, of dry air: within 0.2" down to 15 degrees."""
     ours = refraction.refraction_constants(pressure_hpa, temperature_c, wavelength_m)
     theirs = erfa.refco(pressure_hpa, temperature_c, 0.0, wavelength_m * 1e6)
@@ -55,7 +68,9 @@ def test_refraction_is_erfa_s(pressure_hpa: float, temperature_c: float, wavelen
 
 @law(refraction.zenith_icrs, SiteAir.zenith)
 @given(DATES, some.floats(-90, 90), some.floats(-180, 180), some.floats(-1e5, 1e5))
-def test_the_zenith_is_erfa_s(utc: datetime.datetime, latitude: float, longitude: float, t_s: float) -> None:
+def test_the_zenith_is_erfa_s(
+    utc: datetime.datetime, latitude: float, longitude: float, t_s: float
+) -> None:
     """By precession and nutation of IAU 2006/2000A and the Earth rotation angle, of UTC for UT1 in both."""
     days = (utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + t_s / 86400
     theta = erfa.era00(erfa.DJ00, days) + np.radians(longitude)
@@ -64,7 +79,9 @@ def test_the_zenith_is_erfa_s(utc: datetime.datetime, latitude: float, longitude
     wanted = up @ erfa.c2i06a(erfa.DJ00, days + 69.184 / 86400)
     ours = SiteAir(latitude, longitude, utc).zenith(t_s)
     assert apart(ours, wanted) < 25 * ARCSEC
-    np.testing.assert_allclose(ours, refraction.zenith_icrs(days, lat, np.radians(longitude)), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        ours, refraction.zenith_icrs(days, lat, np.radians(longitude)), rtol=0, atol=1e-9
+    )
     zone = datetime.timezone(datetime.timedelta(hours=-3))
     aware = SiteAir(latitude, longitude, utc.replace(tzinfo=datetime.UTC).astimezone(zone))
     np.testing.assert_allclose(aware.zenith(t_s), ours, rtol=0, atol=1e-12)
@@ -72,8 +89,14 @@ def test_the_zenith_is_erfa_s(utc: datetime.datetime, latitude: float, longitude
 
 @pytest.mark.parametrize(
     ("change", "name"),
-    [({"latitude_deg": 91.0}, "latitude_deg"), ({"pressure_hpa": -1.0}, "pressure_hpa"), ({"epoch": "now"}, "date")],
+    [
+        ({"latitude_deg": 91.0}, "latitude_deg"),
+        ({"pressure_hpa": -1.0}, "pressure_hpa"),
+        ({"epoch": "now"}, "date"),
+    ],
 )
 def test_bad_air_is_refused(change: dict, name: str) -> None:
     with pytest.raises(ImageError, match=name):
-        SiteAir(**{"latitude_deg": 50.0, "longitude_deg": 8.0, "epoch": "2012-06-24T23:00"} | change)
+        SiteAir(
+            **{"latitude_deg": 50.0, "longitude_deg": 8.0, "epoch": "2012-06-24T23:00"} | change
+        )

@@ -8,7 +8,9 @@ from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalog
 from estimator.core.arrays import Floats
 
 PLAIN = interpreted("estimator.catalog.pair_buckets")
-bucket_of, candidates, build_pair_catalog = PLAIN.bucket_of, PLAIN.candidates, PLAIN.build_pair_catalog
+bucket_of = PLAIN.bucket_of
+candidates = PLAIN.candidates
+build_pair_catalog = PLAIN.build_pair_catalog
 
 
 def in_a_cap(rng: np.random.Generator, count: int, radius_rad: float) -> Floats:
@@ -40,7 +42,9 @@ def crowd() -> Floats:
 @pytest.fixture(scope="module")
 def published(crowd: Floats) -> PairCatalog:
     """Angles from 1.5 to 8 degrees in buckets of 5 arcsec (Padro 2012, section 2.4.6)."""
-    return build_pair_catalog(crowd, np.zeros(500), 5 * ARCSEC_RAD, (np.radians(1.5), np.radians(8)))
+    return build_pair_catalog(
+        crowd, np.zeros(500), 5 * ARCSEC_RAD, (np.radians(1.5), np.radians(8))
+    )
 
 
 def test_the_published_range_has_4680_buckets(published: PairCatalog) -> None:
@@ -52,7 +56,8 @@ def test_the_published_range_has_4680_buckets(published: PairCatalog) -> None:
 
 def test_eq_12_s_example_takes_the_third_and_second_bucket_from_the_end() -> None:
     # theta_max - 1.7 D with 3 epsilon = .6 D: PC range [theta_max - 2.3 D, theta_max - 1.1 D] (A14), of M = 40.
-    top, width = 0.1, 2e-3
+    top = 0.1
+    width = 2e-3
     angles = np.array([top - 1.7 * width - 0.6 * width, top - 1.7 * width + 0.6 * width])
     np.testing.assert_allclose((top - angles) / width, [2.3, 1.1], rtol=1e-12)  # rounding
     # From the first entry of bucket M - 2 to before that of bucket M, counted from 1; from 0: M - 3 and M - 2.
@@ -63,7 +68,10 @@ def test_eq_12_s_example_takes_the_third_and_second_bucket_from_the_end() -> Non
     stars = np.column_stack([np.sin(arc), np.zeros(21), np.cos(arc)])
     known = build_pair_catalog(stars, np.zeros(21), width, (top - 20 * width, top))
     begin, end = candidates(known, *angles)
-    assert names(known.pair[begin:end]).tolist() == [2, 3]  # with star 0, at theta_max - 2.5 D and - 1.5 D
+    assert names(known.pair[begin:end]).tolist() == [
+        2,
+        3,
+    ]  # with star 0, at theta_max - 2.5 D and - 1.5 D
 
 
 @pytest.mark.parametrize("width_arcsec", [5, 100, 3600, 1e6])
@@ -73,7 +81,9 @@ def test_nothing_within_the_gate_is_missed(crowd: Floats, width_arcsec: float) -
     known = build_pair_catalog(crowd, np.zeros(200), width_arcsec * ARCSEC_RAD)
     pair, angle = all_pairs(crowd)
     np.testing.assert_array_equal(names(known.pair), names(pair))
-    gate, slack = 29 * ARCSEC_RAD, 1e-12  # the two formulae differ by rounding
+    # the two formulae differ by rounding
+    gate = 29 * ARCSEC_RAD
+    slack = 1e-12
     keys = {}
     for theta in np.concatenate([rng.uniform(0, np.radians(12.5), 60), rng.choice(angle, 20)]):
         window = candidates(known, theta - gate, theta + gate)
@@ -100,9 +110,12 @@ def test_an_angle_that_ends_a_gate_exactly_is_not_missed(crowd: Floats) -> None:
         assert (p, q) in {(int(a), int(b)) for a, b in known.pair[begin:end]}
 
 
-def test_buckets_of_a_quarter_gate_look_at_an_eighth_too_many(published: PairCatalog, crowd: Floats) -> None:
+def test_buckets_of_a_quarter_gate_look_at_an_eighth_too_many(
+    published: PairCatalog, crowd: Floats
+) -> None:
     # Half a bucket at either end of a 40 arcsec gate: 5 / 40 = 12.5 % (A13).
-    rng, gate = np.random.default_rng(72), 20 * ARCSEC_RAD
+    rng = np.random.default_rng(72)
+    gate = 20 * ARCSEC_RAD
     angle = np.sort(all_pairs(crowd)[1])
     looked = expected = 0
     thetas = rng.uniform(np.radians(1.6), np.radians(7.9), 4000)

@@ -37,7 +37,9 @@ def test_the_pairs_are_those_of_brute_force(sky: pair_index.PairIndex) -> None:
     wanted = sorted(zip(i.tolist(), j.tolist(), strict=True))
     assert sorted(map(tuple, np.sort(sky.pair, axis=1).tolist())) == wanted
     # 1e-15: rounding of two formulas of the same angle.
-    np.testing.assert_allclose(sky.angle_rad, every[sky.pair[:, 0], sky.pair[:, 1]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        sky.angle_rad, every[sky.pair[:, 0], sky.pair[:, 1]], rtol=0, atol=1e-15
+    )
 
 
 def test_the_pairs_come_by_growing_angle(sky: pair_index.PairIndex) -> None:
@@ -53,14 +55,18 @@ def test_every_star_s_neighbors_are_all_of_them_by_growing_angle(sky: pair_index
         assert sorted(sky.neighbor[mine].tolist()) == near.tolist()
         assert np.all(np.diff(sky.separation_rad[mine]) >= 0)
         # 1e-15: rounding of two formulas of the same angle.
-        np.testing.assert_allclose(sky.separation_rad[mine], every[star, sky.neighbor[mine]], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(
+            sky.separation_rad[mine], every[star, sky.neighbor[mine]], rtol=0, atol=1e-15
+        )
 
 
 def test_bisection_finds_the_first_neighbor_beyond_an_angle(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(31)
     for star, low in zip(rng.integers(0, 600, 300), rng.uniform(-0.01, 0.33, 300), strict=True):
         mine = sky.separation_rad[sky.first[star] : sky.first[star + 1]]
-        assert pair_index.first_neighbor(sky, star, low) - sky.first[star] == np.searchsorted(mine, low)
+        assert pair_index.first_neighbor(sky, star, low) - sky.first[star] == np.searchsorted(
+            mine, low
+        )
 
 
 # Sixty-fourths are exact in binary, so that angles fall on one another, on the query's ends and on the line's nodes.
@@ -71,8 +77,11 @@ ANY_ANGLE = st.floats(0, 1, allow_subnormal=False) | SIXTY_FOURTHS
 @pytest.mark.long
 @settings(max_examples=400, deadline=None, derandomize=True)
 @given(st.lists(ANY_ANGLE, min_size=3, max_size=40).map(sorted), ANY_ANGLE, ANY_ANGLE)
-def test_the_k_vector_never_misses_and_takes_in_little(given_rad: list, one: float, other: float) -> None:
-    low, high = min(one, other), max(one, other)
+def test_the_k_vector_never_misses_and_takes_in_little(
+    given_rad: list, one: float, other: float
+) -> None:
+    low = min(one, other)
+    high = max(one, other)
     angle = np.array(given_rad)
     known = of_angles(angle)
     begin, end = pair_index.pair_range(known, low, high)
@@ -92,7 +101,9 @@ def test_an_angle_on_a_node_of_the_line_is_found() -> None:
     assert pair_index.pair_range(known, 0.4, 0.5)[1] >= 2
 
 
-def test_a_range_of_the_real_index_is_brute_force_s_with_a_few_more(sky: pair_index.PairIndex) -> None:
+def test_a_range_of_the_real_index_is_brute_force_s_with_a_few_more(
+    sky: pair_index.PairIndex,
+) -> None:
     rng = np.random.default_rng(32)
     extra = []
     for middle, half in zip(rng.uniform(0, 0.33, 500), rng.uniform(1e-5, 1e-3, 500), strict=True):
@@ -123,7 +134,9 @@ def test_the_candidates_of_one_angle_are_reference_s_f2(theta_deg: float) -> Non
     # Reference section 4: f2 = N (N - 1) / 2 sin(theta) sin(eps).
     known = pair_index.build(uniform_sky(2000, seed=34), np.radians(10.0))
     eps = np.radians(0.1)
-    begin, end = pair_index.pair_range(known, np.radians(theta_deg) - eps, np.radians(theta_deg) + eps)
+    begin, end = pair_index.pair_range(
+        known, np.radians(theta_deg) - eps, np.radians(theta_deg) + eps
+    )
     expected = 2000 * 1999 / 2 * np.sin(np.radians(theta_deg)) * np.sin(eps)
     assert end - begin == pytest.approx(expected, abs=4 * np.sqrt(expected))
 
@@ -132,12 +145,16 @@ def test_small_angles_keep_their_digits() -> None:
     # Stars 1e-8 rad apart, where arccos of the dot product would read 0 or 1.5e-8.
     vectors = np.array([[0.0, 0, 1], [1e-8, 0, 1], [0, 3e-8, 1]])
     known = pair_index.build(vectors, 1e-3)
-    np.testing.assert_allclose(known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0)  # rounding of 1
+    np.testing.assert_allclose(
+        known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0
+    )  # rounding of 1
 
 
 def test_a_sky_without_patterns_is_refused() -> None:
     with pytest.raises(ValueError, match=r"1 pairs .*within 1\.00 deg"):
-        pair_index.build(np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0.001, 1]]), np.radians(1.0))
+        pair_index.build(
+            np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0.001, 1]]), np.radians(1.0)
+        )
 
 
 @pytest.mark.slow
@@ -152,7 +169,9 @@ def test_a_range_of_magnitudes_is_brute_force_s() -> None:
 
 
 def test_without_magnitudes_or_a_gate_all_stars_are_alike(sky: pair_index.PairIndex) -> None:
-    known = pair_index.build(uniform_sky(50, seed=37), np.radians(60.0), magnitude=np.linspace(0, 5, 50))
+    known = pair_index.build(
+        uniform_sky(50, seed=37), np.radians(60.0), magnitude=np.linspace(0, 5, 50)
+    )
     assert pair_index.magnitude_range(sky, 3.0, 0.1) == (0, 600)
     assert pair_index.magnitude_range(known, np.nan, 0.1) == (0, 50)
     assert pair_index.magnitude_range(known, 3.0, np.inf) == (0, 50)
@@ -160,5 +179,7 @@ def test_without_magnitudes_or_a_gate_all_stars_are_alike(sky: pair_index.PairIn
 
 @pytest.mark.parametrize("magnitude", [np.linspace(5, 0, 600), np.zeros(3)])
 def test_magnitudes_that_fall_or_are_too_few_are_refused(magnitude: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r"of 600 stars; allowed: one for each, the brightest first"):
+    with pytest.raises(
+        ValueError, match=r"of 600 stars; allowed: one for each, the brightest first"
+    ):
         pair_index.build(uniform_sky(600, seed=30), np.radians(18.0), magnitude=magnitude)

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from estimator.catalog.ptase import BYTES_PER_ENTRY, Color, OnBoard, histogram, log, proc_cat, read_cat
+from estimator.catalog.ptase import (
+    BYTES_PER_ENTRY,
+    Color,
+    OnBoard,
+    histogram,
+    log,
+    proc_cat,
+    read_cat,
+)
 from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
@@ -30,7 +38,9 @@ def test_the_counts_are_the_published_ones(limit: float, published: int) -> None
 
 def test_the_file_s_order_stays_until_the_catalog_is_processed() -> None:
     raw = read_cat(FILE, 5.0)
-    numbers = [int(line.split(",")[0]) for line in FILE.read_text().splitlines() if line[:1].isdigit()]
+    numbers = [
+        int(line.split(",")[0]) for line in FILE.read_text().splitlines() if line[:1].isdigit()
+    ]
     place = {hip: n for n, hip in enumerate(numbers)}
     assert np.all(np.diff([place[hip] for hip in raw.id]) > 0)
     assert np.any(np.diff(raw.magnitude) < 0)
@@ -38,7 +48,8 @@ def test_the_file_s_order_stays_until_the_catalog_is_processed() -> None:
 
 
 def test_the_mission_s_epoch_is_erfa_s_space_motion() -> None:
-    raw, still = read_cat(FILE, 4.0, 2010.0), read_cat(FILE, 4.0)
+    raw = read_cat(FILE, 4.0, 2010.0)
+    still = read_cat(FILE, 4.0)
     rows = [line.split(",") for line in FILE.read_text().splitlines() if line[:1].isdigit()]
     table = {int(row[0]): [float(x) for x in row[1:5]] for row in rows}
     ra, dec, pm_ra, pm_dec = np.array([table[hip] for hip in raw.id]).T
@@ -56,7 +67,9 @@ def test_an_instrument_s_magnitudes_follow_the_formula_and_a_missing_color_is_th
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "three.ecsv"
-    path.write_text(HEADER + "1,0,0,0,0,0,4.0,0.0,0.0\n2,9,0,0,0,0,5.0,1.5,1.0\n3,20,0,0,0,0,5.0,,\n")
+    path.write_text(
+        HEADER + "1,0,0,0,0,0,4.0,0.0,0.0\n2,9,0,0,0,0,5.0,1.5,1.0\n3,20,0,0,0,0,5.0,,\n"
+    )
     seen = read_cat(path, 6.0, color=Color(0.1, -0.2, 0.3))
     # By hand: 4 + .1; 5 + .1 - .3 + .3; 5 + .1 - .2 * .65 + .3 * .72.
     np.testing.assert_allclose(seen.magnitude, [4.1, 5.1, 5.186], rtol=0, atol=1e-12)  # rounding

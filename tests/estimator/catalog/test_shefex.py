@@ -42,7 +42,9 @@ def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarCatalo
     expected = len(even) * (len(even) - 1) / 4 * (1 - np.cos(np.radians(18.57)))
     assert len(even) == pytest.approx(COUNT, abs=1)
     assert expected == pytest.approx(53_243, rel=0.002)
-    assert len(pair_index.build(even.vectors, np.radians(18.57)).pair) == pytest.approx(expected, rel=0.02)
+    assert len(pair_index.build(even.vectors, np.radians(18.57)).pair) == pytest.approx(
+        expected, rel=0.02
+    )
     clumped = catalog.brighter_than(stars, float(np.sort(stars.v_mag)[len(even) - 1]))
     assert len(pair_index.build(clumped.vectors, np.radians(18.57)).pair) > 1.1 * expected
 
@@ -55,7 +57,9 @@ def test_fewer_fields_are_too_poor_in_the_uniform_catalog(stars: StarCatalog) ->
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
     radius = np.sqrt(np.radians(14.87) * np.radians(11.15) / np.pi)
     poor = [
-        np.mean(cKDTree(known.vectors).query_ball_point(sights, chord(radius), return_length=True) < 4)
+        np.mean(
+            cKDTree(known.vectors).query_ball_point(sights, chord(radius), return_length=True) < 4
+        )
         for known in (even, bright)
     ]
     assert poor[0] < poor[1] / 3
@@ -70,7 +74,9 @@ def test_the_hemispheres_have_their_own_limits(stars: StarCatalog) -> None:
 
 
 @pytest.mark.long
-def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(stars: StarCatalog) -> None:
+def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(
+    stars: StarCatalog,
+) -> None:
     apart = np.radians(3.0)
     kept = thin(stars, apart, BRIGHT_MAG)
     bright = stars.v_mag <= BRIGHT_MAG

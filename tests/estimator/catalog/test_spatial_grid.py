@@ -22,7 +22,8 @@ def patch(rng: np.random.Generator, count: int) -> Floats:
 def test_the_stars_within_a_distance_are_brute_force_s(make, chord: float) -> None:
     rng = np.random.default_rng(1)
     vectors = make(rng, 700)
-    known, out = spatial_grid.build(vectors), np.empty(700, np.int64)
+    known = spatial_grid.build(vectors)
+    out = np.empty(700, np.int64)
     # Some of the stars themselves, the poles of the axes, and anywhere.
     for place in np.vstack([vectors[:40], np.eye(3), -np.eye(3), directions(rng, 100)]):
         count = spatial_grid.within(known, vectors, *place, chord, out)

@@ -14,10 +14,14 @@ from estimator.detection import detect
 from estimator.detection.background import FILTERED_NOISE
 
 SIGMA_PX = 0.7
-CELL_PX, CELLS = 64, 12  # stars so far apart that the sky between them is not lifted by their light
+# stars so far apart that the sky between them is not lifted by their light
+CELL_PX = 64
+CELLS = 12
 
 
-def gaussian(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA_PX) -> np.ndarray:
+def gaussian(
+    shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA_PX
+) -> np.ndarray:
     """Light of a Gaussian integrated over each pixel, whose middle is the integer."""
 
     def share(count: int, at: float) -> np.ndarray:
@@ -37,14 +41,17 @@ def disk(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarra
 
 def cramer_rao_px(flux_e: float, read_noise_e: float) -> float:
     """Bound for x of a star whose place, flux, width and sky are unknown, averaged over places in a pixel."""
-    shape, step = (25, 25), 1e-4
+    shape = (25, 25)
+    step = 1e-4
 
     def bound(x: float, y: float) -> float:
         def model(p: np.ndarray) -> np.ndarray:
             return (p[4] + gaussian(shape, p[0], p[1], flux_e * p[2], p[3])).ravel()
 
         p = np.array([x, y, 1.0, SIGMA_PX, 0.0])
-        slopes = np.array([(model(p + step * e) - model(p - step * e)) / (2 * step) for e in np.eye(5)])
+        slopes = np.array(
+            [(model(p + step * e) - model(p - step * e)) / (2 * step) for e in np.eye(5)]
+        )
         fisher = slopes / (model(p) + read_noise_e**2) @ slopes.T
         return np.linalg.inv(fisher)[0, 0]
 
@@ -52,14 +59,19 @@ def cramer_rao_px(flux_e: float, read_noise_e: float) -> float:
     return float(np.sqrt(np.mean([bound(12 + x, 12 + y) for x in places for y in places])))
 
 
-def starfield(rng: np.random.Generator, flux_e: float, noise_e: float) -> tuple[np.ndarray, np.ndarray]:
+def starfield(
+    rng: np.random.Generator, flux_e: float, noise_e: float
+) -> tuple[np.ndarray, np.ndarray]:
     """An image of 144 equal stars with photon and read noise on a sky of 100, and where they are."""
-    image, places = np.empty((CELL_PX * CELLS, CELL_PX * CELLS)), []
+    image = np.empty((CELL_PX * CELLS, CELL_PX * CELLS))
+    places = []
     for row in range(CELLS):
         for column in range(CELLS):
             x, y = rng.uniform(31, 32, 2)
             cell = rng.poisson(gaussian((CELL_PX, CELL_PX), x, y, flux_e))
-            image[row * CELL_PX : (row + 1) * CELL_PX, column * CELL_PX : (column + 1) * CELL_PX] = cell
+            image[
+                row * CELL_PX : (row + 1) * CELL_PX, column * CELL_PX : (column + 1) * CELL_PX
+            ] = cell
             places.append((column * CELL_PX + x, row * CELL_PX + y))
     return image + rng.normal(100, noise_e, image.shape), np.array(places)
 
@@ -67,7 +79,8 @@ def starfield(rng: np.random.Generator, flux_e: float, noise_e: float) -> tuple[
 def errors_of(name: str, flux_e: float, noise_e: float, gain_e_dn: float, seed: int) -> tuple:
     """Errors and reported sigmas over five star fields in DN of so many electrons."""
     rng = np.random.default_rng(seed)
-    off, sigma = [], []
+    off = []
+    sigma = []
     for _ in range(5):
         image, places = starfield(rng, flux_e, noise_e)
         image /= gain_e_dn
@@ -112,7 +125,8 @@ def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(nam
 @pytest.mark.parametrize("radius", [2.0, 5.0, 10.4])
 def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
     # Reference section 2: an LED of 2 mm is a disk of 20.8 px. Larger than the fit's window, it falls back.
-    x, y = 60.37, 58.81
+    x = 60.37
+    y = 58.81
     image = 10 + 200 * disk((128, 128), x, y, radius)
     found = cog(image, detect.local(image, min_area_px=1))
     light = image - 10
@@ -132,7 +146,8 @@ def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
 def test_any_light_but_zero_has_a_center_of_gravity(light: float) -> None:
     """A quarter and three quarters of it in two pixels, on a sky of zero; none at all is of no place."""
     moments = interpreted("estimator.centroiding.moments")
-    image, sky = np.zeros((9, 9)), np.zeros((3, 3))
+    image = np.zeros((9, 9))
+    sky = np.zeros((3, 3))
     image[4, 3:5] = light * np.array([0.25, 0.75])
     boxes = np.array([[3, 4, 4, 4]])
     x, y, sigma, flux = moments.center_of_gravity(image, boxes, sky, sky + 1.0, 1.0)[0]
@@ -149,7 +164,10 @@ def test_the_center_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
     phases = np.linspace(-0.5, 0.5, 21)
     images = [100 + gaussian((40, 40), 20 + x, 20.0, 1e4, sigma) for x in phases]
     off = np.array(
-        [cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x for im, x in zip(images, phases, strict=True)]
+        [
+            cog(im, detect.local(im, min_area_px=1)).xy_px[0, 0] - 20 - x
+            for im, x in zip(images, phases, strict=True)
+        ]
     )
     curve = -np.exp(-2 * (np.pi * sigma) ** 2) / np.pi * np.sin(2 * np.pi * phases)
     # The second harmonic is exp(-8 pi^2 sigma^2) / (2 pi), .0001 at sigma .3.
@@ -161,7 +179,8 @@ def test_what_the_fit_cannot_fit_keeps_its_center_of_gravity() -> None:
     image += gaussian((128, 128), 2.0, 100.2, 2e4)  # too near the border for a window of 7x7
     blobs = detect.local(image, min_area_px=1)
     assert len(blobs) == 2
-    fitted, wanted = gaussian_fit(image, blobs), cog(image, blobs)
+    fitted = gaussian_fit(image, blobs)
+    wanted = cog(image, blobs)
     np.testing.assert_array_equal(fitted.xy_px, wanted.xy_px)
     np.testing.assert_array_equal(fitted.sigma_px, wanted.sigma_px)
     np.testing.assert_array_equal(fitted.flux, wanted.flux)
@@ -172,7 +191,9 @@ def test_what_the_fit_cannot_fit_keeps_its_center_of_gravity() -> None:
     ("flux_e", "noise_e", "published_px"),
     [(1e4, 15, 0.0097), (1e5, 15, 0.0025), (3e3, 15, 0.022), (1e5, 0.5, 0.0024)],
 )
-def test_the_fit_reaches_the_cramer_rao_bound(flux_e: float, noise_e: float, published_px: float) -> None:
+def test_the_fit_reaches_the_cramer_rao_bound(
+    flux_e: float, noise_e: float, published_px: float
+) -> None:
     bound = cramer_rao_px(flux_e, noise_e)
     # The reference's table, section 3, has two figures.
     assert bound == pytest.approx(published_px, rel=0.04)
@@ -209,23 +230,32 @@ def test_the_reported_sigma_is_true(
 def test_the_windowed_centroid_s_error_is_an_eighth_above_the_minimum(sigma: float) -> None:
     """In noise of the sky a Gaussian sampled at points is placed to sqrt(8 pi) sigma^2 n / F at best in x and y."""
     y, x = np.mgrid[:61, :61]
-    image = 1e4 * np.exp(-((x - 30.3) ** 2 + (y - 29.8) ** 2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+    image = (
+        1e4 * np.exp(-((x - 30.3) ** 2 + (y - 29.8) ** 2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+    )
     noise = np.full((1, 1), 3.0 * FILTERED_NOISE)
     box = np.array([[25, 25, 35, 35]])
-    row = moments.gaussian_windowed(image, np.array([[30.0, 30.0]]), box, np.zeros((1, 1)), noise, 1e12)[0]
+    row = moments.gaussian_windowed(
+        image, np.array([[30.0, 30.0]]), box, np.zeros((1, 1)), noise, 1e12
+    )[0]
     np.testing.assert_allclose(row[:2], [30.3, 29.8], rtol=0, atol=1e-3)
     assert row[2] == pytest.approx(9 / 8 * np.sqrt(8 * np.pi) * sigma**2 * 3.0 / 1e4, rel=0.01)
 
 
 def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
-    image, grid, last = gaussian((17, 21), 1.2, 2.3, 1e4, 0.9), np.ones((1, 1)), np.array([20, 16])
+    image = gaussian((17, 21), 1.2, 2.3, 1e4, 0.9)
+    grid = np.ones((1, 1))
+    last = np.array([20, 16])
 
     def mirrored(*flip: bool) -> np.ndarray:
         axes = [axis for axis in (0, 1) if flip[1 - axis]]
         corners = np.where(flip, last - [[0, 0], [4, 5]], [[0, 0], [4, 5]])
-        box, start = np.hstack([corners.min(axis=0), corners.max(axis=0)])[None], np.where(flip, last - [1, 2], [1, 2])
+        box = np.hstack([corners.min(axis=0), corners.max(axis=0)])[None]
+        start = np.where(flip, last - [1, 2], [1, 2])
         flipped = np.ascontiguousarray(np.flip(image, axes))
-        row = moments.gaussian_windowed(flipped, start[None].astype(float), box, 0 * grid, grid, 1.0)[0]
+        row = moments.gaussian_windowed(
+            flipped, start[None].astype(float), box, 0 * grid, grid, 1.0
+        )[0]
         return np.append(np.where(flip, last - row[:2], row[:2]), row[2:])
 
     wanted = mirrored(False, False)
@@ -236,10 +266,16 @@ def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
 
 def test_a_large_saturated_star_is_placed_by_its_wings() -> None:
     """In the largest window, of 21 px; by the interpreter, which refuses an index beyond an array."""
-    plain, image = interpreted("estimator.centroiding.gaussian_fit"), gaussian((41, 41), 20.3, 19.8, 1e5, 1.2)
-    level, noise, box = np.zeros((1, 1)), np.ones((1, 1)), np.array([[10, 10, 30, 30]])
-    clipped, start = np.minimum(image, 5000.0), np.array([[20.0, 20.0]])
-    row = plain.fit_all(clipped, start, np.array([4e4]), box, np.array([5000.0]), level, noise, 1.0, 5000.0)[0]
+    plain = interpreted("estimator.centroiding.gaussian_fit")
+    image = gaussian((41, 41), 20.3, 19.8, 1e5, 1.2)
+    level = np.zeros((1, 1))
+    noise = np.ones((1, 1))
+    box = np.array([[10, 10, 30, 30]])
+    clipped = np.minimum(image, 5000.0)
+    start = np.array([[20.0, 20.0]])
+    row = plain.fit_all(
+        clipped, start, np.array([4e4]), box, np.array([5000.0]), level, noise, 1.0, 5000.0
+    )[0]
     np.testing.assert_allclose(row[:2], [20.3, 19.8], rtol=0, atol=1e-3)
     assert row[3] == pytest.approx(1e5, rel=1e-3)
 
@@ -268,7 +304,9 @@ def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
-    image = np.random.default_rng(24).normal(300, 2, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)
+    image = np.random.default_rng(24).normal(300, 2, (128, 128)) + gaussian(
+        (128, 128), 60.2, 70.9, 5e4
+    )
     found = CENTROIDERS[name](image, detect.local(image))
     # 17x17 pixels of noise 2, and of a sky level known to 0.1: five deviations of 45.
     assert found.flux[0] == pytest.approx(5e4, abs=225)
@@ -277,7 +315,9 @@ def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_a_big_endian_frame_gives_the_same_centroids(name: str) -> None:
-    image = np.random.default_rng(25).normal(300, 5, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)
+    image = np.random.default_rng(25).normal(300, 5, (128, 128)) + gaussian(
+        (128, 128), 60.2, 70.9, 5e4
+    )
     foreign = image.astype(">f8")
     np.testing.assert_array_equal(
         CENTROIDERS[name](foreign, detect.local(foreign)).xy_px,
@@ -293,10 +333,14 @@ def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
-def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(radius: float, bright_e: float) -> None:
+def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(
+    radius: float, bright_e: float
+) -> None:
     # An edge blurred by optics of 0.8 px; the reference's LED of 20.8 px, and a smaller one.
     rng = np.random.default_rng(27)
-    off, sigma, by_gravity = [], [], []
+    off = []
+    sigma = []
+    by_gravity = []
     for _ in range(80):
         x, y = rng.uniform(63, 64, 2)
         light = ndimage.gaussian_filter(bright_e * disk((128, 128), x, y, radius), 0.8)
@@ -315,7 +359,8 @@ def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(radius: 
 @pytest.mark.slow
 def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     rng = np.random.default_rng(28)
-    off, sigma = [], []
+    off = []
+    sigma = []
     for _ in range(60):
         x, y = rng.uniform(63, 64, 2)
         light = ndimage.gaussian_filter(3000 * disk((128, 128), x, y, 10.4), 0.8)
@@ -331,11 +376,15 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
 def test_the_disk_fit_gives_place_flux_and_radius_of_a_blurred_disk() -> None:
     """Without noise, on a sky of 50; by the interpreter, which refuses what is beyond an array."""
     fit = interpreted("estimator.centroiding.disk_fit")
-    radius, x, y = 4.0, 15.3, 14.8
+    radius = 4.0
+    x = 15.3
+    y = 14.8
     light = 100 * ndimage.gaussian_filter(disk((31, 31), x, y, radius), 0.6)
-    area, sky = np.array([int(np.pi * radius**2)]), np.full((3, 3), 50.0)
+    area = np.array([int(np.pi * radius**2)])
+    sky = np.full((3, 3), 50.0)
     boxes = np.array([[11, 10, 20, 19]])
-    place, flux = np.array([[15.0, 15.0]]), np.array([light.sum()])
+    place = np.array([[15.0, 15.0]])
+    flux = np.array([light.sum()])
     row = fit.fit_all(light + 50, place, flux, area, boxes, sky, sky / 50, 1.0, np.inf)[0]
     assert row[:2] == pytest.approx([x, y], abs=0.02)  # pixels are not narrow beside the edge
     assert 0 < row[2] < 0.05

@@ -18,7 +18,13 @@ from estimator.core.types import NO_PRIORS, Background, Blobs
 def blobs(box: list[int]) -> Blobs:
     sky = Background(np.zeros((1, 1)), np.ones((1, 1)), 30)
     return Blobs(
-        np.array([box]), np.array([[5.0, 5.0]]), np.ones(1), np.ones(1), np.ones(1, int), sky, np.zeros(1, int)
+        np.array([box]),
+        np.array([[5.0, 5.0]]),
+        np.ones(1),
+        np.ones(1),
+        np.ones(1, int),
+        sky,
+        np.zeros(1, int),
     )
 
 
@@ -30,7 +36,9 @@ def test_blobs_within_an_image_pass_and_others_do_not(rng: np.random.Generator) 
     inside = blobs([0, 0, int(width) - 1, int(height) - 1])
     assert centroid.prepare(image, inside, 1.0, NO_PRIORS) is image
     for box in ([-1, 0, 3, 3], [0, -1, 3, 3], [0, 0, int(width), 3], [0, 0, 3, int(height)]):
-        with pytest.raises(ImageError, match=f"blobs reach beyond the image of {width}x{height} pixels"):
+        with pytest.raises(
+            ImageError, match=f"blobs reach beyond the image of {width}x{height} pixels"
+        ):
             centroid.prepare(image, blobs(box), 1.0, NO_PRIORS)
 
 

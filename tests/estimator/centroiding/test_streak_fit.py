@@ -20,18 +20,28 @@ SIGMA_PX = 0.7
 
 
 def smeared(
-    shape: tuple[int, int], x: float, y: float, dx: float, dy: float, flux: float, sigma: float = SIGMA_PX
+    shape: tuple[int, int],
+    x: float,
+    y: float,
+    dx: float,
+    dy: float,
+    flux: float,
+    sigma: float = SIGMA_PX,
 ) -> np.ndarray:
     """A Gaussian integrated over each pixel, on its way from end to end in 80 steps."""
 
     def share(count: int, at: np.ndarray) -> np.ndarray:
-        return np.diff(erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1) / 2
+        return (
+            np.diff(erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1) / 2
+        )
 
     t = (np.arange(80) + 0.5) / 80 - 0.5
     return flux / 80 * share(shape[0], y + t * dy).T @ share(shape[1], x + t * dx)
 
 
-def field(rng: np.random.Generator, dx: float, dy: float, fluxes_e: np.ndarray, noise_e: float = 10.0):
+def field(
+    rng: np.random.Generator, dx: float, dy: float, fluxes_e: np.ndarray, noise_e: float = 10.0
+):
     """A 512x512 frame of up to 36 streaks on a lattice, and their middles."""
     lattice = np.array([(x, y) for y in range(56, 480, 80) for x in range(56, 480, 80)], float)
     xy = lattice[: len(fluxes_e)] + rng.uniform(-8, 8, (len(fluxes_e), 2))
@@ -54,14 +64,17 @@ def near(found: np.ndarray, wanted: np.ndarray) -> int:
 
 def cramer_rao_px(length: float, flux_e: float, noise_e: float) -> tuple[float, float]:
     """Bound along and across a streak of known length, direction, width and sky, averaged over places in a pixel."""
-    shape, step = (31, 41), 1e-4
+    shape = (31, 41)
+    step = 1e-4
 
     def bound(x: float, y: float) -> np.ndarray:
         def model(p: np.ndarray) -> np.ndarray:
             return smeared(shape, p[0], p[1], length, 0.0, flux_e * p[2]).ravel()
 
         p = np.array([x, y, 1.0])
-        slopes = np.array([(model(p + step * e) - model(p - step * e)) / (2 * step) for e in np.eye(3)])
+        slopes = np.array(
+            [(model(p + step * e) - model(p - step * e)) / (2 * step) for e in np.eye(3)]
+        )
         fisher = slopes / (model(p) + noise_e**2) @ slopes.T
         return np.linalg.inv(fisher).diagonal()[:2]
 
@@ -105,7 +118,8 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
     fluxes = np.concatenate([np.full(12, 1000.0), np.full(24, 3000.0)])
     found = strangers = 0
     for angle in rng.uniform(0, np.pi, 6):
-        dx, dy = 12 * np.cos(angle), 12 * np.sin(angle)
+        dx = 12 * np.cos(angle)
+        dy = 12 * np.sin(angle)
         image, xy = field(rng, dx, dy, fluxes)
         blobs = detect.default(image, priors=FramePriors((dx, dy) if told else None))
         found += near(blobs.xy_px, xy)
@@ -116,7 +130,8 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
 
 def test_of_noise_alone_the_line_filter_keeps_what_is_five_pixels_and_bright() -> None:
     # At two sigma noise itself makes blobs: they are scipy's labels of the filtered frame, by the rule.
-    image, streak_px = np.random.default_rng(69).normal(1000, 9, (256, 256)), (9.0, 0.0)
+    image = np.random.default_rng(69).normal(1000, 9, (256, 256))
+    streak_px = (9.0, 0.0)
     background = frame_background.estimate_background(image)
     blobs = detect.detect_streaks(image, background, 2.0, 1000, FramePriors(streak_px))
     taps = detect.line_taps(streak_px)
@@ -147,15 +162,19 @@ def test_a_line_filter_gains_over_a_round_one() -> None:
 @pytest.mark.parametrize("length", [4.41, 8.8, 15.0])
 def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> None:
     rng = np.random.default_rng(64)
-    scaled, off, ends_off = [], [], []
+    scaled = []
+    off = []
+    ends_off = []
     for angle in rng.uniform(0, np.pi, 10):
-        dx, dy = length * np.cos(angle), length * np.sin(angle)
+        dx = length * np.cos(angle)
+        dy = length * np.sin(angle)
         image, xy = field(rng, dx, dy, np.full(36, 8000.0))
         priors = FramePriors((dx, dy))
         blobs = detect.default(image, priors=priors)
         found = streak(image, blobs, 1.0, priors)
         rows = nearest(found.xy_px, xy)
-        error, spread = found.xy_px[rows] - xy, found.covariance_px2[rows]
+        error = found.xy_px[rows] - xy
+        spread = found.covariance_px2[rows]
         scaled.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error))
         off.append(error @ np.array([[dx, -dy], [dy, dx]]) / length)
         begin, end = streak_ends(image, blobs, 1.0, priors)
@@ -197,7 +216,8 @@ def test_the_fit_reaches_the_bound_along_and_across() -> None:
 
 def test_a_faint_streak_does_not_call_a_piece_of_itself_the_whole() -> None:
     rng = np.random.default_rng(71)
-    priors, scaled = FramePriors((14.0, 10.0)), []
+    priors = FramePriors((14.0, 10.0))
+    scaled = []
     for _ in range(8):
         image, xy = field(rng, 14.0, 10.0, np.full(36, 1000.0))  # signal to noise of 7
         found = streak(image, detect.default(image, priors=priors), 1.0, priors)
@@ -217,7 +237,8 @@ def test_the_line_fit_beats_the_center_of_gravity() -> None:
     image, xy = field(rng, 9.0, 7.0, np.full(36, 4000.0))
     priors = FramePriors((9.0, 7.0))
     blobs = detect.default(image, priors=priors)
-    fitted, by_gravity = streak(image, blobs, 1.0, priors), cog(image, blobs, 1.0)
+    fitted = streak(image, blobs, 1.0, priors)
+    by_gravity = cog(image, blobs, 1.0)
     errors = [found.xy_px[nearest(found.xy_px, xy)] - xy for found in (fitted, by_gravity)]
     assert errors[0].std() < errors[1].std() / 2
     # A streak of 11 px has 130 pixels of noise of 12 e-: some 2 % of its light for one, 0.4 % for all.
@@ -229,7 +250,8 @@ def test_round_stars_get_the_round_fit() -> None:
     image, _ = field(rng, 0.0, 0.0, np.full(36, 8000.0))
     blobs = detect.default(image)
     assert blobs.streak_px is None
-    lines, rounds = streak(image, blobs), gaussian_fit(image, blobs)
+    lines = streak(image, blobs)
+    rounds = gaussian_fit(image, blobs)
     np.testing.assert_array_equal(lines.xy_px, rounds.xy_px)
     np.testing.assert_array_equal(lines.sigma_px, rounds.sigma_px)
     assert lines.covariance_px2 is None  # x and y are alike
@@ -239,7 +261,9 @@ def test_round_stars_get_the_round_fit() -> None:
 @pytest.mark.parametrize("stretch", [1.0, 1.5])
 def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float) -> None:
     """The vector without priors has no bias and an honest covariance, also if the frame's streak is half too long."""
-    true, nees, errors = np.array([6.0, 3.5]), [], []
+    true = np.array([6.0, 3.5])
+    nees = []
+    errors = []
     for seed in range(8):
         image, _ = field(np.random.default_rng([69, seed]), *true, np.full(36, 3_000.0))
         found = streak(image, detect.default(image), 1.0, FramePriors(tuple(stretch * true)))
@@ -248,10 +272,12 @@ def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float
         own = found.streak_px * np.sign(found.streak_px @ true)[:, None]
         errors.append(own - true)
         nees += [
-            error @ np.linalg.solve(P, error) for error, P in zip(own - true, found.streak_covariance_px2, strict=True)
+            error @ np.linalg.solve(P, error)
+            for error, P in zip(own - true, found.streak_covariance_px2, strict=True)
         ]
     assert np.mean(nees) == pytest.approx(2, abs=4 * 2 / np.sqrt(len(nees)))
-    offset, spread = np.mean(np.concatenate(errors), axis=0), np.std(np.concatenate(errors), axis=0)
+    offset = np.mean(np.concatenate(errors), axis=0)
+    spread = np.std(np.concatenate(errors), axis=0)
     np.testing.assert_allclose(offset, 0, rtol=0, atol=4 * spread.max() / np.sqrt(len(nees)))
 
 
@@ -264,8 +290,11 @@ def test_a_star_s_own_vector_is_that_of_the_data_without_the_priors(seed: int) -
     root = 0.5 * rng.standard_normal((7, 7)) + 2 * np.eye(7)
     scale = np.array([0.1, 0.1, 20.0, 0.9, 0.06, 0.1, 1.0])
     covariance = scale[:, None] * np.linalg.inv(root @ root.T) * scale
-    prior_mean, prior = np.array([10.5, 0.7]), np.zeros((7, 7))
-    prior[place, place] = 1 / np.array([streak_fit.length_sigma_px(10.5), streak_fit.ANGLE_RAD]) ** 2
+    prior_mean = np.array([10.5, 0.7])
+    prior = np.zeros((7, 7))
+    prior[place, place] = (
+        1 / np.array([streak_fit.length_sigma_px(10.5), streak_fit.ANGLE_RAD]) ** 2
+    )
     normal = np.linalg.inv(covariance) + prior
     pull = np.zeros(7)
     pull[place] = prior[place, place] * prior_mean
@@ -273,11 +302,14 @@ def test_a_star_s_own_vector_is_that_of_the_data_without_the_priors(seed: int) -
     out = np.full(5, np.nan)
     streak_fit._own_vector(np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out)
     length, angle = data_mean[place]
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     by_both = np.array([[c, -length * s], [s, length * c]])
     own = covariance[np.ix_(place, place)] + np.diag([0.01, 0.0])
     np.testing.assert_allclose(out[:2], [length * c, length * s], rtol=1e-9)
-    np.testing.assert_allclose(out[[2, 4, 4, 3]].reshape(2, 2), by_both @ own @ by_both.T, rtol=1e-7)
+    np.testing.assert_allclose(
+        out[[2, 4, 4, 3]].reshape(2, 2), by_both @ own @ by_both.T, rtol=1e-7
+    )
 
 
 def test_a_frame_s_short_streak_is_corrected_by_its_stars() -> None:
@@ -300,27 +332,37 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
         found += len(detect.default(image, priors=FramePriors((10.0, 6.0))))
     expected = 6 * 2**20 / 5 * stats.norm.sf(5)
     assert found <= 3 + 4 * expected
-    assert frame_background.estimate_background(image).noise.mean() == pytest.approx(9 * 0.375, rel=0.03)
+    assert frame_background.estimate_background(image).noise.mean() == pytest.approx(
+        9 * 0.375, rel=0.03
+    )
 
 
 @pytest.mark.slow
 def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
     """Five streaks of which the filter for round stars sees two at most; nobody tells which way they go."""
     rng = np.random.default_rng(31)
-    middles, along = rng.uniform(40, 360, (5, 2)), np.array([10.0, 6.0])
+    middles = rng.uniform(40, 360, (5, 2))
+    along = np.array([10.0, 6.0])
     rows, columns = np.mgrid[:400, :400]
     light = np.zeros((400, 400))
     for middle in middles:
         for step in np.linspace(-0.5, 0.5, 60):
             x, y = middle + step * along
-            light += 500 / 60 / (2 * np.pi * 0.64) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
+            light += (
+                500
+                / 60
+                / (2 * np.pi * 0.64)
+                * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
+            )
     image = 100 + light + rng.normal(0, 10, light.shape)
     told = detect.default(image, priors=FramePriors(tuple(along)))
     unaided = detect.default(image)
     assert len(detect.local(image)) <= 2
     assert len(told) == 5
     near = np.linalg.norm(unaided.xy_px[:, None] - middles, axis=2).min(axis=0)
-    assert np.sum(near < 3) >= 4  # one in five may be lost for a direction that is not quite its own
+    assert (
+        np.sum(near < 3) >= 4
+    )  # one in five may be lost for a direction that is not quite its own
     assert len(unaided) <= 6
 
 
@@ -336,7 +378,8 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
     p = np.array([20.3, 14.8, 500.0, 9.0, 0.4, 0.8, 7.0])
 
     def model(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows, weight = np.ones((8, x.size)), np.empty(x.size)
+        rows = np.ones((8, x.size))
+        weight = np.empty(x.size)
         plain._rows(np.vstack([x, y, np.zeros(x.size)]), 3.0, 2.0, at, rows, weight)
         np.testing.assert_allclose(weight, 1 / (9 + (-rows[7] - at[plain.SKY]) / 2), rtol=1e-9)
         return -rows[7], rows  # the pixels are zero: the residual is minus the model
@@ -357,14 +400,19 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
 
 
 @pytest.mark.parametrize(
-    "start", [(0.2, 0.1, 0.3, 0.02), (2.5, -1.0, 0.0, 0.0), (0.0, 0.0, 6.0, 0.0), (0.0, 0.0, 0, 0.3)]
+    "start",
+    [(0.2, 0.1, 0.3, 0.02), (2.5, -1.0, 0.0, 0.0), (0.0, 0.0, 6.0, 0.0), (0.0, 0.0, 0, 0.3)],
 )
-def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(start: tuple[float, float, float, float]) -> None:
+def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(
+    start: tuple[float, float, float, float],
+) -> None:
     """Of place, length and direction: where a first step would go too far it is shortened; almost without noise."""
     plain = interpreted("estimator.centroiding.streak_fit")
     y, x = (grid.ravel().astype(float) for grid in np.mgrid[:31, :41])
     truth = np.array([20.3, 14.8, 50000.0, 9.0, 0.4, 0.8, 7.0])
-    rows, weight, out = np.ones((8, x.size)), np.empty(x.size), np.empty(13)
+    rows = np.ones((8, x.size))
+    weight = np.empty(x.size)
+    out = np.empty(13)
     plain._rows(np.vstack([x, y, np.zeros(x.size)]), 1.0, 1e9, truth, rows, weight)
     p = np.add(truth, [start[0], start[1], 0, start[2], start[3], 0.1, 0])
     assert plain._fit(np.vstack([x, y, -rows[7]]), 1.0, 1e9, rows, weight, p, out)
@@ -373,22 +421,28 @@ def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(start: tuple[float
 
 
 def test_a_fit_uses_every_pixel_near_its_line_and_no_other() -> None:
-    plain, streak_px = interpreted("estimator.centroiding.streak_fit"), (8.0, -6.0)
+    plain = interpreted("estimator.centroiding.streak_fit")
+    streak_px = (8.0, -6.0)
     image = smeared((41, 41), 20.3, 19.8, *streak_px, 5000.0)
-    box, grid = np.array([[14, 14, 26, 26]]), np.ones((1, 1))
+    box = np.array([[14, 14, 26, 26]])
+    grid = np.ones((1, 1))
 
     def fit(at: tuple[int, int] | None = None) -> np.ndarray:
         changed = image.copy()
         if at is not None:
             changed[at] += 100.0
-        return plain.fit_all(changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, np.array([streak_px]), 1.0, 1e9)
+        return plain.fit_all(
+            changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, np.array([streak_px]), 1.0, 1e9
+        )
 
     y, x = np.mgrid[:41, :41]
-    u, v = ((x - 20) * 8 - (y - 20) * 6) / 10, ((x - 20) * 6 + (y - 20) * 8) / 10
+    u = ((x - 20) * 8 - (y - 20) * 6) / 10
+    v = ((x - 20) * 6 + (y - 20) * 8) / 10
     far_px = np.hypot(np.maximum(np.abs(u) - 5, 0), v)
     # The window ends 4 px beyond the line's ends in x and y.
     near = (far_px <= 4.5) & (np.abs(x - 20) <= 8) & (np.abs(y - 20) <= 7)
-    plain_fit, used = fit(), np.argwhere(near)
+    plain_fit = fit()
+    used = np.argwhere(near)
     assert plain_fit.shape == (1, 13)
     np.testing.assert_allclose(plain_fit[0, :2], [20.3, 19.8], rtol=0, atol=0.01)
     for at in (used[0], used[-1]):
@@ -402,21 +456,34 @@ def test_a_streak_s_length_direction_and_width_are_weighed_with_the_frame_s() ->
     """The least chi-square of pixels and priors by SciPy: sigmas of 0.15 of the length and 0.5 px, 0.15 rad, 0.15."""
     plain = interpreted("estimator.centroiding.streak_fit")
     y, x = (grid.ravel().astype(float) for grid in np.mgrid[:17, :27])
-    start, noise = np.array([13.0, 8.0, 900.0, 9.0, 0.0, 0.8, 7.0]), 20.0
+    start = np.array([13.0, 8.0, 900.0, 9.0, 0.0, 0.8, 7.0])
+    noise = 20.0
 
     def model(p: np.ndarray) -> np.ndarray:
-        u, v = np.array([[np.cos(p[4]), np.sin(p[4])], [-np.sin(p[4]), np.cos(p[4])]]) @ [x - p[0], y - p[1]]
-        along = np.diff(erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0)[0] / (2 * p[3])
+        u, v = np.array([[np.cos(p[4]), np.sin(p[4])], [-np.sin(p[4]), np.cos(p[4])]]) @ [
+            x - p[0],
+            y - p[1],
+        ]
+        along = np.diff(erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0)[
+            0
+        ] / (2 * p[3])
         return p[6] + p[2] * along * np.exp(-((v / p[5]) ** 2) / 2) / (p[5] * np.sqrt(2 * np.pi))
 
     light = model(np.array([13.3, 8.2, 1000.0, 12.0, 0.1, 0.9, 7.0]))
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        return np.append((light - model(p)) / noise, (start - p)[3:6] / [0.15 * 9 + 0.5, 0.15, 0.15 * 0.8])
+        return np.append(
+            (light - model(p)) / noise, (start - p)[3:6] / [0.15 * 9 + 0.5, 0.15, 0.15 * 0.8]
+        )
 
-    p, rows, weight, out = start.copy(), np.ones((8, x.size)), np.empty(x.size), np.empty(13)
+    p = start.copy()
+    rows = np.ones((8, x.size))
+    weight = np.empty(x.size)
+    out = np.empty(13)
     assert plain._fit(np.vstack([x, y, light]), noise, 1e9, rows, weight, p, out)
-    wanted = optimize.least_squares(residuals, start, x_scale=[1, 1, 100, 1, 0.1, 0.1, 1], xtol=1e-12).x
+    wanted = optimize.least_squares(
+        residuals, start, x_scale=[1, 1, 100, 1, 0.1, 0.1, 1], xtol=1e-12
+    ).x
     assert 10 < wanted[3] < 11.5  # between the frame's and its own
     off = np.abs(p - wanted) / [0.01, 0.01, 5, 0.02, 0.002, 0.002, 0.02]
     assert off.max() < 1, off

@@ -13,7 +13,9 @@ CV_MATRIX = np.array([[2000.0, 0, 810.5], [0, 2000.0, 590.25], [0, 0, 1]])
 
 
 def pixels_over(camera: Camera, count: int, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0, [camera.width_px - 1, camera.height_px - 1], (count, 2))
+    return np.random.default_rng(seed).uniform(
+        0, [camera.width_px - 1, camera.height_px - 1], (count, 2)
+    )
 
 
 def test_a_distorted_pixel_by_hand() -> None:
@@ -22,7 +24,9 @@ def test_a_distorted_pixel_by_hand() -> None:
     # y' = -.0996 + p1 (.05 + .02) + 2 p2 (-.02) = -.0996 + .0007 + .0008 = -.0981.
     camera = Camera(640, 480, 1000.0, (300.0, 200.0), (-0.1, 0.4, 0.01, -0.02, 0.0))
     # 1e-10: rounding of numbers of a few hundred.
-    np.testing.assert_allclose(camera.pixels(np.array([[0.4, -0.2, 2.0]])), [[496.2, 101.9]], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        camera.pixels(np.array([[0.4, -0.2, 2.0]])), [[496.2, 101.9]], rtol=0, atol=1e-10
+    )
 
 
 def test_the_boresight_lands_on_the_principal_point() -> None:
@@ -52,7 +56,9 @@ def test_a_star_far_off_does_not_fold_back_into_a_barrel_s_field() -> None:
 
 def test_the_distortion_is_opencv_s() -> None:
     rng = np.random.default_rng(1)
-    points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.ones(500)]) * rng.uniform(1, 9, (500, 1))
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.ones(500)]) * rng.uniform(
+        1, 9, (500, 1)
+    )
     oracle, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CV_MATRIX, np.array(LENS))
     # 1e-9 px: rounding in two orders of summation.
     np.testing.assert_allclose(DISTORTED.pixels(points), oracle[:, 0], rtol=0, atol=1e-9)
@@ -61,7 +67,9 @@ def test_the_distortion_is_opencv_s() -> None:
 def test_the_undistortion_is_opencv_s() -> None:
     pixels = pixels_over(DISTORTED, 500, seed=2)
     done = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    oracle = cv2.undistortPoints(pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done).reshape(-1, 2)
+    oracle = cv2.undistortPoints(pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done).reshape(
+        -1, 2
+    )
     rays = DISTORTED.rays(pixels)
     # 1e-9: both iterate to convergence; OpenCV stops by the pixel error.
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], oracle, rtol=0, atol=1e-9)
@@ -90,7 +98,9 @@ def test_each_coefficient_alone_is_undone(coefficient: int) -> None:
     lens = tuple(0.05 * (n == coefficient) for n in range(5))
     tangent = np.array([[0.2, -0.1], [-0.3, 0.25], [0.0, 0.1]])
     xy_px = 2000 * distorted(tangent, lens) + [810.5, 590.25]
-    np.testing.assert_allclose(undistorted(xy_px, 2000.0, 810.5, 590.25, lens), tangent, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        undistorted(xy_px, 2000.0, 810.5, 590.25, lens), tangent, rtol=0, atol=1e-14
+    )
 
 
 def test_the_field_is_the_angle_between_the_edge_columns_middles() -> None:
@@ -105,7 +115,9 @@ def test_the_diagonal_is_the_angle_between_opposite_corners() -> None:
     # Reference H1: SHEFEX-2's 14.868 x 11.150 degrees have a diagonal of 18.51 (24.95 mm, 9.9 um).
     camera = Camera(659, 493, 24.95e-3 / 9.9e-6, (329.0, 246.0))
     corners = camera.rays(np.array([[-0.5, -0.5], [658.5, 492.5]]))
-    assert camera.diagonal_rad == pytest.approx(np.arccos(corners[0] @ corners[1]), abs=1e-12)  # rounding
+    assert camera.diagonal_rad == pytest.approx(
+        np.arccos(corners[0] @ corners[1]), abs=1e-12
+    )  # rounding
     # .05 degree: the papers leave open whether edges or middles of pixels are meant, a pixel of .023 apart.
     assert np.degrees(camera.diagonal_rad) == pytest.approx(18.51, abs=0.05)
 
@@ -115,14 +127,20 @@ def test_a_zoomed_camera_magnifies_angles_from_the_axis() -> None:
     vector = np.array([[0.1, -0.05, 1.0]])
     off = plain.pixels(vector) - plain.center_px
     zoomed = plain.zoomed(1.5)
-    np.testing.assert_allclose(zoomed.pixels(vector) - zoomed.center_px, 1.5 * off, rtol=0, atol=1e-12)  # rounding
+    np.testing.assert_allclose(
+        zoomed.pixels(vector) - zoomed.center_px, 1.5 * off, rtol=0, atol=1e-12
+    )  # rounding
 
 
 def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_middles() -> None:
     camera = Camera(10, 8, 10.0, (4.5, 3.5))
-    inside = camera.contains(np.array([[-0.5, -0.5], [9.5, 7.5], [-0.51, 0], [9.51, 0], [0, 7.51], [0, -0.51]]))
+    inside = camera.contains(
+        np.array([[-0.5, -0.5], [9.5, 7.5], [-0.51, 0], [9.51, 0], [0, 7.51], [0, -0.51]])
+    )
     assert inside.tolist() == [True, True, False, False, False, False]
-    shrunk = camera.contains(np.array([[0.4, 4.0], [0.5, 4.0], [4.0, 6.5], [4.0, 6.6]]), margin_px=1.0)
+    shrunk = camera.contains(
+        np.array([[0.4, 4.0], [0.5, 4.0], [4.0, 6.5], [4.0, 6.6]]), margin_px=1.0
+    )
     assert shrunk.tolist() == [False, True, True, False]
 
 

@@ -27,9 +27,19 @@ from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Settings
 
 WORDS = some.text(max_size=8)
-THINGS: Any = some.none() | some.booleans() | some.integers() | ANY | WORDS | some.lists(ANY, max_size=3) | NUMBERS
+THINGS: Any = (
+    some.none()
+    | some.booleans()
+    | some.integers()
+    | ANY
+    | WORDS
+    | some.lists(ANY, max_size=3)
+    | NUMBERS
+)
 DTYPES = some.sampled_from(["u1", "?", "u2", ">u2", "i2", ">i4", "i8", "f4", ">f8", "f8"])
-MATRICES = DTYPES.flatmap(lambda kind: arrays(kind, array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=30)))
+MATRICES = DTYPES.flatmap(
+    lambda kind: arrays(kind, array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=30))
+)
 
 
 def disguises(array: NDArray) -> list[NDArray]:
@@ -39,14 +49,24 @@ def disguises(array: NDArray) -> list[NDArray]:
     locked = array.copy()
     locked.flags.writeable = False
     unaligned = np.frombuffer(b"\0" + array.tobytes(), array.dtype, offset=1).reshape(array.shape)
-    return [np.asfortranarray(array), np.ascontiguousarray(array[::-1])[::-1], locked, spread, unaligned]
+    return [
+        np.asfortranarray(array),
+        np.ascontiguousarray(array[::-1])[::-1],
+        locked,
+        spread,
+        unaligned,
+    ]
 
 
 def is_plain(array: NDArray, dtype: Any) -> bool:
     """Whether compiled code takes it for the one type that it is compiled for."""
     flags = array.flags
     return (
-        type(array) is np.ndarray and array.dtype == dtype and flags.c_contiguous and flags.aligned and flags.writeable
+        type(array) is np.ndarray
+        and array.dtype == dtype
+        and flags.c_contiguous
+        and flags.aligned
+        and flags.writeable
     )
 
 
@@ -85,15 +105,21 @@ def test_anything_is_what_is_asked_for_or_one_line(thing: Any) -> None:
     whole = answered(lambda: checks.number("x", thing, 0, 5, "0 to 5", True), ImageError)
     assert whole is None or (type(whole) is int and 0 <= whole <= 5)
     step = answered(lambda: checks.pixel_step("x", thing), ImageError)
-    assert step is None or (len(step) == 2 and np.isfinite(step).all() and {type(one) for one in step} == {float})
+    assert step is None or (
+        len(step) == 2 and np.isfinite(step).all() and {type(one) for one in step} == {float}
+    )
     with pytest.raises(ImageError, match="allowed: Rotation"):
         checks.one_rotation("x", thing)
     with pytest.raises(ImageError, match="allowed: Centroids or Lever"):
         checks.of_type("x", thing, Centroids, Lever)
     checks.each_of_type("x", [thing, thing], object)
-    with pytest.raises(ImageError, match=r"x: number 1 is .*allowed: Lever|x is .*allowed: list or tuple"):
+    with pytest.raises(
+        ImageError, match=r"x: number 1 is .*allowed: Lever|x is .*allowed: list or tuple"
+    ):
         checks.each_of_type("x", [dome_map.Lever(None, None), thing], Lever)  # type: ignore[arg-type]
-    with pytest.raises(ImageError, match="'abd' is unknown; did you mean abc\\?; allowed: abc, xyz"):
+    with pytest.raises(
+        ImageError, match="'abd' is unknown; did you mean abc\\?; allowed: abc, xyz"
+    ):
         checks.known("x", "abd", {"xyz", "abc"})
     assert len(checks.excerpt(thing).splitlines()) <= 1
     assert len(checks.excerpt(thing)) <= 60
@@ -107,13 +133,24 @@ def test_a_rotation_is_one_and_no_nan() -> None:
         checks.one_rotation("x", Rotation.from_rotvec([np.nan, 0, 0]))
 
 
-@law(checks.rows, checks.unit_rows, checks.row_numbers, checks.row_pairs, checks.first_bad, checks.angle_guess)
+@law(
+    checks.rows,
+    checks.unit_rows,
+    checks.row_numbers,
+    checks.row_pairs,
+    checks.first_bad,
+    checks.angle_guess,
+)
 @given(rng=SEEDS, thing=THINGS)
 def test_rows_are_of_their_length_finite_and_there(rng: np.random.Generator, thing: Any) -> None:
     for call in (checks.rows, checks.unit_rows):
-        found = answered(lambda call=call: call("x", thing, *([None, 3][: 1 + (call is checks.rows)])), ImageError)  # type: ignore[misc]
+        found = answered(
+            lambda call=call: call("x", thing, *([None, 3][: 1 + (call is checks.rows)])),
+            ImageError,
+        )  # type: ignore[misc]
         assert found is None or (found.shape[1] == 3 and np.isfinite(found).all())
-    count, bad = int(rng.integers(2, 9)), units(rng, 9)
+    count = int(rng.integers(2, 9))
+    bad = units(rng, 9)
     row = int(rng.integers(0, count))
     checks.unit_rows("x", bad[:count], count)
     bad[row] *= 1.01
@@ -146,17 +183,28 @@ def test_a_lazy_name_is_its_module_s_or_told(name: str) -> None:
 def lights(rng: np.random.Generator, count: int) -> dict[str, NDArray]:
     spread = rng.normal(size=(count, 2, 2))
     spread = spread @ spread.transpose(0, 2, 1) + np.eye(2)
-    xy_px, sigma_px = rng.uniform(0, 99, (count, 2)), rng.uniform(0.1, 1, count)
-    return {"xy_px": xy_px, "sigma_px": sigma_px, "flux": rng.uniform(1, 9, count), "covariance_px2": spread}
+    xy_px = rng.uniform(0, 99, (count, 2))
+    sigma_px = rng.uniform(0.1, 1, count)
+    return {
+        "xy_px": xy_px,
+        "sigma_px": sigma_px,
+        "flux": rng.uniform(1, 9, count),
+        "covariance_px2": spread,
+    }
 
 
 @law(Centroids.check_values)
-@given(rng=SEEDS, value=some.sampled_from([np.nan, np.inf, -np.inf, -1.0, 0.0]), longer=some.sampled_from([-1, 1, 7]))
+@given(
+    rng=SEEDS,
+    value=some.sampled_from([np.nan, np.inf, -np.inf, -1.0, 0.0]),
+    longer=some.sampled_from([-1, 1, 7]),
+)
 def test_centroids_are_of_one_length_and_their_numbers_usable(
     rng: np.random.Generator, value: float, longer: int
 ) -> None:
     count = int(rng.integers(2, 20))
-    good, row = lights(rng, count), int(rng.integers(0, count))
+    good = lights(rng, count)
+    row = int(rng.integers(0, count))
     Centroids(**good).check_values()  # type: ignore[arg-type]
     Centroids(**good | {"covariance_px2": None}).check_values()  # type: ignore[arg-type]
     for name, array in good.items():
@@ -177,12 +225,18 @@ def test_centroids_are_of_one_length_and_their_numbers_usable(
 def test_a_catalog_of_arrays_is_that_of_vectors(rng: np.random.Generator) -> None:
     stars = drawn(rng)
     x, y, z = stars.vectors.T
-    ra_deg, dec_deg = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
+    ra_deg = np.degrees(np.arctan2(y, x))
+    dec_deg = np.degrees(np.arcsin(z))
     east = np.column_stack([-y, x, 0 * x]) / np.hypot(x, y)[:, None]
     motion = np.einsum("ij,ij->i", stars.drift_rad_yr, east) / catalog.MAS_RAD
     order = rng.permutation(len(stars))
     made = StarCatalog.from_radec(
-        ra_deg[order], dec_deg[order], stars.v_mag[order], motion[order], epoch_yr=1991, id=stars.id[order]
+        ra_deg[order],
+        dec_deg[order],
+        stars.v_mag[order],
+        motion[order],
+        epoch_yr=1991,
+        id=stars.id[order],
     )
     assert np.array_equal(made.id, stars.id)  # brightest first again
     np.testing.assert_allclose(made.vectors, stars.vectors, rtol=0, atol=1e-12)
@@ -297,19 +351,27 @@ def test_settings_are_known_and_usable(word: str, value: Any) -> None:
     for stage in stages:
         named = Settings(**{stage: word})  # type: ignore[arg-type]
         if word not in {"default", *pipeline.DETECTORS, *pipeline.CENTROIDERS}:
-            with pytest.raises(ImageError, match=f"settings: {stage}: .* is unknown.*; allowed: .*default"):
+            with pytest.raises(
+                ImageError, match=f"settings: {stage}: .* is unknown.*; allowed: .*default"
+            ):
                 pipeline.check_algorithms(named, ["default"], ["default"])
     pipeline.check_algorithms(Settings(), ["default"], ["default"])
     if word not in names:
-        with pytest.raises(ImageError, match=r"settings: .* is unknown.*; allowed: .*centroid_sigma_px"):
+        with pytest.raises(
+            ImageError, match=r"settings: .* is unknown.*; allowed: .*centroid_sigma_px"
+        ):
             Settings(**{word: value})
-    for name, kind in itertools.product(names - set(stages) - {"bad_px", "zero_point_mag"}, [value]):
+    for name, kind in itertools.product(
+        names - set(stages) - {"bad_px", "zero_point_mag"}, [value]
+    ):
         made = answered(lambda name=name, kind=kind: Settings(**{name: kind}), ImageError)  # type: ignore[misc]
         assert made is None or type(getattr(made, name)) is type(getattr(Settings(), name))
 
 
 def test_a_misspelt_setting_is_told_the_nearest() -> None:
-    with pytest.raises(ImageError, match="'centroid_sigma' is unknown; did you mean centroid_sigma_px"):
+    with pytest.raises(
+        ImageError, match="'centroid_sigma' is unknown; did you mean centroid_sigma_px"
+    ):
         Settings(centroid_sigma=0.1)  # type: ignore[call-arg]
     with pytest.raises(ImageError, match=r"bad_px has shape \(2,\)"):
         Settings(bad_px=[1, 2])  # type: ignore[arg-type]

@@ -19,7 +19,8 @@ def test_a_small_rotation_is_right_to_its_second_order(vectors, size_rad: float)
     """The error of I + [w] + [w]^2 / 2 is |w|^3 / 6; the rows are made orthonormal to rounding."""
     rng = np.random.default_rng(0)
     for _ in range(30):
-        start, w = Rotation.random(rng=rng), size_rad * np.array(rng.uniform(-1, 1, 3))
+        start = Rotation.random(rng=rng)
+        w = size_rad * np.array(rng.uniform(-1, 1, 3))
         matrix = start.as_matrix()
         vectors.rotate_in_place(w, matrix)
         assert np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-15
@@ -29,19 +30,27 @@ def test_a_small_rotation_is_right_to_its_second_order(vectors, size_rad: float)
 
 @every_mode
 def test_a_pair_s_frame_is_right_handed_with_its_bisector_and_normal(vectors) -> None:
-    rng, out = np.random.default_rng(1), np.empty((3, 3))
+    rng = np.random.default_rng(1)
+    out = np.empty((3, 3))
     for u, v in rng.normal(size=(20, 2, 3)):
-        u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
+        u = u / np.linalg.norm(u)
+        v = v / np.linalg.norm(v)
         vectors.pair_frame(tuple(u), tuple(v), out)
-        bisector, normal = (u + v) / np.linalg.norm(u + v), np.cross(u, v) / np.linalg.norm(np.cross(u, v))
-        np.testing.assert_allclose(out, np.column_stack([bisector, normal, np.cross(bisector, normal)]), atol=1e-13)
+        bisector = (u + v) / np.linalg.norm(u + v)
+        normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+        np.testing.assert_allclose(
+            out, np.column_stack([bisector, normal, np.cross(bisector, normal)]), atol=1e-13
+        )
 
 
 @every_mode
 def test_products_are_numpy_s(vectors) -> None:
-    rng, out = np.random.default_rng(2), np.empty((3, 3))
+    rng = np.random.default_rng(2)
+    out = np.empty((3, 3))
     a, b = rng.normal(size=(2, 3, 3))
     vectors.multiply_transposed(a, b, out)
     np.testing.assert_allclose(out, a @ b.T, rtol=0, atol=1e-14)
     np.testing.assert_allclose(vectors.rotate(a, vectors.row(b, 1)), a @ b[1], rtol=0, atol=1e-14)
-    assert vectors.chord(tuple(a[0]), tuple(b[2])) == pytest.approx(np.linalg.norm(a[0] - b[2]), rel=1e-14)
+    assert vectors.chord(tuple(a[0]), tuple(b[2])) == pytest.approx(
+        np.linalg.norm(a[0] - b[2]), rel=1e-14
+    )

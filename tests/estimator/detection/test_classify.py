@@ -19,10 +19,13 @@ SHAPE = (493, 659)
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
 
 
-def star(x: float, y: float, flux: float, sigma: float, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+def star(
+    x: float, y: float, flux: float, sigma: float, shape: tuple[int, int] = SHAPE
+) -> np.ndarray:
     """A Gaussian integrated over each pixel."""
     down, across = (
-        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2 for n, at in zip(shape, (y, x), strict=True)
+        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
+        for n, at in zip(shape, (y, x), strict=True)
     )
     return flux * np.outer(down, across)
 
@@ -30,8 +33,12 @@ def star(x: float, y: float, flux: float, sigma: float, shape: tuple[int, int] =
 def sky_frame(rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE):
     """Light of some stars of 4,000 to 40,000 electrons on a lattice, and where they are."""
     step = 80
-    lattice = [(x, y) for y in range(60, shape[0] - 40, step) for x in range(60, shape[1] - 40, step)]
-    xy = np.array(lattice, float)[rng.permutation(len(lattice))[:stars]] + rng.uniform(-10, 10, (stars, 2))
+    lattice = [
+        (x, y) for y in range(60, shape[0] - 40, step) for x in range(60, shape[1] - 40, step)
+    ]
+    xy = np.array(lattice, float)[rng.permutation(len(lattice))[:stars]] + rng.uniform(
+        -10, 10, (stars, 2)
+    )
     light = sum(star(x, y, rng.uniform(4e3, 4e4), sigma, shape) for x, y in xy)
     return light, xy
 
@@ -112,7 +119,9 @@ def test_an_led_is_no_moon() -> None:
     light = np.zeros((1200, 1600))
     y, x = np.mgrid[-20:21, -20:21]
     for cx, cy in rng.uniform(100, 1100, (8, 2)).round().astype(int):
-        light[cy - 20 : cy + 21, cx - 20 : cx + 21] += 2e4 / (1 + np.exp((np.hypot(x, y) - 10.4) / 0.5))
+        light[cy - 20 : cy + 21, cx - 20 : cx + 21] += 2e4 / (
+            1 + np.exp((np.hypot(x, y) - 10.4) / 0.5)
+        )
     blobs = detect.default(exposed(rng, light))
     assert len(blobs) == 8
     assert blobs.flag.tolist() == [0] * 8
@@ -150,10 +159,13 @@ def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
     assert np.degrees(np.arctan(y / x)) == pytest.approx(np.degrees(np.arctan(-0.6)), abs=3)
 
 
-def smeared_frame(rng: np.random.Generator, streak: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def smeared_frame(
+    rng: np.random.Generator, streak: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
     """A frame of 15 streaks, drawn in steps of less than half a pixel, and where their middles are."""
     steps = 4 * int(np.hypot(*streak)) + 1
-    light, xy = np.zeros(SHAPE), sky_frame(rng, 15, 0.7)[1]
+    light = np.zeros(SHAPE)
+    xy = sky_frame(rng, 15, 0.7)[1]
     for at in xy:
         corner = np.rint(at).astype(int) - 12
         for t in (np.arange(steps) + 0.5) / steps - 0.5:
@@ -163,10 +175,14 @@ def smeared_frame(rng: np.random.Generator, streak: tuple[float, float]) -> tupl
 
 
 @pytest.mark.parametrize("streak", [(2.5, 1.0), (4.0, -3.0)])
-def test_a_short_streak_is_seen_without_a_gyro_and_centered_as_with_one(streak: tuple[float, float]) -> None:
+def test_a_short_streak_is_seen_without_a_gyro_and_centered_as_with_one(
+    streak: tuple[float, float],
+) -> None:
     """A round star in place of a streak of some pixels would double the error, and claim too little."""
     image, xy = smeared_frame(np.random.default_rng(47), streak)
-    alone, guided = (detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak))
+    alone, guided = (
+        detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak)
+    )
     rms_px = [np.sqrt(np.mean(off_px(found, xy) ** 2)) for found in (alone, guided)]
     assert len(alone) == len(guided) == 15
     assert rms_px[0] < 1.1 * rms_px[1] < 0.06
@@ -185,7 +201,8 @@ def test_a_hot_pixel_is_no_star_of_a_smeared_frame() -> None:
 
 def rolled_frame(seed: int, turn_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A frame of 15 stars while the camera turns by this (3,) about its axes, and their places at mid-exposure."""
-    rng, light = np.random.default_rng(seed), np.zeros(SHAPE)
+    rng = np.random.default_rng(seed)
+    light = np.zeros(SHAPE)
     xy = sky_frame(rng, 15, 0.7)[1]
     rays = CAMERA.rays(xy)
     for part in (np.arange(120) + 0.5) / 120 - 0.5:
@@ -209,8 +226,14 @@ def test_streaks_that_a_roll_makes_differ_are_stars(
     image, xy = rolled_frame(49, np.array([*across, -turn_rad]))
     for x, y in HOT_PX:
         image[y, x] += 20_000
-    rate = RateEstimate(np.array([*across, -turn_rad]) / 0.1, 1e-12 * np.eye(3)) if rate_known else None
-    seen = process_frame(image, CAMERA, Settings(), lambda *_: Attitude("no_solution"), None, rate, 0.1).centroids
+    rate = (
+        RateEstimate(np.array([*across, -turn_rad]) / 0.1, 1e-12 * np.eye(3))
+        if rate_known
+        else None
+    )
+    seen = process_frame(
+        image, CAMERA, Settings(), lambda *_: Attitude("no_solution"), None, rate, 0.1
+    ).centroids
     assert len(seen) == 15
     assert off_px(seen, xy).max() < 0.15
     assert seen.covariance_px2 is not None
@@ -241,23 +264,29 @@ def test_a_track_among_streaks_of_a_roll_is_flagged() -> None:
 def add_line(light: np.ndarray, at: tuple[int, int], angle: float) -> None:
     """Draw a line of 16 px in the 41 pixels from a place."""
     for t in np.arange(-8, 8, 0.25):
-        x, y = 20 + t * np.cos(angle), 20 + t * np.sin(angle)
+        x = 20 + t * np.cos(angle)
+        y = 20 + t * np.sin(angle)
         light[at[1] : at[1] + 41, at[0] : at[0] + 41] += star(x, y, 900.0, 0.7, (41, 41))
 
 
 @pytest.mark.parametrize("angle_deg", [12.0, 75.0])
 def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
     """Near the threshold a line is many blobs: of up to 24 at most two are left, and no star is taken for a piece."""
-    rng, angle = np.random.default_rng(53), np.radians(angle_deg)
+    rng = np.random.default_rng(53)
+    angle = np.radians(angle_deg)
     light, xy = sky_frame(rng, 25, 0.7)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] - np.array([240.0, 320.0])[:, None, None]
-    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    across = y * np.cos(angle) - x * np.sin(angle)
     track = np.where(np.abs(along) < 230, np.exp(-(across**2) / (2 * 0.7**2)), 0.0)
-    pieces, left = [], []
+    pieces = []
+    left = []
     for peak in (24.0, 27.0, 30.0):
         blobs = detect.default(exposed(rng, light + peak * track))
         away = np.linalg.norm(blobs.xy_px[:, None] - xy, axis=2).min(axis=1) > 3
-        assert np.count_nonzero(~away & (blobs.flag == 0)) >= len(xy) - 1  # a star may be on the line
+        assert (
+            np.count_nonzero(~away & (blobs.flag == 0)) >= len(xy) - 1
+        )  # a star may be on the line
         pieces.append(np.count_nonzero(away))
         left.append(np.count_nonzero(away & (blobs.flag & NO_STAR == 0)))
     assert max(pieces) >= 20
@@ -289,10 +318,13 @@ def test_three_tracks_make_no_roll() -> None:
 @pytest.mark.parametrize(("peak_sigma", "flag"), [(6.0, 0), (30.0, Flag.TRACK)])
 def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int) -> None:
     """Lines across the streak that the gyros predict; the shape of a line of 6 sigma per pixel is mostly noise."""
-    rng, light = np.random.default_rng(51), np.zeros(SHAPE)
+    rng = np.random.default_rng(51)
+    light = np.zeros(SHAPE)
     # The peak of a line of so much light per pixel of its length is that over sqrt(2 pi) sigma.
     flux = peak_sigma * 12.0 * np.sqrt(2 * np.pi) * 0.7 * 0.25
-    line = sum(star(12 + 0.5 * t, 12 + 0.86 * t, flux, 0.7, (25, 25)) for t in np.arange(-6, 6, 0.25))
+    line = sum(
+        star(12 + 0.5 * t, 12 + 0.86 * t, flux, 0.7, (25, 25)) for t in np.arange(-6, 6, 0.25)
+    )
     places = [(x, y) for x in (150, 300, 450) for y in (120, 360)]
     for x, y in places:
         light[y - 12 : y + 13, x - 12 : x + 13] += line
@@ -303,10 +335,12 @@ def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int
 
 def trailed_frame(seed: int, flux_per_px: float, spread: float) -> np.ndarray:
     """A frame of 15 trails of 45 px, longer or shorter by a relative standard deviation; the first five are bright."""
-    rng, light = np.random.default_rng(seed), np.zeros(SHAPE)
+    rng = np.random.default_rng(seed)
+    light = np.zeros(SHAPE)
     places = [(x, y) for y in (80, 240, 400) for x in (70, 190, 310, 430, 550)]
     for row, (x, y) in enumerate(places):
-        length, flux = 45 * (1 + spread * rng.standard_normal()), 600.0 if row < 5 else flux_per_px
+        length = 45 * (1 + spread * rng.standard_normal())
+        flux = 600.0 if row < 5 else flux_per_px
         for along in np.arange(0.25, length, 0.5) - length / 2:
             patch = star(35 + 0.8 * along, 35 + 0.6 * along, flux / 2, 0.8, (71, 71))
             light[y - 35 : y + 36, x - 35 : x + 36] += patch
@@ -325,11 +359,15 @@ def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
     """Ten of 15 trails are just above the noise of a pixel; the bright ones tell how long all are."""
     image = trailed_frame(61, 60.0, 0.02)
     background = detect.estimate_background(image)
-    pieces = detect.detect_blobs(image, background, 5.0 * background.noise, 3, 100, detect.GROW_SIGMA)
+    pieces = detect.detect_blobs(
+        image, background, 5.0 * background.noise, 3, 100, detect.GROW_SIGMA
+    )
     assert len(pieces) > 20
     blobs = detect.default(image)
     assert len(blobs) == 15
-    assert np.degrees(np.arctan2(blobs.streak_px[1], blobs.streak_px[0])) == pytest.approx(36.9, abs=5)
+    assert np.degrees(np.arctan2(blobs.streak_px[1], blobs.streak_px[0])) == pytest.approx(
+        36.9, abs=5
+    )
     assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.1)
 
 
@@ -340,7 +378,9 @@ def test_a_caption_is_text_and_tells_no_streak(height_px: int) -> None:
     light, xy = sky_frame(rng, 15, 0.8)
     image = exposed(rng, light)
     mask = np.zeros(SHAPE, np.uint8)
-    cv2.putText(mask, "2012-06-22 11:11:14", (30, 48), cv2.FONT_HERSHEY_DUPLEX, height_px / 22, 255, 1)
+    cv2.putText(
+        mask, "2012-06-22 11:11:14", (30, 48), cv2.FONT_HERSHEY_DUPLEX, height_px / 22, 255, 1
+    )
     image[mask > 128] = 60_000
     blobs = detect.default(image)
     far = xy[xy[:, 1] > 70]
@@ -366,23 +406,29 @@ def test_rows_of_equal_lights_are_no_text() -> None:
 @pytest.mark.parametrize("seed", [2, 50, 84])
 def test_columns_of_readout_smear_are_no_streaks(seed: int) -> None:
     """Saturated stars leave columns from border to border: they are parallel, but no star moved along them."""
-    setup, stars = frames.SETUPS[3], catalog.hipparcos()
+    setup = frames.SETUPS[3]
+    stars = catalog.hipparcos()
     image, truth = frames.render(setup, stars, np.random.default_rng([1, seed]))
     blobs = detect.default(image, priors=FramePriors(None, setup.depth))
     assert blobs.streak_px is None
     xy_px = setup.camera.pixels(truth.apply(stars.vectors[stars.v_mag < 5.5]))
     bright = xy_px[setup.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 20.0)]
-    off_px = np.linalg.norm(bright[:, None] - blobs.xy_px[blobs.flag & NO_STAR == 0], axis=2).min(axis=1)
+    off_px = np.linalg.norm(bright[:, None] - blobs.xy_px[blobs.flag & NO_STAR == 0], axis=2).min(
+        axis=1
+    )
     assert np.mean(off_px < 2) >= 0.6
 
 
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
 @pytest.mark.parametrize("over", [2.0, 10.0])
-def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str, over: float) -> None:
+def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(
+    centroider: str, over: float
+) -> None:
     rng = np.random.default_rng(47)
     full = 60_000
     settings = Settings(centroider=centroider, saturation=full)
-    scaled, flags = [], []
+    scaled = []
+    flags = []
     for _ in range(4):
         xy = sky_frame(rng, 15, 1.0)[1]
         light = sum(star(x, y, over * full * 2 * np.pi, 1.0) for x, y in xy)
@@ -401,13 +447,16 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str,
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
 def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -> None:
     rng = np.random.default_rng(48)
-    off, told = [], []
+    off = []
+    told = []
     for _ in range(12):
         light, xy = sky_frame(rng, 15, 0.8)
         image = exposed(rng, light)
         bad = np.rint(xy).astype(int) + rng.integers(-1, 2, (15, 2))
         image[bad[:, 1], bad[:, 0]] = rng.choice([0, 65535], 15)
-        found = detect_and_centroid(image, CAMERA, Settings(centroider=centroider, bad_px=bad), Clock())
+        found = detect_and_centroid(
+            image, CAMERA, Settings(centroider=centroider, bad_px=bad), Clock()
+        )
         rows = np.linalg.norm(found.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
         off.append(found.xy_px[rows] - xy)
         told.append(found.sigma_px[rows])
@@ -438,13 +487,16 @@ def test_a_bad_pixel_gets_the_median_of_its_good_neighbors() -> None:
     good[bad[:, 1] + 2, bad[:, 0] + 2] = np.nan
     wanted = image.copy()
     for x, y in bad:
-        near, far = good[y + 1 : y + 4, x + 1 : x + 4], good[y : y + 5, x : x + 5]
+        near = good[y + 1 : y + 4, x + 1 : x + 4]
+        far = good[y : y + 5, x : x + 5]
         wanted[y, x] = np.nanmedian(far if np.isnan(near).all() else near)
     np.testing.assert_array_equal(detect.replace_bad_pixels(image, bad), wanted)
 
 
 def test_a_bad_pixel_off_the_sensor_is_refused() -> None:
-    with pytest.raises(ImageError, match="the bad-pixel map reaches beyond the frame of 659x493 pixels"):
+    with pytest.raises(
+        ImageError, match="the bad-pixel map reaches beyond the frame of 659x493 pixels"
+    ):
         detect.replace_bad_pixels(np.eye(493, 659), np.array([(659, 3)]))
 
 

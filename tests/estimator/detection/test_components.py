@@ -18,7 +18,8 @@ BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 
 def star(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float) -> np.ndarray:
     down, across = (
-        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2 for n, at in zip(shape, (y, x), strict=True)
+        np.diff(erf((np.arange(n + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
+        for n, at in zip(shape, (y, x), strict=True)
     )
     return flux * np.outer(down, across)
 
@@ -37,7 +38,8 @@ def field(seed: int, sigma: float = 0.8) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(4))
 def test_both_scans_find_the_same_objects(seed: int) -> None:
     image = field(seed)
-    once, again = detect.sequential(image), detect.maximum(image)
+    once = detect.sequential(image)
+    again = detect.maximum(image)
     assert len(once) == 20
     for name in ("box_px", "xy_px", "flux", "peak", "area_px"):
         np.testing.assert_array_equal(getattr(once, name).round(6), getattr(again, name).round(6))
@@ -69,10 +71,13 @@ def test_the_objects_are_scipy_s_labels(scan, seed: int) -> None:
 
 def test_the_table_holds_the_brightest_and_not_the_first() -> None:
     image = field(9)
-    every, few = detect.sequential(image), detect.sequential(image, max_blobs=5)
+    every = detect.sequential(image)
+    few = detect.sequential(image, max_blobs=5)
     np.testing.assert_array_equal(few.flux, every.flux[:5])
     # All are of one shape, so that the highest peaks are the brightest, but for a pixel's phase.
-    np.testing.assert_allclose(detect.maximum(image, max_blobs=5).flux.sum(), few.flux.sum(), rtol=0.1)
+    np.testing.assert_allclose(
+        detect.maximum(image, max_blobs=5).flux.sum(), few.flux.sum(), rtol=0.1
+    )
 
 
 def test_the_thesis_keeps_fifty_pixels_above_four_per_cent() -> None:
@@ -146,19 +151,27 @@ def test_labels_are_scipy_s(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "rows", "columns"), [((48, 61), 3, 4), ((40, 64), 2, 4), ((30, 47), 2, 3), ((9, 9), 1, 1)]
+    ("shape", "rows", "columns"),
+    [((48, 61), 3, 4), ((40, 64), 2, 4), ((30, 47), 2, 3), ((9, 9), 1, 1)],
 )
 def test_a_row_s_lower_bounds_are_the_least_corners_of_its_cells(
     shape: tuple[int, int], rows: int, columns: int
 ) -> None:
     """Nowhere above the interpolated threshold, nor below the least of the four tile centers about a pixel."""
     grid = np.random.default_rng(8).uniform(10, 90, (rows, columns))
-    bounds, (height, width) = interpreted("estimator.detection.components")._lower_bounds, shape
+    bounds = interpreted("estimator.detection.components")._lower_bounds
+    (height, width) = shape
     u = np.clip((np.arange(width) + 0.5) * columns / width - 0.5, 0, columns - 1)
     for y in range(height):
-        bound, v = np.full(width, np.nan), np.clip((y + 0.5) * rows / height - 0.5, 0, rows - 1)
+        bound = np.full(width, np.nan)
+        v = np.clip((y + 0.5) * rows / height - 0.5, 0, rows - 1)
         bounds(grid, height, y, -1, 1.0, bound)
-        assert (bound <= [interpolate(grid, height, width, y, x) + 1e-12 for x in range(width)]).all()
-        corners = grid[np.array([[np.floor(v)], [np.ceil(v)]], int), np.array([np.floor(u), np.ceil(u)], int)[:, None]]
+        assert (
+            bound <= [interpolate(grid, height, width, y, x) + 1e-12 for x in range(width)]
+        ).all()
+        corners = grid[
+            np.array([[np.floor(v)], [np.ceil(v)]], int),
+            np.array([np.floor(u), np.ceil(u)], int)[:, None],
+        ]
         inner = (u % 1 > 0) & (v % 1 > 0)
         np.testing.assert_allclose(bound[inner], corners.min(axis=(0, 1))[inner], rtol=1e-12)

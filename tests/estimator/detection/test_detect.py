@@ -20,15 +20,21 @@ def flat_background(level: float) -> Background:
     return Background(np.full((1, 1), level), np.ones((1, 1)), 64)
 
 
-def field_of_stars(seed: int, noise: float = 5.0, flux: float = 5000.0) -> tuple[np.ndarray, np.ndarray]:
+def field_of_stars(
+    seed: int, noise: float = 5.0, flux: float = 5000.0
+) -> tuple[np.ndarray, np.ndarray]:
     """A 256x320 frame with 12 well separated Gaussian stars of sigma 0.8 px on a sky of 100."""
     rng = np.random.default_rng(seed)
     columns, rows = np.meshgrid(np.arange(40, 320, 80), np.arange(40, 256, 80))
     xy = np.column_stack([columns.ravel(), rows.ravel()]) + rng.uniform(-10, 10, (12, 2))
-    edges_x, edges_y = np.arange(321) - 0.5, np.arange(257) - 0.5
+    edges_x = np.arange(321) - 0.5
+    edges_y = np.arange(257) - 0.5
     image = rng.normal(100, noise, (256, 320))
     for x, y in xy:
-        across, down = (np.diff(erf((edges - at) / (0.8 * 2**0.5))) / 2 for edges, at in ((edges_x, x), (edges_y, y)))
+        across, down = (
+            np.diff(erf((edges - at) / (0.8 * 2**0.5))) / 2
+            for edges, at in ((edges_x, x), (edges_y, y))
+        )
         image += flux * np.outer(down, across)
     return image, xy
 
@@ -43,7 +49,8 @@ def test_false_alarms_on_white_noise_are_the_gaussian_tail(sigma: float) -> None
     rng = np.random.default_rng(4)
     frames = 8
     area = sum(
-        detect.local(rng.normal(500, 9, (1024, 1024)), sigma, min_area_px=1).area_px.sum() for _ in range(frames)
+        detect.local(rng.normal(500, 9, (1024, 1024)), sigma, min_area_px=1).area_px.sum()
+        for _ in range(frames)
     )
     expected = frames * 1024**2 * stats.norm.sf(sigma)
     # A tile's noise is known to some 3 %, which raises the mean of the steep tail by up to a half at 5 sigma;
@@ -117,7 +124,9 @@ def test_blobs_are_scipy_s_labels_of_the_same_mask(seed: int) -> None:
     assert len(blobs) == len(order) > 5
     np.testing.assert_array_equal(blobs.area_px, ndimage.sum(mask, labels, order))
     np.testing.assert_array_equal(blobs.peak, ndimage.maximum(image, labels, order))
-    np.testing.assert_array_equal(blobs.box_px, [[b[1].start, b[0].start, b[1].stop - 1, b[0].stop - 1] for b in boxes])
+    np.testing.assert_array_equal(
+        blobs.box_px, [[b[1].start, b[0].start, b[1].stop - 1, b[0].stop - 1] for b in boxes]
+    )
     # Rounding of sums of some hundreds; the middle divides by a flux that may be small.
     np.testing.assert_allclose(blobs.flux, flux[order - 1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(blobs.xy_px, middles, rtol=1e-9, atol=1e-7)
@@ -137,7 +146,8 @@ def test_arms_that_meet_only_at_the_bottom_are_one_blob() -> None:
 def test_the_peak_of_an_image_below_zero_is_below_zero() -> None:
     # A dark-subtracted float frame may lie below zero everywhere.
     image, _ = field_of_stars(7)
-    above, below = detect.local(image), detect.local(image - 10_000)
+    above = detect.local(image)
+    below = detect.local(image - 10_000)
     assert below.peak.max() < 0
     np.testing.assert_allclose(below.peak + 10_000, above.peak, rtol=0, atol=1e-9)  # rounding
 
@@ -171,7 +181,8 @@ def test_stars_are_found_in_pixels_of_any_type(name: str, dtype: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "dtype", ["?", "u1", "i1", "<u2", ">u2", "i2", ">i4", "u4", "i8", "u8", "f2", ">f4", "f8", ">f8"]
+    "dtype",
+    ["?", "u1", "i1", "<u2", ">u2", "i2", ">i4", "u4", "i8", "u8", "f2", ">f4", "f8", ">f8"],
 )
 def test_compiled_code_gets_one_of_three_types_and_every_value(dtype: str) -> None:
     image = np.random.default_rng(62).integers(0, 100, (40, 50)).astype(dtype)
@@ -193,7 +204,9 @@ def test_the_thesis_s_full_scale_is_that_of_the_given_pixels() -> None:
 def test_a_mask_of_ones_is_an_image_too() -> None:
     image = np.zeros((64, 64), bool)
     image[30:34, 40:44] = True
-    np.testing.assert_allclose(detect.local(image).xy_px, [[41.5, 31.5]], rtol=0, atol=1e-12)  # rounding
+    np.testing.assert_allclose(
+        detect.local(image).xy_px, [[41.5, 31.5]], rtol=0, atol=1e-12
+    )  # rounding
 
 
 def test_blobs_come_brightest_first_and_the_faintest_are_dropped() -> None:
@@ -223,7 +236,9 @@ def test_hot_pixels_do_not_take_the_places_of_stars() -> None:
 
 def test_small_blobs_are_left_out() -> None:
     image = np.random.default_rng(12).normal(0, 1, (64, 64))
-    image[30, 30] = 60.0  # filtered: a peak of 15, shoulders of 7.5 and corners of 3.75 against 5 * .375
+    image[30, 30] = (
+        60.0  # filtered: a peak of 15, shoulders of 7.5 and corners of 3.75 against 5 * .375
+    )
     assert detect.local(image, min_area_px=9).area_px.tolist() == [9]
     assert len(detect.local(image, min_area_px=20)) == 0
 
@@ -251,14 +266,18 @@ def test_what_is_no_image_is_refused_in_one_line(name: str, message: str) -> Non
 def test_a_texture_is_refused() -> None:
     # 25,600 points a few pixels from the corners of a lattice of 10: few of the pixels feel one.
     image = np.zeros((1600, 1600))
-    place = np.arange(0, 1600, 10)[:, None] + np.random.default_rng(13).integers(2, 7, (2, 160, 160))
+    place = np.arange(0, 1600, 10)[:, None] + np.random.default_rng(13).integers(
+        2, 7, (2, 160, 160)
+    )
     image[place[0], place[1].transpose(1, 0)] = 1.0
     with pytest.raises(ImageError, match="over 20000 blobs"):
         detect.local(image)
 
 
 @pytest.mark.slow
-def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Lattices that close to lines of 1200 and of 600 px: filters of the length of the first took a minute."""
     taps: list[int] = []
     kept = detect.line_taps
@@ -278,9 +297,13 @@ def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pyt
     assert nearest_px(told.xy_px, xy).max() < 1
 
 
-def streaked(rng: np.random.Generator, streak_px: tuple[float, float], flux: float) -> tuple[np.ndarray, np.ndarray]:
+def streaked(
+    rng: np.random.Generator, streak_px: tuple[float, float], flux: float
+) -> tuple[np.ndarray, np.ndarray]:
     """A frame with noise of 5 and ten streaks of this flux, far from each other and from the border; their centers."""
-    places = np.array([[70 + 90 * (n % 5), 70 + 160 * (n // 5)] for n in range(10)]) + rng.uniform(-5, 5, (10, 2))
+    places = np.array([[70 + 90 * (n % 5), 70 + 160 * (n // 5)] for n in range(10)]) + rng.uniform(
+        -5, 5, (10, 2)
+    )
     y, x = np.mgrid[0:300, 0:500]
     frame = 100 + 5 * rng.standard_normal(x.shape)
     steps = np.linspace(-0.5, 0.5, 200)

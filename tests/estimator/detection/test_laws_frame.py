@@ -31,24 +31,33 @@ from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
-WIDTH, HEIGHT = 90, 70
+WIDTH = 90
+HEIGHT = 70
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, 0.3)
 # Those that compiled code is compiled for once, and any other.
 KINDS = some.sampled_from(["u2", "f8", ">f8"])
-EVERY_KIND = some.sampled_from(["?", "u1", "i1", "<u2", ">u2", ">i4", "u8", "f2", ">f4", "f8", "c8", "S3", "O"])
+EVERY_KIND = some.sampled_from(
+    ["?", "u1", "i1", "<u2", ">u2", ">i4", "u8", "f2", ">f4", "f8", "c8", "S3", "O"]
+)
 FRAMES = KINDS.flatmap(lambda kind: arrays(kind, (HEIGHT, WIDTH), fill=some.just(0)))
 STREAKS = some.none() | some.tuples(some.floats(-15, 15), some.floats(-15, 15))
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 
 
-def starry(rng: np.random.Generator, kind: str = "f8", smear_px: float = 0.0) -> tuple[NDArray, Floats]:
+def starry(
+    rng: np.random.Generator, kind: str = "f8", smear_px: float = 0.0
+) -> tuple[NDArray, Floats]:
     """A noisy sky with stars that are alone, smeared along x, and their places."""
-    places = np.array([(x, y) for x in (15, 44, 74) for y in (14, 35, 56)]) + rng.uniform(-2, 2, (9, 2))
+    places = np.array([(x, y) for x in (15, 44, 74) for y in (14, 35, 56)]) + rng.uniform(
+        -2, 2, (9, 2)
+    )
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     frame = rng.normal(100.0, 5, (HEIGHT, WIDTH))
     for at_x, at_y in places:
         for shift in np.linspace(-smear_px / 2, smear_px / 2, 21):
-            frame += rng.uniform(150, 180) * np.exp(-((x - at_x - shift) ** 2 + (y - at_y) ** 2) / 2.88)
+            frame += rng.uniform(150, 180) * np.exp(
+                -((x - at_x - shift) ** 2 + (y - at_y) ** 2) / 2.88
+            )
     return frame.astype(kind), places
 
 
@@ -66,7 +75,11 @@ def assert_inside(blobs: Blobs, most: int) -> None:
 
 
 @law(detect.prepare_image, detect.check_image, detect.check_size, detect.to_native)
-@given(image=EVERY_KIND.flatmap(lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))))
+@given(
+    image=EVERY_KIND.flatmap(
+        lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))
+    )
+)
 def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
     told = answered(lambda: detect.prepare_image(image), ImageError)
     assert told is None or (told.ndim == 2 and told.dtype.isnative and min(told.shape) >= 16)
@@ -82,15 +95,23 @@ def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
     most=some.integers(1, 12),
 )
 def test_blobs_are_of_the_frame(
-    rng: np.random.Generator, hostile: NDArray, name: str, streak_px: tuple[float, float] | None, most: int
+    rng: np.random.Generator,
+    hostile: NDArray,
+    name: str,
+    streak_px: tuple[float, float] | None,
+    most: int,
 ) -> None:
-    answered(lambda: DETECTORS[name](hostile, 5.0, 3, most, FramePriors(streak_px, np.inf)), ImageError)
+    answered(
+        lambda: DETECTORS[name](hostile, 5.0, 3, most, FramePriors(streak_px, np.inf)), ImageError
+    )
     frame, _ = starry(rng)
     assert_inside(DETECTORS[name](frame, 5.0, 3, most, FramePriors(streak_px, 3000.0)), most)
 
 
 @law(detect.local, detect.default, detect.components)
-@given(rng=SEEDS, up=some.integers(1, 500), name=some.sampled_from(["default", "local", "components"]))
+@given(
+    rng=SEEDS, up=some.integers(1, 500), name=some.sampled_from(["default", "local", "components"])
+)
 def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: str) -> None:
     frame, places = starry(rng)
     low, high = (DETECTORS[name](frame + more, 5.0, 3, 50, FramePriors()) for more in (0, up))
@@ -117,14 +138,19 @@ def test_what_stands_out_less_is_found_with_less(
     sky = background.estimate_background(frame)
     flat = detect.flat_background(sky, frame.shape)
     assert sky.level.min() <= flat.level.item() <= sky.level.max()
-    found = [detect.detect_blobs(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)]
+    found = [
+        detect.detect_blobs(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)
+    ]
     for blobs in found:
         assert_inside(blobs, 99)
     assert found[0].area_px.sum() >= found[1].area_px.sum()
     assert_inside(detect.detect_streaks(frame, sky, sigma, 99, FramePriors(streak_px)), 99)
     faint = detect.detect_faint_streaks(frame, sky, sigma, 99, FramePriors())
     assert_inside(faint, 99)
-    assert_inside(detect.in_full_length(frame, replace(faint, streak_px=streak_px), sigma, 99, FramePriors()), 99)
+    assert_inside(
+        detect.in_full_length(frame, replace(faint, streak_px=streak_px), sigma, 99, FramePriors()),
+        99,
+    )
 
 
 @law(components.runs_above, background.estimate_background, background.accumulator_type)
@@ -137,16 +163,26 @@ def test_runs_are_the_pixels_that_a_plain_filter_has_above(
     told = np.zeros(frame.shape, bool)
     for y, first, last in runs:
         told[y, first : last + 1] = True
-    np.testing.assert_array_equal(told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold)
-    lower, higher = (background.estimate_background(frame + np.array(more, kind)) for more in (0, 50))
-    np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)  # by the median's own steps
+    np.testing.assert_array_equal(
+        told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold
+    )
+    lower, higher = (
+        background.estimate_background(frame + np.array(more, kind)) for more in (0, 50)
+    )
+    np.testing.assert_allclose(
+        higher.level - lower.level, 50, rtol=0, atol=0.3
+    )  # by the median's own steps
     for pixel in ("u1", "i1", "u2", "i2"):
-        assert np.iinfo(background.accumulator_type(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
+        assert (
+            np.iinfo(background.accumulator_type(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
+        )
 
 
 @law(detect.line_taps, detect.noise_factor)
 @given(some.tuples(some.floats(-60, 60), some.floats(-60, 60)))
-def test_a_line_filter_keeps_less_noise_and_has_no_direction(streak_px: tuple[float, float]) -> None:
+def test_a_line_filter_keeps_less_noise_and_has_no_direction(
+    streak_px: tuple[float, float],
+) -> None:
     taps = detect.line_taps(streak_px)
     assert sorted(map(tuple, taps)) == sorted(map(tuple, -taps))
     assert (np.abs(taps) <= np.abs(streak_px) / 2 + 0.5).all()
@@ -157,7 +193,9 @@ def test_a_line_filter_keeps_less_noise_and_has_no_direction(streak_px: tuple[fl
 @law(detect.replace_bad_pixels)
 @given(
     rng=SEEDS,
-    bad=arrays("i8", some.tuples(some.integers(0, 9), some.just(2)), elements=some.integers(-2, 95)),
+    bad=arrays(
+        "i8", some.tuples(some.integers(0, 9), some.just(2)), elements=some.integers(-2, 95)
+    ),
 )
 def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray) -> None:
     frame, _ = starry(rng)
@@ -171,14 +209,28 @@ def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray
 
 @law()
 @given(SEEDS, some.integers(5, 12), some.integers(8, 30), some.booleans())
-def test_letters_are_text_wherever_they_are(rng: np.random.Generator, letters: int, height: int, even: bool) -> None:
+def test_letters_are_text_wherever_they_are(
+    rng: np.random.Generator, letters: int, height: int, even: bool
+) -> None:
     """A line of letters beside lights far below; moved and in any order; none if they are equally wide."""
-    width = np.full(letters, height) if even else rng.permutation(np.arange(letters) % 2 + 1) * height // 2
+    width = (
+        np.full(letters, height)
+        if even
+        else rng.permutation(np.arange(letters) % 2 + 1) * height // 2
+    )
     left = np.cumsum(width + rng.integers(1, height, letters)) - width
-    line = np.column_stack([left, np.zeros_like(left), left + width - 1, np.full(letters, height - 1)])
-    lights = rng.integers(0, 400, (6, 1)) * [1, 0, 1, 0] + np.arange(6)[:, None] * [0, 60, 0, 60] + [0, 100, 6, 106]
+    line = np.column_stack(
+        [left, np.zeros_like(left), left + width - 1, np.full(letters, height - 1)]
+    )
+    lights = (
+        rng.integers(0, 400, (6, 1)) * [1, 0, 1, 0]
+        + np.arange(6)[:, None] * [0, 60, 0, 60]
+        + [0, 100, 6, 106]
+    )
     order = rng.permutation(letters + 6)
-    boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[order].astype(np.int64)
+    boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[order].astype(
+        np.int64
+    )
     text = captions.find_captions(boxes, np.where(order < letters, 255.0, 200.0))
     assert text.tolist() == ((order < letters) & (not even)).tolist()
 
@@ -217,7 +269,9 @@ def test_streaks_of_a_roll_differ_across_their_separation(
 
 @law(windows.in_windows)
 @given(rng=SEEDS, strange=arrays("f8", (4, 2), elements=ANY), half_px=some.floats(0, 20))
-def test_windows_anywhere_hold_blobs_of_the_frame(rng: np.random.Generator, strange: NDArray, half_px: float) -> None:
+def test_windows_anywhere_hold_blobs_of_the_frame(
+    rng: np.random.Generator, strange: NDArray, half_px: float
+) -> None:
     frame, places = starry(rng)
     assert_inside(windows.in_windows(frame, np.concatenate([strange, places]), half_px, 6.0), 13)
     found = windows.in_windows(frame, places, 3.0, 6.0)
@@ -237,7 +291,9 @@ def test_windows_anywhere_hold_blobs_of_the_frame(rng: np.random.Generator, stra
     centroid.streak,
 )
 @given(rng=SEEDS, name=some.sampled_from(sorted(CENTROIDERS)), hostile=FRAMES)
-def test_a_centroid_is_its_star_s_whatever_the_order(rng: np.random.Generator, name: str, hostile: NDArray) -> None:
+def test_a_centroid_is_its_star_s_whatever_the_order(
+    rng: np.random.Generator, name: str, hostile: NDArray
+) -> None:
     frame, places = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
     seen = CENTROIDERS[name](frame, blobs, 1.0, FramePriors())
@@ -280,7 +336,9 @@ def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px
 def test_lights_are_chosen_and_doubted_as_told(
     rng: np.random.Generator, count: int, base: int, floor_px: float
 ) -> None:
-    lights = Centroids(rng.uniform(0, 60, (count, 2)), rng.uniform(0.01, 1, count), -np.arange(count) + 99.0)
+    lights = Centroids(
+        rng.uniform(0, 60, (count, 2)), rng.uniform(0.01, 1, count), -np.arange(count) + 99.0
+    )
     settings = Settings(base_stars=base, centroid_sigma_px=floor_px, bad_px=np.array([[44, 35]]))
     few = pipeline.brightest(lights, settings)
     np.testing.assert_array_equal(few.xy_px, lights.xy_px[: 2 * base])
@@ -292,7 +350,9 @@ def test_lights_are_chosen_and_doubted_as_told(
     seen = CENTROIDERS["cog"](frame, blobs, 1.0, FramePriors())
     assert (pipeline.inflate_uncertainty(seen, blobs, settings).sigma_px >= seen.sigma_px).all()
     off_border = (blobs.box_px > 0) & (blobs.box_px < np.tile([WIDTH - 1, HEIGHT - 1], 2))
-    np.testing.assert_array_equal(pipeline.away_from_border(blobs.box_px, CAMERA), off_border.all(axis=1))
+    np.testing.assert_array_equal(
+        pipeline.away_from_border(blobs.box_px, CAMERA), off_border.all(axis=1)
+    )
 
 
 @law()
@@ -304,8 +364,12 @@ def test_weights_are_the_inverse_of_all_the_errors(
     spread = roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(2)
     sigma = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
     known = NO_SPREAD if even else spread
-    lights = FlatCentroids(np.zeros((count, 2)), sigma, np.ones(count), known, np.hypot(sigma, more_px))
-    seen = detections_of(lights, Sensor(1.0, (0.0, 0.0), (0.0,) * 5, np.zeros(4), np.nan, 0.25), 0.0)
+    lights = FlatCentroids(
+        np.zeros((count, 2)), sigma, np.ones(count), known, np.hypot(sigma, more_px)
+    )
+    seen = detections_of(
+        lights, Sensor(1.0, (0.0, 0.0), (0.0,) * 5, np.zeros(4), np.nan, 0.25), 0.0
+    )
     xx, yy, xy = seen.weight.T
     weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     alone = sigma[:, None, None] ** 2 * np.eye(2) if even else spread
@@ -327,7 +391,10 @@ def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
     fits = answered(lambda: camera.check_frame(hostile, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
     nothing = Attitude("nobody asked")
-    answered(lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError)
+    answered(
+        lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px),
+        ImageError,
+    )
     frame, _ = starry(rng)
     clock = Clock()
     seen = pipeline.detect_and_centroid(frame, CAMERA, Settings(), clock, streak_px)
@@ -362,16 +429,27 @@ def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> Non
     lens = Camera.from_fov(WIDTH, HEIGHT, fov_rad)
     np.testing.assert_allclose(lens.fov_rad, fov_rad, rtol=1e-9, atol=0)
     assert lens.diagonal_rad > lens.fov_rad > lens.zoomed(factor).fov_rad
-    np.testing.assert_allclose(lens.zoomed(factor).zoomed(1 / factor).focal_px, lens.focal_px, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        lens.zoomed(factor).zoomed(1 / factor).focal_px, lens.focal_px, rtol=1e-12, atol=0
+    )
 
 
 # Attitude
 
 
 @law(*SOLVERS.values(), solvers.rotation)
-@given(rng=SEEDS, count=some.integers(2, 12), noise=some.floats(0, 0.01), name=some.sampled_from(sorted(SOLVERS)))
-def test_a_solver_finds_the_turn_in_any_order(rng: np.random.Generator, count: int, noise: float, name: str) -> None:
-    truth, ref, sigma = turn(rng), units(rng, count), rng.uniform(1e-5, 1e-3, count)
+@given(
+    rng=SEEDS,
+    count=some.integers(2, 12),
+    noise=some.floats(0, 0.01),
+    name=some.sampled_from(sorted(SOLVERS)),
+)
+def test_a_solver_finds_the_turn_in_any_order(
+    rng: np.random.Generator, count: int, noise: float, name: str
+) -> None:
+    truth = turn(rng)
+    ref = units(rng, count)
+    sigma = rng.uniform(1e-5, 1e-3, count)
     cam = truth.apply(ref) + noise * sigma[:, None] * rng.normal(size=(count, 3))
     cam /= np.linalg.norm(cam, axis=1, keepdims=True)
     found = answered(lambda: SOLVERS[name](cam, ref, sigma))
@@ -382,7 +460,9 @@ def test_a_solver_finds_the_turn_in_any_order(rng: np.random.Generator, count: i
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12)
     assert solvers.rotation(matrix).approx_equal(found, 1e-7)
     weight = 1 / sigma**2
-    cost, best = (np.sum(weight * np.sum((cam - one.apply(ref)) ** 2, axis=1)) for one in (found, truth))
+    cost, best = (
+        np.sum(weight * np.sum((cam - one.apply(ref)) ** 2, axis=1)) for one in (found, truth)
+    )
     assert name == "triad" or cost <= best * (1 + 1e-6) + 1e-12 * weight.sum()
     order = rng.permutation(count)
     again = answered(lambda: SOLVERS[name](cam[order], ref[order], sigma[order])) or found
@@ -407,7 +487,9 @@ def test_any_directions_are_solved_or_refused(
     seen = units(rng, 5)
     spread = solvers.covariance(seen, np.full(5, 1e-4), name)
     assert_covariance(spread)
-    np.testing.assert_allclose(solvers.covariance(seen, np.full(5, scale * 1e-4), name), scale**2 * spread, rtol=1e-6)
+    np.testing.assert_allclose(
+        solvers.covariance(seen, np.full(5, scale * 1e-4), name), scale**2 * spread, rtol=1e-6
+    )
 
 
 @law(ra_dec_roll_rad, Attitude.ra_dec_roll_deg)
@@ -422,7 +504,9 @@ def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Ge
     up = np.cos(roll) * north + np.sin(roll) * np.cross(sight, north) * -1
     built = Rotation.from_matrix([np.cross(-up, sight), -up, sight])
     assert (built * truth.inv()).magnitude() < 1e-9
-    np.testing.assert_array_equal(Attitude("solved", truth).ra_dec_roll_deg, np.degrees([ra, dec, roll]))
+    np.testing.assert_array_equal(
+        Attitude("solved", truth).ra_dec_roll_deg, np.degrees([ra, dec, roll])
+    )
     assert np.isnan(Attitude("lost").ra_dec_roll_deg).all()
 
 
@@ -431,15 +515,29 @@ BLEMISHES = {  # flags, a bad pixel, and the variance added
     "saturated": (int(Flag.SATURATED), [30, 30], pipeline.SATURATED_SIGMA_PX**2),
     "bad pixel beside it": (0, [9, 13], pipeline.BAD_PIXEL_SIGMA_PX**2),
     "bad pixel two away": (0, [8, 11], 0.0),
-    "both": (int(Flag.SATURATED), [11, 11], pipeline.SATURATED_SIGMA_PX**2 + pipeline.BAD_PIXEL_SIGMA_PX**2),
+    "both": (
+        int(Flag.SATURATED),
+        [11, 11],
+        pipeline.SATURATED_SIGMA_PX**2 + pipeline.BAD_PIXEL_SIGMA_PX**2,
+    ),
 }
 
 
 @pytest.mark.parametrize(("flag", "bad_px", "variance"), BLEMISHES.values(), ids=BLEMISHES)
-def test_a_blemish_adds_the_same_variance_in_every_direction(flag: int, bad_px: list[int], variance: float) -> None:
+def test_a_blemish_adds_the_same_variance_in_every_direction(
+    flag: int, bad_px: list[int], variance: float
+) -> None:
     """A saturated center and a bad pixel are independent errors; the ellipse of the rest keeps its axes."""
     one = np.ones(1)
-    blob = Blobs(np.array([[10, 10, 12, 12]]), np.array([[11.0, 11.0]]), one, one, one, None, np.array([flag]))
+    blob = Blobs(
+        np.array([[10, 10, 12, 12]]),
+        np.array([[11.0, 11.0]]),
+        one,
+        one,
+        one,
+        None,
+        np.array([flag]),
+    )
     ellipse = np.array([[[4e-4, 1e-4], [1e-4, 2e-4]]])
     lights = Centroids(np.array([[11.0, 11.0]]), np.array([0.02]), np.array([99.0]), ellipse)
     settings = Settings(bad_px=np.array([bad_px, [40, 40]]))

@@ -27,10 +27,13 @@ def test_a_blob_is_all_that_is_connected_with_its_peak() -> None:
         image, _, label = crowded(seed)
         for number in range(1, label.max() + 1):
             y, x = np.nonzero(label == number)
-            box, total = np.empty(4, np.int64), np.empty(5)
+            box = np.empty(4, np.int64)
+            total = np.empty(5)
             WINDOWS._grow(image, x[0], y[0], SKY, SKY + 1, box, total)
             light = image[y, x]
-            np.testing.assert_allclose(total, [len(x), light.sum(), light @ x, light @ y, light.max()], rtol=1e-12)
+            np.testing.assert_allclose(
+                total, [len(x), light.sum(), light @ x, light @ y, light.max()], rtol=1e-12
+            )
             assert box.tolist() == [x.min(), y.min(), x.max(), y.max()]
             touched |= [x.min() == 0, y.min() == 0, x.max() == 16, y.max() == 12]
     assert touched.all()
@@ -42,7 +45,9 @@ def test_a_window_spans_the_pixels_from_its_lower_end_to_its_upper_one() -> None
         high = low + 4.0
         first, last = WINDOWS._span(low + 2.0, 2.0, 17)
         if high >= 0:
-            assert list(range(first, last + 1)) == [k for k in range(17) if np.floor(low) <= k <= high]
+            assert list(range(first, last + 1)) == [
+                k for k in range(17) if np.floor(low) <= k <= high
+            ]
         if high <= -1:
             assert first > last
     assert WINDOWS._span(np.nan, 2.0, 17) == (0, -1)
@@ -50,15 +55,21 @@ def test_a_window_spans_the_pixels_from_its_lower_end_to_its_upper_one() -> None
 
 def test_each_window_gives_the_blob_of_its_brightest_pixel_once() -> None:
     """Windows over the edges and outside of the frame too; where none is above the threshold there is no blob."""
-    rng, found, empty = np.random.default_rng(9), 0, 0
+    rng = np.random.default_rng(9)
+    found = 0
+    empty = 0
     for seed in range(20):
         image, above, label = crowded(seed)
-        center, half = rng.uniform(-4, [21, 17]), 2.0
+        center = rng.uniform(-4, [21, 17])
+        half = 2.0
         x, y = np.meshgrid(np.arange(17), np.arange(13))
         # A window's first pixel is its lower end rounded down, its last one the upper end rounded down.
-        low, high = np.maximum(center - half, 0).astype(int), np.minimum(center + half, [16, 12]).astype(int)
+        low = np.maximum(center - half, 0).astype(int)
+        high = np.minimum(center + half, [16, 12]).astype(int)
         inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]) & (above > 6)
-        boxes, _, count = WINDOWS._brightest(image, np.array([center, center]), half, SKY, SKY + 1, 6.0)
+        boxes, _, count = WINDOWS._brightest(
+            image, np.array([center, center]), half, SKY, SKY + 1, 6.0
+        )
         assert count == inside.any()
         empty += count == 0
         if count:

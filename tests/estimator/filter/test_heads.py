@@ -12,13 +12,15 @@ from tumble import tumble_angle_rad, tumble_body_from_ref
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
 
 ARCSEC_RAD = np.pi / 180 / 3600
-CROSS, ROLL = 10 * ARCSEC_RAD, 60 * ARCSEC_RAD
+CROSS = 10 * ARCSEC_RAD
+ROLL = 60 * ARCSEC_RAD
 # The boresight of the first head is the body's z axis, that of the second its x axis.
 NOISE_RAD2 = np.diag([CROSS, CROSS, ROLL]) ** 2, np.diag([ROLL, CROSS, CROSS]) ** 2
 GYRO = GyroModel(np.radians(0.07) / 60, 0.0, np.inf)
 MOUNTED = TrackerModel(mounting_rad=1e-3)
 WALKING = replace(MOUNTED, mounting_drift_rad_sqrt_s=5 * ARCSEC_RAD)
-RATE_HZ, SECONDS = 20, 15
+RATE_HZ = 20
+SECONDS = 15
 T_S = np.arange(SECONDS * RATE_HZ + 1) / RATE_HZ
 
 
@@ -29,33 +31,51 @@ def test_two_heads_at_a_right_angle_have_the_sum_of_their_information() -> None:
         assert mekf.update(0.0, Rotation.identity(), noise, head=head).status == USED
     summed = np.linalg.inv(sum(np.linalg.inv(noise) for noise in NOISE_RAD2))
     np.testing.assert_allclose(mekf.state.covariance[:3, :3], summed, rtol=1e-6, atol=1e-18)
-    np.testing.assert_allclose(mekf.state.sigma_attitude_rad[2], (ROLL**-2 + CROSS**-2) ** -0.5, rtol=1e-6)
+    np.testing.assert_allclose(
+        mekf.state.sigma_attitude_rad[2], (ROLL**-2 + CROSS**-2) ** -0.5, rtol=1e-6
+    )
 
 
-def squared(tracker: TrackerModel, considered: tuple[str, ...], runs: int) -> tuple[float, float, int]:
+def squared(
+    tracker: TrackerModel, considered: tuple[str, ...], runs: int
+) -> tuple[float, float, int]:
     """Mean NEES of the attitude and of all states of flights with two heads, and the number of states."""
-    rng, truth, nees = np.random.default_rng(3), tumble_body_from_ref(np.arange(SECONDS + 1.0)), []
+    rng = np.random.default_rng(3)
+    truth = tumble_body_from_ref(np.arange(SECONDS + 1.0))
+    nees = []
     for _ in range(runs):
         mounts = tracker.mounting_rad * rng.normal(size=(2, 3))  # the second relative to the first
         noise = GYRO.arw_rad_sqrt_s / np.sqrt(RATE_HZ) * rng.normal(size=(len(T_S) - 1, 3))
         angle = tumble_angle_rad(T_S) + noise
         start = Rotation.from_rotvec(1e-3 * rng.normal(size=3)) * truth[0]
-        mekf = AttitudeFilter(GYRO, 0.0, start, 1e-3, 0.0, 0.0, np.inf, tracker, considered=considered, heads=2)
+        mekf = AttitudeFilter(
+            GYRO, 0.0, start, 1e-3, 0.0, 0.0, np.inf, tracker, considered=considered, heads=2
+        )
         for k in range(SECONDS):
             rows = slice(k * RATE_HZ, (k + 1) * RATE_HZ)
             mekf.propagate(T_S[1:][rows], angle[rows], np.zeros(RATE_HZ, bool))
             mounts += tracker.mounting_drift_rad_sqrt_s * rng.normal(size=(2, 3))
             for head in range(2):
-                error = mounts[: head + 1].sum(axis=0) + np.sqrt(np.diag(NOISE_RAD2[head])) * rng.normal(size=3)
+                error = mounts[: head + 1].sum(axis=0) + np.sqrt(
+                    np.diag(NOISE_RAD2[head])
+                ) * rng.normal(size=3)
                 measured = Rotation.from_rotvec(-error) * truth[k + 1]
                 assert mekf.update(k + 1.0, measured, NOISE_RAD2[head], head=head).status == USED
         state = mekf.state
         turned = (state.body_from_ref * truth[-1].inv()).as_rotvec()
-        errors = [mount - state.others[name] for mount, name in zip(mounts, ("mounting", "mounting_1"), strict=True)]
+        errors = [
+            mount - state.others[name]
+            for mount, name in zip(mounts, ("mounting", "mounting_1"), strict=True)
+        ]
         error = np.concatenate([turned, *errors])
         used = [0, 1, 2, 6, 7, 8, 9, 10, 11]  # the bias has no error here
         covariance = state.covariance[np.ix_(used, used)]
-        nees.append((turned @ np.linalg.solve(covariance[:3, :3], turned), error @ np.linalg.solve(covariance, error)))
+        nees.append(
+            (
+                turned @ np.linalg.solve(covariance[:3, :3], turned),
+                error @ np.linalg.solve(covariance, error),
+            )
+        )
     attitude, every = np.mean(nees, axis=0)
     return float(attitude), float(every), len(used)
 
@@ -74,9 +94,12 @@ def test_errors_of_two_mountings_are_what_the_covariance_says(
 @pytest.mark.slow
 def test_a_constant_model_does_not_claim_a_walk() -> None:
     """The same flights as above with mountings that walk: the filter without the walk is wrong about them."""
-    rng, truth = np.random.default_rng(3), Rotation.identity()
+    rng = np.random.default_rng(3)
+    truth = Rotation.identity()
     mekf = AttitudeFilter(GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, MOUNTED, considered=(), heads=2)
-    walking = AttitudeFilter(GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, WALKING, considered=(), heads=2)
+    walking = AttitudeFilter(
+        GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, WALKING, considered=(), heads=2
+    )
     mount = np.zeros(3)
     for k in range(60):
         mount += WALKING.mounting_drift_rad_sqrt_s * rng.normal(size=3)
@@ -84,7 +107,10 @@ def test_a_constant_model_does_not_claim_a_walk() -> None:
             each.propagate([k + 1.0], np.zeros((1, 3)), [False])
             each.update(k + 1.0, truth, NOISE_RAD2[0], head=0)
             each.update(k + 1.0, Rotation.from_rotvec(-mount), NOISE_RAD2[1], head=1)
-    errors = [(mount - each.state.others["mounting_1"]) / each.state.sigma("mounting_1") for each in (mekf, walking)]
+    errors = [
+        (mount - each.state.others["mounting_1"]) / each.state.sigma("mounting_1")
+        for each in (mekf, walking)
+    ]
     assert np.abs(errors[0]).max() > 5
     assert np.abs(errors[1]).max() < 4
 

@@ -34,19 +34,29 @@ WRONG = Rotation.from_rotvec(np.radians([3.0, -4.0, 0.0]))  # 5 degrees
 class Vehicle:
     """A vehicle at rest with a noisy gyro at 100 Hz and a solution each second."""
 
-    def __init__(self, seed: int, gyro: GyroModel = GYRO, start: Rotation = HOME, sigma_rad: float = 1e-3) -> None:
-        self.rng, self.second = np.random.default_rng(seed), 0
+    def __init__(
+        self, seed: int, gyro: GyroModel = GYRO, start: Rotation = HOME, sigma_rad: float = 1e-3
+    ) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.second = 0
         self.mekf = AttitudeFilter(gyro, 0.0, start, sigma_rad, 1e-5)
 
-    def update(self, attitude: Rotation, turn: np.ndarray | None = None, saturated: slice = slice(0)) -> Update:
+    def update(
+        self, attitude: Rotation, turn: np.ndarray | None = None, saturated: slice = slice(0)
+    ) -> Update:
         """One second on: the turn (100, 3) that the gyro measures, and a solution of the attitude."""
-        t_s, flags = self.second + np.arange(1, 101) / 100, np.zeros(100, bool)
+        t_s = self.second + np.arange(1, 101) / 100
+        flags = np.zeros(100, bool)
         flags[saturated] = True
-        angle = (0 if turn is None else turn) + ARW_RAD_SQRT_S * 0.1 * self.rng.normal(size=(100, 3))
+        angle = (0 if turn is None else turn) + ARW_RAD_SQRT_S * 0.1 * self.rng.normal(
+            size=(100, 3)
+        )
         self.mekf.propagate(t_s, angle, flags)
         self.second += 1
         noise = np.sqrt(np.diag(NOISE_RAD2)) * self.rng.normal(size=3)
-        return self.mekf.update(float(self.second), Rotation.from_rotvec(noise) * attitude, NOISE_RAD2)
+        return self.mekf.update(
+            float(self.second), Rotation.from_rotvec(noise) * attitude, NOISE_RAD2
+        )
 
     def updates(self, attitude: Rotation, count: int) -> list[Update]:
         return [self.update(attitude) for _ in range(count)]
@@ -57,11 +67,15 @@ class Vehicle:
 
 def statuses(updates: list[Update]) -> list[tuple[str, int]]:
     """Each status with the number of times that it follows itself."""
-    return [(status, len(list(group))) for status, group in groupby(update.status for update in updates)]
+    return [
+        (status, len(list(group))) for status, group in groupby(update.status for update in updates)
+    ]
 
 
 @pytest.mark.parametrize(("right", "wrong"), [(1, 3), (1, 10), (4, 10), (20, 3), (20, 20)])
-def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(wrong: int, right: int) -> None:
+def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
+    wrong: int, right: int
+) -> None:
     vehicle = Vehicle(1)
     assert statuses(vehicle.updates(HOME, right)) == [(USED, right)]
     told = vehicle.updates(WRONG, wrong)
@@ -141,7 +155,11 @@ def knock(rate_rad_s: float, samples: int) -> tuple[np.ndarray, Rotation]:
 def test_after_a_knock_the_filter_is_back_within_three_solutions(
     times_limit: float, samples: int, known_by: str
 ) -> None:
-    gyro = GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf, limit_rad_s=LIMIT_RAD_S) if known_by == "the limit" else GYRO
+    gyro = (
+        GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf, limit_rad_s=LIMIT_RAD_S)
+        if known_by == "the limit"
+        else GYRO
+    )
     vehicle = Vehicle(5, gyro)
     vehicle.updates(HOME, 40)
     turn, after = knock(times_limit * LIMIT_RAD_S, samples)
@@ -181,7 +199,12 @@ def test_an_outage_grows_by_its_rate_and_keeps_the_bias() -> None:
     mekf = AttitudeFilter(gyro, 0.0, HOME, 0.0, 0.0)
     t_s = np.arange(1, 101) / 100
     missing = t_s > 0.5
-    mekf.propagate(t_s, np.where(missing[:, None], np.nan, 0.0) * np.ones((100, 3)), np.zeros(100, bool), missing)
+    mekf.propagate(
+        t_s,
+        np.where(missing[:, None], np.nan, 0.0) * np.ones((100, 3)),
+        np.zeros(100, bool),
+        missing,
+    )
     assert mekf.state.sigma_attitude_rad == pytest.approx(0.15 * np.ones(3), rel=1e-9)
     assert not mekf.state.sigma_bias_rad_s.any()
     # A guess is used as such.
@@ -204,7 +227,9 @@ def test_the_odds_are_those_of_the_docstring() -> None:
     lost = log_odds(jump(lost_rad=np.radians(5.0) / 3), model)
     assert lost == pytest.approx(math.log(0.25) - wrong, rel=1e-4)
     assert log_odds(jump(support=0), model) == pytest.approx(math.log(0.02) - wrong, rel=1e-3)
-    assert log_odds(jump(support=2, since_s=0.0), model) == pytest.approx(math.log(5e-4) - wrong, rel=1e-9)
+    assert log_odds(jump(support=2, since_s=0.0), model) == pytest.approx(
+        math.log(5e-4) - wrong, rel=1e-9
+    )
     assert log_odds(jump(distance=10.0), model) == pytest.approx(-2 - wrong, rel=1e-3)
     assert math.isfinite(log_odds(jump(since_s=0.0, support=10**6), model))
 
@@ -215,7 +240,8 @@ def test_a_small_jump_is_put_to_the_filter_s_own_model_at_the_third_solution() -
 
 
 def test_a_shock_is_the_sharpest_change_of_rate_and_no_noise() -> None:
-    rng, samples = np.random.default_rng(8), np.zeros((100, 5))
+    rng = np.random.default_rng(8)
+    samples = np.zeros((100, 5))
     samples[:, 0] = 2.0 + np.cumsum(rng.uniform(0.005, 0.015, 100))
     step_s = np.diff(samples[:, 0], prepend=2.0)
     samples[:, 1:4] = ARW_RAD_SQRT_S * np.sqrt(step_s)[:, None] * rng.normal(size=(100, 3))

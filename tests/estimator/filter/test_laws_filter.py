@@ -31,16 +31,23 @@ def filtering(rng: np.random.Generator) -> AttitudeFilter:
 def test_the_inverse_response_undoes_the_gyro_s_matrix(seed: int, used: NDArray) -> None:
     """The states of the matrix are anywhere among the values; elements that are no state are 0."""
     rng = np.random.default_rng(seed)
-    values, columns = 0.1 * rng.normal(size=20), np.full(9, -1)
+    values = 0.1 * rng.normal(size=20)
+    columns = np.full(9, -1)
     columns[used] = rng.choice(20, used.sum(), replace=False)
     matrix = np.where(used, values[columns], 0.0).reshape(3, 3)
-    np.testing.assert_allclose(inverse_response(values, columns) @ (np.eye(3) + matrix), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        inverse_response(values, columns) @ (np.eye(3) + matrix), np.eye(3), atol=1e-12
+    )
 
 
 def assert_sound(told: FilterState) -> None:
     assert_covariance(told.covariance)
-    np.testing.assert_allclose(told.sigma_attitude_rad**2, np.diag(told.covariance)[:3], rtol=1e-12, atol=0)
-    np.testing.assert_allclose(told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        told.sigma_attitude_rad**2, np.diag(told.covariance)[:3], rtol=1e-12, atol=0
+    )
+    np.testing.assert_allclose(
+        told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0
+    )
 
 
 @pytest.mark.slow
@@ -61,15 +68,19 @@ def test_any_finite_turns_leave_a_unit_attitude_and_a_covariance(
     np.testing.assert_allclose(np.linalg.norm(mekf.ref_from_body_wxyz), 1, rtol=0, atol=1e-12)
     same = Rotation.from_quat(mekf.ref_from_body_wxyz, scalar_first=True) * mekf.body_from_ref
     assert same.magnitude() < 1e-12
-    np.testing.assert_array_equal(mekf.bias_rad_s, np.zeros(3))  # a gyro alone tells nothing of its bias
+    np.testing.assert_array_equal(
+        mekf.bias_rad_s, np.zeros(3)
+    )  # a gyro alone tells nothing of its bias
 
 
 @law(AttitudeFilter.propagate, FilterState.sigma_attitude_rad, FilterState.sigma_bias_rad_s)
 @given(rng=SEEDS, cut=some.integers(1, 9))
 def test_how_samples_are_cut_into_calls_is_no_matter(rng: np.random.Generator, cut: int) -> None:
-    t_s, angle = np.cumsum(rng.uniform(1e-3, 0.1, 10)), rng.normal(0, 0.1, (10, 3))
+    t_s = np.cumsum(rng.uniform(1e-3, 0.1, 10))
+    angle = rng.normal(0, 0.1, (10, 3))
     seed = int(rng.integers(2**32))
-    once, twice = filtering(np.random.default_rng(seed)), filtering(np.random.default_rng(seed))
+    once = filtering(np.random.default_rng(seed))
+    twice = filtering(np.random.default_rng(seed))
     once.propagate(t_s, angle, np.zeros(10))
     for part in (slice(None, cut), slice(cut, None)):
         twice.propagate(t_s[part], angle[part], np.zeros(10)[part])
@@ -113,7 +124,9 @@ def test_a_solution_that_is_used_makes_the_filter_surer(
 
 @law(AttitudeFilter.update)
 @given(rng=SEEDS, t_s=ANY, covariance=NUMBERS | arrays("f8", (3, 3), elements=ANY))
-def test_any_solution_is_taken_or_refused(rng: np.random.Generator, t_s: float, covariance: NDArray) -> None:
+def test_any_solution_is_taken_or_refused(
+    rng: np.random.Generator, t_s: float, covariance: NDArray
+) -> None:
     mekf = filtering(rng)
     mekf.propagate([0.1, 0.2], rng.normal(0, 0.1, (2, 3)), [False, False])
     for when_s in (t_s, 0.15):
@@ -135,10 +148,14 @@ def test_any_solution_is_taken_or_refused(rng: np.random.Generator, t_s: float, 
 def test_an_exposure_stays_within_the_camera_s(
     time_s: float, mean_dn: float, stars: int, overexposed: int, control: Control
 ) -> None:
-    asked = exposure_control.step(Exposure(time_s), Observation(mean_dn, stars, overexposed), control)
+    asked = exposure_control.step(
+        Exposure(time_s), Observation(mean_dn, stars, overexposed), control
+    )
     assert control.shortest_s <= asked.time_s <= control.longest_s
     assert asked.no_stars == (stars < control.min_stars)
-    assert asked.time_s <= max(time_s, control.shortest_s) + 1e-6 or (asked.no_stars and not asked.saturated)
+    assert asked.time_s <= max(time_s, control.shortest_s) + 1e-6 or (
+        asked.no_stars and not asked.saturated
+    )
 
 
 @law(exposure_control.observe)

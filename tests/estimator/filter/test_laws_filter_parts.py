@@ -35,12 +35,18 @@ def state_of(rng: np.random.Generator, layout: states.Layout) -> states.State:
     """A state with some attitude, values, correlations and history."""
     values = rng.normal(0, 1e-3, layout.size)
     values[:3] = 0.0
-    started = states.start_state(1.0, correct.wxyz_of(turn(rng)), dict.fromkeys(layout.slices, 1.0), layout)
+    started = states.start_state(
+        1.0, correct.wxyz_of(turn(rng)), dict.fromkeys(layout.slices, 1.0), layout
+    )
     used = correct.wxyz_of(turn(rng))
-    return started._replace(values=values, covariance=covariance(rng, layout.size), used_wxyz=used, support=5)
+    return started._replace(
+        values=values, covariance=covariance(rng, layout.size), used_wxyz=used, support=5
+    )
 
 
-def solution_near(rng: np.random.Generator, state: states.State, off_rad: float) -> correct.Solution:
+def solution_near(
+    rng: np.random.Generator, state: states.State, off_rad: float
+) -> correct.Solution:
     near = Rotation.from_rotvec(rng.normal(0, off_rad, 3)) * state.body_from_ref
     return correct.Solution(near, covariance(rng, 3), covariance(rng, 3))
 
@@ -50,15 +56,26 @@ def solution_near(rng: np.random.Generator, state: states.State, off_rad: float)
 
 @law(states.of_head, states.build_layout)
 @given(heads=some.integers(1, 8), considered=CHOICES)
-def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(heads: int, considered: tuple[str, ...]) -> None:
+def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
+    heads: int, considered: tuple[str, ...]
+) -> None:
     """They share no row; only the first mounting can be considered, the slow errors all together."""
     layout = states.build_layout(GYRO, TRACKER, considered, heads)
-    names = [states.of_head(name, head) for head in range(heads) for name in ("mounting", "systematic")]
+    names = [
+        states.of_head(name, head) for head in range(heads) for name in ("mounting", "systematic")
+    ]
     rows = np.concatenate([np.arange(layout.size)[layout.slices[name]] for name in names])
     assert len(set(names)) == len(names)
-    assert len(set(rows.tolist())) == 6 * heads == len(layout.mountings) + layout.slow.stop - layout.slow.start
+    assert (
+        len(set(rows.tolist()))
+        == 6 * heads
+        == len(layout.mountings) + layout.slow.stop - layout.slow.start
+    )
     for name in ("mounting", "systematic"):
-        fixed = [not layout.estimated[layout.slices[states.of_head(name, head)]].any() for head in range(heads)]
+        fixed = [
+            not layout.estimated[layout.slices[states.of_head(name, head)]].any()
+            for head in range(heads)
+        ]
         others = name in considered and name == "systematic"
         assert fixed == [name in considered, *[others] * (heads - 1)]
 
@@ -77,8 +94,12 @@ def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None
 
 @law(checks.checked_samples)
 @given(rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5))
-def test_samples_keep_what_was_measured_and_say_how(rng: np.random.Generator, angle: NDArray, lost: NDArray) -> None:
-    t_s, saturated, gyro = np.cumsum(rng.uniform(0.01, 0.1, 5)), rng.random(5) < 0.5, replace(GYRO, limit_rad_s=3.0)
+def test_samples_keep_what_was_measured_and_say_how(
+    rng: np.random.Generator, angle: NDArray, lost: NDArray
+) -> None:
+    t_s = np.cumsum(rng.uniform(0.01, 0.1, 5))
+    saturated = rng.random(5) < 0.5
+    gyro = replace(GYRO, limit_rad_s=3.0)
     holes = np.where(lost[:, None], np.nan, angle)
     samples = checks.checked_samples(0.0, t_s, holes, saturated, lost, gyro)
     np.testing.assert_array_equal(samples[:, 0], t_s)
@@ -93,8 +114,11 @@ def test_samples_keep_what_was_measured_and_say_how(rng: np.random.Generator, an
 
 @law(checks.checked_covariances, checks.is_covariance)
 @given(rng=SEEDS, any_matrix=NUMBERS | arrays("f8", (3, 3), elements=ANY))
-def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(rng: np.random.Generator, any_matrix: NDArray) -> None:
-    noise, common = covariance(rng, 3), covariance(rng, 3)
+def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(
+    rng: np.random.Generator, any_matrix: NDArray
+) -> None:
+    noise = covariance(rng, 3)
+    common = covariance(rng, 3)
     told = checks.checked_covariances(noise + common, common)
     np.testing.assert_allclose(told[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
     np.testing.assert_array_equal(told[1], told[1].T)
@@ -110,9 +134,13 @@ def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(rng: np.random.
 
 @law(states.build_layout, states.start_state, states.Layout.reported)
 @given(considered=CHOICES, used=some.sets(some.sampled_from(STATES[1:4])))
-def test_the_states_fill_the_covariance_without_gap_or_overlap(considered: tuple[str, ...], used: set[str]) -> None:
+def test_the_states_fill_the_covariance_without_gap_or_overlap(
+    considered: tuple[str, ...], used: set[str]
+) -> None:
     gyro = replace(GYRO, scale="scale" in used, misalignment_rad="misalignment" in used)
-    layout = states.build_layout(gyro, replace(TRACKER, mounting_rad="mounting" in used), considered)
+    layout = states.build_layout(
+        gyro, replace(TRACKER, mounting_rad="mounting" in used), considered
+    )
     assert set(layout.slices) == {"attitude", "bias", "systematic"} | used
     rows = np.concatenate([np.arange(part.start, part.stop) for part in layout.slices.values()])
     np.testing.assert_array_equal(rows, np.arange(layout.size))
@@ -147,16 +175,25 @@ def test_a_gyro_sample_moves_the_errors_as_it_moves_the_truth(
     single = before._replace(covariance=np.outer(error, error))
     moved = states.propagate_state(single, samples, quiet, known, layout)
     truth = states.propagate_state(true, samples, quiet, known, layout)
-    after = np.r_[(moved.body_from_ref * truth.body_from_ref.inv()).as_rotvec(), (truth.values - moved.values)[3:]]
-    np.testing.assert_allclose(moved.covariance, np.outer(after, after), rtol=0, atol=1e-4 * (after @ after))
+    after = np.r_[
+        (moved.body_from_ref * truth.body_from_ref.inv()).as_rotvec(),
+        (truth.values - moved.values)[3:],
+    ]
+    np.testing.assert_allclose(
+        moved.covariance, np.outer(after, after), rtol=0, atol=1e-4 * (after @ after)
+    )
     assert states.propagate_state(before, samples[:0], quiet, known, layout) is before
 
 
 @law(states.propagate_state)
 @given(rng=SEEDS, share=some.floats(0, 1), time_s=some.floats(0.1, 100))
-def test_the_slow_error_returns_to_its_unit_variance(rng: np.random.Generator, share: float, time_s: float) -> None:
-    layout, tracker = states.build_layout(GYRO, TRACKER, ()), replace(TRACKER, systematic_time_s=time_s)
-    before, slow = state_of(rng, layout), layout.slices["systematic"]
+def test_the_slow_error_returns_to_its_unit_variance(
+    rng: np.random.Generator, share: float, time_s: float
+) -> None:
+    layout = states.build_layout(GYRO, TRACKER, ())
+    tracker = replace(TRACKER, systematic_time_s=time_s)
+    before = state_of(rng, layout)
+    slow = layout.slices["systematic"]
     before.covariance[slow] = before.covariance[:, slow] = 0.0
     before.covariance[slow, slow] = share * np.eye(3)
     samples = np.column_stack([1.0 + np.arange(1, 5) / 20, np.zeros((4, 4))])
@@ -164,7 +201,9 @@ def test_the_slow_error_returns_to_its_unit_variance(rng: np.random.Generator, s
     kept = np.exp(-0.2 / time_s)
     np.testing.assert_allclose(after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0)
     variance = share * kept**2 + 1 - kept**2
-    np.testing.assert_allclose(after.covariance[slow, slow], variance * np.eye(3), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        after.covariance[slow, slow], variance * np.eye(3), rtol=1e-9, atol=1e-15
+    )
 
 
 @law(states.decorrelate)
@@ -172,13 +211,16 @@ def test_the_slow_error_returns_to_its_unit_variance(rng: np.random.Generator, s
 def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random.Generator) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
     before = state_of(rng, layout)
-    after, slow = states.decorrelate(before, TRACKER, layout), layout.slices["systematic"]
+    after = states.decorrelate(before, TRACKER, layout)
+    slow = layout.slices["systematic"]
     used = Rotation.from_quat(before.used_wxyz, scalar_first=True)
     kept = math.exp(-(before.body_from_ref * used).magnitude() / TRACKER.systematic_angle_rad)
     np.testing.assert_allclose(after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0)
     variance = kept**2 * before.covariance[slow, slow] + (1 - kept**2) * np.eye(3)
     np.testing.assert_allclose(after.covariance[slow, slow], variance, rtol=1e-9, atol=1e-15)
-    np.testing.assert_array_equal(after.covariance[: slow.start, : slow.start], before.covariance[:-3, :-3])
+    np.testing.assert_array_equal(
+        after.covariance[: slow.start, : slow.start], before.covariance[:-3, :-3]
+    )
     assert_covariance(after.covariance)
 
 
@@ -187,22 +229,32 @@ def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random
 
 @law(correct.innovation, correct.offset_rows)
 @given(rng=SEEDS, off_rad=some.floats(0, 0.5))
-def test_the_residual_follows_the_errors_that_it_is_linear_in(rng: np.random.Generator, off_rad: float) -> None:
+def test_the_residual_follows_the_errors_that_it_is_linear_in(
+    rng: np.random.Generator, off_rad: float
+) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
     prior = state_of(rng, layout)
     solution = solution_near(rng, prior, off_rad)
     found = correct.innovation(prior, solution, layout)
     rows = correct.offset_rows(solution, layout)
     slow = rows[:, layout.slices["systematic"]]
-    np.testing.assert_allclose(slow @ slow.T, solution.systematic_rad2, rtol=0, atol=1e-9 * np.trace(slow @ slow.T))
+    np.testing.assert_allclose(
+        slow @ slow.T, solution.systematic_rad2, rtol=0, atol=1e-9 * np.trace(slow @ slow.T)
+    )
     assert not rows[:, :6].any()
     # The residual by H of a change of the offset's values: to the second order in them.
     change = np.r_[np.zeros(6), rng.normal(0, 1e-7, layout.size - 6)]
-    less = correct.innovation(prior._replace(values=prior.values + change), solution, layout).residual_rad
-    np.testing.assert_allclose(found.residual_rad - less, found.H @ change, rtol=0, atol=3e-3 * np.linalg.norm(change))
+    less = correct.innovation(
+        prior._replace(values=prior.values + change), solution, layout
+    ).residual_rad
+    np.testing.assert_allclose(
+        found.residual_rad - less, found.H @ change, rtol=0, atol=3e-3 * np.linalg.norm(change)
+    )
     apart = found.distance2
     assert apart >= 0
-    larger = correct.innovation(prior, solution._replace(noise_rad2=10 * solution.noise_rad2), layout)
+    larger = correct.innovation(
+        prior, solution._replace(noise_rad2=10 * solution.noise_rad2), layout
+    )
     assert larger.distance2 <= apart
 
 
@@ -218,7 +270,9 @@ def test_a_correction_leaves_the_considered_and_shrinks_the_estimated(
     kept = layout.estimated == 0
     np.testing.assert_array_equal(after.values[kept], prior.values[kept])
     inside = np.ix_(kept, kept)
-    np.testing.assert_allclose(after.covariance[inside], prior.covariance[inside], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        after.covariance[inside], prior.covariance[inside], rtol=1e-9, atol=1e-15
+    )
     assert_covariance(after.covariance)
     np.testing.assert_allclose(np.linalg.norm(after.ref_from_body_wxyz), 1, rtol=0, atol=1e-12)
     assert (np.diag(after.covariance)[3:] <= np.diag(prior.covariance)[3:] * (1 + 1e-9)).all()
@@ -228,7 +282,9 @@ def test_a_correction_leaves_the_considered_and_shrinks_the_estimated(
 
 @law(correct.adopt)
 @given(rng=SEEDS)
-def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(rng: np.random.Generator) -> None:
+def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(
+    rng: np.random.Generator,
+) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
     prior = state_of(rng, layout)
     solution = solution_near(rng, prior, 1.0)
@@ -237,7 +293,9 @@ def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(rng: np.r
     rows = correct.offset_rows(solution, layout)
     expected = rows @ prior.covariance @ rows.T + solution.noise_rad2
     np.testing.assert_allclose(after.covariance[:3, :3], expected, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(np.diag(after.covariance - prior.covariance)[3:6], 1e-8, rtol=1e-6, atol=0)
+    np.testing.assert_allclose(
+        np.diag(after.covariance - prior.covariance)[3:6], 1e-8, rtol=1e-6, atol=0
+    )
     np.testing.assert_array_equal(after.values, prior.values)
     assert_covariance(after.covariance)
     # The error is the offset's and the noise, with opposite sign: their sum with the offset is the noise alone.
@@ -257,7 +315,8 @@ def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, leng
     p = length * Rotation.random(rng=rng).apply([0, 0, 1.0])
     cross = np.cross(p, np.eye(3), axisb=0, axisc=0)
     block = np.zeros((6, 6))
-    block[:3, :3], block[:3, 3:] = -cross, np.eye(3)
+    block[:3, :3] = -cross
+    block[:3, 3:] = np.eye(3)
     np.testing.assert_allclose(correct.right_jacobian(p), expm(block)[:3, 3:], rtol=0, atol=1e-12)
     matrix = covariance(rng, 3)
     root = correct.root(matrix)
@@ -286,7 +345,12 @@ def test_odds_rise_with_what_speaks_against_the_filter(
     odds = jumps.log_odds(one, model)
     assert math.isfinite(odds)
     assert jumps.log_odds(one._replace(agreeing=agreeing + 1), model) > odds
-    rising = {"since_s": since_s + 1, "lost_rad": lost + 0.1, "angle_rad": angle / 2, "distance": distance / 2}
+    rising = {
+        "since_s": since_s + 1,
+        "lost_rad": lost + 0.1,
+        "angle_rad": angle / 2,
+        "distance": distance / 2,
+    }
     for name, value in rising.items():
         assert jumps.log_odds(one._replace(**{name: value}), model) >= odds  # type: ignore[arg-type]
     assert jumps.log_odds(one._replace(support=support + 1), model) <= odds
@@ -296,7 +360,9 @@ def test_odds_rise_with_what_speaks_against_the_filter(
 
 @law(jumps.shock_rad)
 @given(rng=SEEDS, step=some.floats(1e-3, 1.0), slope=some.floats(-10, 10))
-def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(rng: np.random.Generator, step: float, slope: float) -> None:
+def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
+    rng: np.random.Generator, step: float, slope: float
+) -> None:
     at = int(rng.integers(2, 18))
     t_s = 5.0 + np.arange(1, 21) * 0.01
     rate = slope * (t_s - 5.0)[:, None] * turn(rng).apply([1.0, 0, 0])
@@ -311,8 +377,14 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(rng: np.random.Genera
 @given(rng=SEEDS)
 def test_the_sigma_of_each_state_is_its_part_of_the_covariance(rng: np.random.Generator) -> None:
     told = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
-    parts = [told.sigma_attitude_rad, told.sigma_bias_rad_s, *(told.sigma(name) for name in told.others)]
-    np.testing.assert_allclose(np.concatenate(parts) ** 2, np.diag(told.covariance), rtol=1e-12, atol=0)
+    parts = [
+        told.sigma_attitude_rad,
+        told.sigma_bias_rad_s,
+        *(told.sigma(name) for name in told.others),
+    ]
+    np.testing.assert_allclose(
+        np.concatenate(parts) ** 2, np.diag(told.covariance), rtol=1e-12, atol=0
+    )
     assert list(told.others) == ["scale", "misalignment", "mounting"]
     with pytest.raises(KeyError):
         told.sigma("attitude")

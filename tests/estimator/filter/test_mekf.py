@@ -36,7 +36,9 @@ def error_rad(state: FilterState, body_from_ref: Rotation) -> np.ndarray:
     return (state.body_from_ref * body_from_ref.inv()).as_rotvec()
 
 
-def measured(body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.random.Generator | None) -> Rotation:
+def measured(
+    body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.random.Generator | None
+) -> Rotation:
     """A solution whose small turn in body axes has that covariance; exact without a generator."""
     if rng is None:
         return body_from_ref
@@ -52,7 +54,9 @@ def test_the_gyro_is_followed() -> None:
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 0.0, 0.0)
     mekf.propagate(t_s[1:], tumble_angle_rad(t_s), np.zeros(4000, bool))
     # Increments are no rotation vectors: coning, (w x w') T^3 / 12 a sample at most, 10 s of w w' = 0.02.
-    assert np.abs(error_rad(mekf.state, tumble_body_from_ref(t_s)[-1])).max() < 0.02 * 10 / 400**2 / 12
+    assert (
+        np.abs(error_rad(mekf.state, tumble_body_from_ref(t_s)[-1])).max() < 0.02 * 10 / 400**2 / 12
+    )
     assert mekf.rate_rad_s == pytest.approx(tumble_angle_rad(t_s).sum(axis=0) / 10, abs=1e-12)
 
 
@@ -74,7 +78,9 @@ def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
 @pytest.mark.slow
 def test_an_error_common_to_all_solutions_stays_and_is_claimed() -> None:
     """Fifteen solutions with a common error of covariance S and noise of S / 9: NEES 3, less what S adds as noise."""
-    rng, common_rad2, nees = np.random.default_rng(15), TRACKER_RAD2, []
+    rng = np.random.default_rng(15)
+    common_rad2 = TRACKER_RAD2
+    nees = []
     for _ in range(400):
         mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-2, 0.0)
         shifted = measured(HOME, common_rad2, rng)
@@ -84,22 +90,30 @@ def test_an_error_common_to_all_solutions_stays_and_is_claimed() -> None:
             assert mekf.update(k + 1.0, noisy, common_rad2 * 10 / 9, common_rad2).status == USED
         error = error_rad(mekf.state, HOME)
         nees.append(error @ np.linalg.solve(mekf.state.covariance[:3, :3], error))
-    assert np.mean(nees) == pytest.approx(3 * (1 + 1 / 135) / (1 + 10 / 135), abs=4 * np.sqrt(6 / 400))
+    assert np.mean(nees) == pytest.approx(
+        3 * (1 + 1 / 135) / (1 + 10 / 135), abs=4 * np.sqrt(6 / 400)
+    )
 
 
 def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
-    gyro, rate = GyroModel(1e-4, 2e-4, 20.0), np.array([0.3, -0.8, 0.5])
+    gyro = GyroModel(1e-4, 2e-4, 20.0)
+    rate = np.array([0.3, -0.8, 0.5])
     start = np.diag(np.array([1e-3, 2e-3, 3e-3, 1e-4, 2e-4, 3e-4]) ** 2)
     drift = np.zeros((6, 6))
     drift[:3, :3] = np.cross(rate, np.eye(3), axisb=0, axisc=0) * -1
-    drift[:3, 3:], drift[3:, 3:] = -np.eye(3), -np.eye(3) / 20
+    drift[:3, 3:] = -np.eye(3)
+    drift[3:, 3:] = -np.eye(3) / 20
     noise = np.diag([1e-4**2] * 3 + [2 * 2e-4**2 / 20] * 3)
 
     def slope(_: float, p: np.ndarray) -> np.ndarray:
         half = drift @ p.reshape(6, 6)
         return (half + half.T + noise).ravel()
 
-    oracle = solve_ivp(slope, (0, 3), start.ravel(), "DOP853", rtol=1e-11, atol=1e-16).y[:, -1].reshape(6, 6)
+    oracle = (
+        solve_ivp(slope, (0, 3), start.ravel(), "DOP853", rtol=1e-11, atol=1e-16)
+        .y[:, -1]
+        .reshape(6, 6)
+    )
     mekf = AttitudeFilter(gyro, 0.0, HOME, np.sqrt(np.diag(start)[:3]), np.sqrt(np.diag(start)[3:]))
     t_s = np.arange(1, 1201) / 400
     mekf.propagate(t_s, np.tile(rate / 400, (1200, 1)), np.zeros(1200, bool))
@@ -108,13 +122,16 @@ def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
     assert np.abs((mekf.state.covariance - oracle) / scale).max() < 1e-6
 
 
-def farrenkopf(arw: float, walk: float, sigma_rad: float, period_s: float) -> tuple[float, float, float, float]:
+def farrenkopf(
+    arw: float, walk: float, sigma_rad: float, period_s: float
+) -> tuple[float, float, float, float]:
     """Steady sigmas before and after a solution: attitude, attitude, bias, bias (Farrenkopf 1978, in closed form).
 
     With s = p/R + 1 = x^2 the Riccati equation of one axis becomes quadratic in z = x + 1/x:
     z^2 - 4 = S_u z + S_v^2 - S_u^2 / 6, where S_u = walk T^(3/2) / sigma, S_v = arw T^(1/2) / sigma.
     """
-    s_u, s_v = walk * period_s**1.5 / sigma_rad, arw * period_s**0.5 / sigma_rad
+    s_u = walk * period_s**1.5 / sigma_rad
+    s_v = arw * period_s**0.5 / sigma_rad
     z = s_u / 2 + 2 * np.sqrt(1 + s_v**2 / 4 + s_u**2 / 48)
     x = (z + np.sqrt(z**2 - 4)) / 2
     bias2 = walk * sigma_rad / np.sqrt(period_s) * (x - 1 / x)
@@ -127,12 +144,17 @@ def farrenkopf(arw: float, walk: float, sigma_rad: float, period_s: float) -> tu
     )
 
 
-@pytest.mark.parametrize(("s_u", "s_v", "period_s"), [(0.05, 0.3, 1.0), (1.0, 0.1, 1.0), (0.3, 2.0, 0.25)])
+@pytest.mark.parametrize(
+    ("s_u", "s_v", "period_s"), [(0.05, 0.3, 1.0), (1.0, 0.1, 1.0), (0.3, 2.0, 0.25)]
+)
 def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> None:
     sigma_rad = 20 * ARCSEC_RAD
-    arw, walk = s_v * sigma_rad / period_s**0.5, s_u * sigma_rad / period_s**1.5
+    arw = s_v * sigma_rad / period_s**0.5
+    walk = s_u * sigma_rad / period_s**1.5
     time_s = 1e9  # a random walk is the limit of a long correlation time
-    mekf = AttitudeFilter(GyroModel(arw, walk * np.sqrt(time_s / 2), time_s), 0.0, HOME, 1e-3, 10 * walk)
+    mekf = AttitudeFilter(
+        GyroModel(arw, walk * np.sqrt(time_s / 2), time_s), 0.0, HOME, 1e-3, 10 * walk
+    )
     share = np.arange(1, 51) / 50
     for k in range(300):
         mekf.propagate((k + share) * period_s, np.zeros((50, 3)), np.zeros(50, bool))
@@ -141,7 +163,12 @@ def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> N
     after = mekf.state
     oracle = np.array(farrenkopf(arw, walk, sigma_rad, period_s))
     ours = np.array(
-        [before.sigma_attitude_rad, after.sigma_attitude_rad, before.sigma_bias_rad_s, after.sigma_bias_rad_s]
+        [
+            before.sigma_attitude_rad,
+            after.sigma_attitude_rad,
+            before.sigma_bias_rad_s,
+            after.sigma_bias_rad_s,
+        ]
     )
     assert np.abs(ours / oracle[:, None] - 1).max() < 1e-6
 
@@ -149,9 +176,11 @@ def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> N
 @pytest.mark.parametrize("angle_rad", [5e-4, 1e-2, 0.5, 3.0])
 def test_the_transition_is_the_exponential_of_the_error_s_equation(angle_rad: float) -> None:
     """e' = -[w] e - db with db constant: the matrix exponential, both where J is a series and where it is closed."""
-    rotation, step_s = angle_rad * np.array([0.48, -0.6, 0.64]), 0.2
+    rotation = angle_rad * np.array([0.48, -0.6, 0.64])
+    step_s = 0.2
     slope = np.zeros((6, 6))
-    slope[:3, :3], slope[:3, 3:] = np.cross(rotation, np.eye(3), axisb=0, axisc=0) * -1, -step_s * np.eye(3)
+    slope[:3, :3] = np.cross(rotation, np.eye(3), axisb=0, axisc=0) * -1
+    slope[:3, 3:] = -step_s * np.eye(3)
     rows = np.empty((3, 6))
     transition(rotation, step_s, rows)
     assert np.abs(rows - expm(slope)[:3]).max() < 1e-14
@@ -178,7 +207,8 @@ class World:
 
 
 def drawn(gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Generator) -> World:
-    step_s, count = float(t_s[1]), len(t_s) - 1
+    step_s = float(t_s[1])
+    count = len(t_s) - 1
     decay = np.exp(-step_s / gyro.bias_time_s)
     kicks = gyro.bias_rad_s * np.sqrt(1 - decay**2) * rng.normal(size=(count, 3))
     bias = np.empty((count + 1, 3))
@@ -193,8 +223,13 @@ def drawn(gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Ge
 @pytest.mark.long
 def test_the_errors_are_what_the_covariance_says() -> None:
     # Solutions once a second, for a moment 0.3025 s ago, in the middle of a sample; 4 sigma of a chi-square's mean.
-    runs, seconds, rate_hz, late_s = 300, 5, 200, 0.3025
-    gyro, floor_rad, sigma_bias = GyroModel(1e-4, 3e-4, 20.0), 2e-5, 3e-4
+    runs = 300
+    seconds = 5
+    rate_hz = 200
+    late_s = 0.3025
+    gyro = GyroModel(1e-4, 3e-4, 20.0)
+    floor_rad = 2e-5
+    sigma_bias = 3e-4
     sigma_attitude = np.array([0.01, 0.02, 0.03])
     axes = Rotation.from_rotvec([0.3, 0.5, -0.4]).as_matrix()
     spread = axes @ np.diag([3e-5, 5e-5, 3e-4]) ** 2 @ axes.T
@@ -214,7 +249,9 @@ def test_the_errors_are_what_the_covariance_says() -> None:
             solution = measured(seen[k], spread + floor_rad**2 * np.eye(3), rng)
             statuses.add(mekf.update(k + 1 - late_s, solution, spread).status)
         state = mekf.state
-        error = np.concatenate([error_rad(state, truth[-1]), world.bias_rad_s[-1] - state.bias_rad_s])
+        error = np.concatenate(
+            [error_rad(state, truth[-1]), world.bias_rad_s[-1] - state.bias_rad_s]
+        )
         nees[run, 0] = error[:3] @ np.linalg.solve(state.covariance[:3, :3], error[:3])
         nees[run, 1] = error @ np.linalg.solve(state.covariance, error)
     assert statuses == {USED}
@@ -227,14 +264,21 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
     # Bar-Shalom's tests: NEES at the end, NIS of each solution, both within the 95 % band of their chi-squares.
     # Gyro at 200 Hz, asked for in calls of 1 to 40 samples; solutions at 5 Hz of which a third never comes, and the
     # others 0.05 to 0.5 s late, so that they overtake one another.
-    runs, seconds, rate_hz = 200, 4, 200
-    gyro, sigma_bias, sigma_attitude = GyroModel(1e-4, 3e-4, 20.0), 3e-4, 0.01
+    runs = 200
+    seconds = 4
+    rate_hz = 200
+    gyro = GyroModel(1e-4, 3e-4, 20.0)
+    sigma_bias = 3e-4
+    sigma_attitude = 0.01
     spread = np.diag([3e-5, 5e-5, 3e-4]) ** 2
     t_s = np.arange(seconds * rate_hz + 1) / rate_hz
-    truth, seen_s = tumble_body_from_ref(t_s), np.arange(0.1, seconds - 0.5, 0.2) + 1 / 3000
+    truth = tumble_body_from_ref(t_s)
+    seen_s = np.arange(0.1, seconds - 0.5, 0.2) + 1 / 3000
     seen = tumble_body_from_ref(np.append(seen_s, seconds))
     rng = np.random.default_rng(69)
-    nees, nis, overtaken = np.empty(runs), [], 0
+    nees = np.empty(runs)
+    nis = []
+    overtaken = 0
     for run in range(runs):
         world = drawn(gyro, sigma_bias, t_s, rng)
         start = Rotation.from_rotvec(sigma_attitude * rng.normal(size=3)) * truth[0]
@@ -250,9 +294,13 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
             at = rows.stop
             while waiting and arrives_s[waiting[0]] <= t_s[at]:
                 k = waiting.pop(0)
-                nis.append(mekf.update(seen_s[k], measured(seen[k], spread, rng), spread).distance ** 2)
+                nis.append(
+                    mekf.update(seen_s[k], measured(seen[k], spread, rng), spread).distance ** 2
+                )
         state = mekf.state
-        error = np.concatenate([error_rad(state, truth[-1]), world.bias_rad_s[-1] - state.bias_rad_s])
+        error = np.concatenate(
+            [error_rad(state, truth[-1]), world.bias_rad_s[-1] - state.bias_rad_s]
+        )
         nees[run] = error @ np.linalg.solve(state.covariance, error)
     assert overtaken > runs
     for squared, freedom in ((nees, 6), (np.array(nis), 3)):
@@ -264,8 +312,12 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
 
 @pytest.mark.long
 def test_a_constant_bias_is_found_to_its_sigma() -> None:
-    rng, runs, bias = np.random.default_rng(62), 12, 5 * DEG_H_RAD_S
-    z, found, samples = np.empty((runs, 3)), np.empty((runs, 3)), np.arange(1, 11) / 10
+    rng = np.random.default_rng(62)
+    runs = 12
+    bias = 5 * DEG_H_RAD_S
+    z = np.empty((runs, 3))
+    found = np.empty((runs, 3))
+    samples = np.arange(1, 11) / 10
     for run in range(runs):
         mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
         for k in range(200):
@@ -283,7 +335,8 @@ def test_a_constant_bias_is_found_to_its_sigma() -> None:
 
 def test_a_bias_that_is_no_longer_seen_is_forgotten_with_its_time() -> None:
     # E[b(t)] = b(0) exp(-t / time), and the attitude is corrected by its integral.
-    time_s, bias = 20.0, 1e-4
+    time_s = 20.0
+    bias = 1e-4
     mekf = AttitudeFilter(GyroModel(ARW_RAD_SQRT_S, 1e-4, time_s), 0.0, HOME, 1e-3, 1e-4)
     samples = np.arange(1, 101) / 100
     for k in range(10):
@@ -322,7 +375,9 @@ def test_a_late_solution_is_as_good_as_one_in_order(seen_s: float) -> None:
     for k in range(100):
         rows = slice(4 * k, 4 * k + 4)
         late.propagate(t_s[1:][rows], angle[rows], saturated[rows])
-    split = int(np.searchsorted(t_s[1:], seen_s, side="left"))  # the sample that contains it, or ends there
+    split = int(
+        np.searchsorted(t_s[1:], seen_s, side="left")
+    )  # the sample that contains it, or ends there
     share = (seen_s - t_s[split]) / (t_s[split + 1] - t_s[split])
     times = np.insert(t_s[1:], split, seen_s)
     angles = np.insert(angle, split, share * angle[split], axis=0)
@@ -364,16 +419,22 @@ def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
         kept_s = 60 if k < 10 else HISTORY_S / 2
         assert mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
     assert mekf.update(45.0, HOME, TRACKER_RAD2).status == TOO_OLD
-    assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (HISTORY_S + 3) + 3 * len(mekf._segments)
+    assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (HISTORY_S + 3) + 3 * len(
+        mekf._segments
+    )
     assert len(mekf._segments) < 3 * HISTORY_S
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1)])
 def test_solutions_in_any_order_end_where_the_right_order_ends(order: tuple[int, ...]) -> None:
-    gyro, rng = GyroModel(1e-4, 3e-4, 20.0), np.random.default_rng(68)
+    gyro = GyroModel(1e-4, 3e-4, 20.0)
+    rng = np.random.default_rng(68)
     t_s = np.arange(401) / 400
-    angle, seen_s = tumble_angle_rad(t_s), np.array([0.2, 0.45125, 0.4513, 0.9])
-    solutions = [measured(truth, TRACKER_RAD2, rng) for truth in tumble_body_from_ref(np.append(seen_s, 1.0))]
+    angle = tumble_angle_rad(t_s)
+    seen_s = np.array([0.2, 0.45125, 0.4513, 0.9])
+    solutions = [
+        measured(truth, TRACKER_RAD2, rng) for truth in tumble_body_from_ref(np.append(seen_s, 1.0))
+    ]
     shuffled, ordered = (AttitudeFilter(gyro, 0.0, HOME, 0.01, 1e-3) for _ in range(2))
     for mekf, rows in ((shuffled, order), (ordered, range(4))):
         mekf.propagate(t_s[1:], angle, np.zeros(400, bool))
@@ -410,7 +471,9 @@ class Blow:
             attitude = Rotation.from_rotvec(-rate * np.clip(t_s - a, 0, b - a)) * attitude
         return attitude
 
-    def fly(self, mekf: AttitudeFilter, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator) -> list[str]:
+    def fly(
+        self, mekf: AttitudeFilter, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator
+    ) -> list[str]:
         """A second at a time, with a solution at the end of each; what became of them."""
         statuses = []
         for k in range(from_s, to_s):
@@ -427,7 +490,8 @@ class Blow:
 
 @pytest.mark.parametrize("limit_deg_s", [10.0, 100.0])
 def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_deg_s: float) -> None:
-    blow, rng = Blow(np.radians(limit_deg_s)), np.random.default_rng(67)
+    blow = Blow(np.radians(limit_deg_s))
+    rng = np.random.default_rng(67)
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
     assert set(blow.fly(mekf, 0, 20, True, rng)) == {USED}
     before = mekf.state
@@ -440,13 +504,15 @@ def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_de
 
 
 def test_without_the_flag_the_blow_is_laid_to_the_bias() -> None:
-    blow, rng = Blow(np.radians(10.0)), np.random.default_rng(67)
+    blow = Blow(np.radians(10.0))
+    rng = np.random.default_rng(67)
     trusting = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S, gate_sigma=np.inf)
     assert set(blow.fly(trusting, 0, 22, False, rng)) == {USED}
     state = trusting.state
     assert np.abs((state.bias_rad_s - blow.bias_rad_s) / state.sigma_bias_rad_s).max() > 100
     # With the gate it is lost for two frames and found at the third.
-    gated, rng = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S), np.random.default_rng(67)
+    gated = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
+    rng = np.random.default_rng(67)
     assert blow.fly(gated, 0, 24, False, rng)[20:] == [OUTSIDE_GATE, OUTSIDE_GATE, RESET, USED]
     state = gated.state
     assert (np.abs(state.bias_rad_s - blow.bias_rad_s) < 4 * state.sigma_bias_rad_s).all()
@@ -461,7 +527,9 @@ def test_plain_integration_is_wrong_by_the_missed_angle_for_good() -> None:
         rate = np.clip(blow.rate_rad_s(middle_s), -blow.limit_rad_s, blow.limit_rad_s)
         plain.propagate(middle_s + 0.5 / 400, rate / 400, np.zeros(len(rate), bool))
         # 1 %: about the other axes the vehicle turned 0.2 s x 0.036 rad/s while the gyro was lost.
-        assert np.linalg.norm(error_rad(plain.state, blow.body_from_ref(to_s))) == pytest.approx(missed_rad, rel=0.01)
+        assert np.linalg.norm(error_rad(plain.state, blow.body_from_ref(to_s))) == pytest.approx(
+            missed_rad, rel=0.01
+        )
 
 
 @pytest.mark.parametrize("rate_hz", [100, 400])
@@ -488,12 +556,15 @@ def turning() -> AttitudeFilter:
     return mekf
 
 
-def after_turning(mekf: AttitudeFilter, second: int, jump: Rotation = HOME, outage: int = 0) -> Update:
+def after_turning(
+    mekf: AttitudeFilter, second: int, jump: Rotation = HOME, outage: int = 0
+) -> Update:
     """One second on, and an exact solution; jump * the vehicle's true body_from_ref.
 
     outage : number of gyro samples that are missing at its end
     """
-    t_s, angle = second + np.arange(1, 101) / 100, np.tile([0.0, 0.0, 1e-3], (100, 1))
+    t_s = second + np.arange(1, 101) / 100
+    angle = np.tile([0.0, 0.0, 1e-3], (100, 1))
     missing = np.arange(100) >= 100 - outage
     angle[missing] = np.nan
     mekf.propagate(t_s, angle, np.zeros(100, bool), missing)
@@ -512,16 +583,21 @@ def wild(*rotvec: float) -> Rotation:
 @pytest.mark.slow
 def test_the_gate_is_as_rare_as_so_many_sigma() -> None:
     # 1.5 sigma of one normal number is exceeded in 13.4 % of draws, here from the filter's own uncertainty.
-    rng, count, outside = np.random.default_rng(64), 500, 0
+    rng = np.random.default_rng(64)
+    count = 500
+    outside = 0
     spread = 1e-6 * np.eye(3) + TRACKER_RAD2
     for _ in range(count):
         mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 0.0, gate_sigma=1.5)
-        outside += mekf.update(0.0, measured(HOME, spread, rng), TRACKER_RAD2).status == OUTSIDE_GATE
+        outside += (
+            mekf.update(0.0, measured(HOME, spread, rng), TRACKER_RAD2).status == OUTSIDE_GATE
+        )
     assert abs(outside / count - 0.1336) < 4 * np.sqrt(0.1336 * 0.8664 / count)
 
 
 def test_a_single_wild_solution_is_refused_and_harmless() -> None:
-    mekf, untouched = turning(), turning()
+    mekf = turning()
+    untouched = turning()
     update = after_turning(mekf, 3, wild(0.5, 0, 0))
     assert update.status == OUTSIDE_GATE
     # From the filter to the solution, in body axes; body_from_ref turns the other way.
@@ -536,7 +612,8 @@ def test_a_single_wild_solution_is_refused_and_harmless() -> None:
 
 
 def test_wild_solutions_that_disagree_are_refused_for_ever() -> None:
-    mekf, rng = turning(), np.random.default_rng(65)
+    mekf = turning()
+    rng = np.random.default_rng(65)
     for k in range(3, 15):
         assert after_turning(mekf, k, Rotation.random(rng=rng)).status == OUTSIDE_GATE
     assert after_turning(mekf, 15).status == USED
@@ -551,7 +628,8 @@ def test_solutions_that_stand_still_while_the_vehicle_turns_do_not_agree() -> No
 
 @pytest.mark.parametrize("outage", [5, 20, 50])
 def test_a_jump_during_an_outage_is_taken_at_the_third_solution(outage: int) -> None:
-    mekf, jump = turning(), wild(0.3, -0.2, 0.6)
+    mekf = turning()
+    jump = wild(0.3, -0.2, 0.6)
     assert after_turning(mekf, 3, jump, outage).status == OUTSIDE_GATE
     assert after_turning(mekf, 4, jump).status == OUTSIDE_GATE
     before = mekf.state
@@ -568,15 +646,21 @@ def test_a_jump_during_an_outage_is_taken_at_the_third_solution(outage: int) -> 
 
 
 def test_a_good_solution_between_ends_the_row() -> None:
-    mekf, jump = turning(), wild(0.3, -0.2, 0.6)
-    got = [after_turning(mekf, 3 + k, turn).status for k, turn in enumerate([jump, jump, HOME, jump, jump])]
+    mekf = turning()
+    jump = wild(0.3, -0.2, 0.6)
+    got = [
+        after_turning(mekf, 3 + k, turn).status
+        for k, turn in enumerate([jump, jump, HOME, jump, jump])
+    ]
     assert got == [OUTSIDE_GATE, OUTSIDE_GATE, USED, OUTSIDE_GATE, OUTSIDE_GATE]
 
 
 # ---- Refused solutions that confirm each other ----
 
 
-def refused_then(rate_rad_s: float, gap_s: float, spread: np.ndarray, sigma_bias: float, turns: list[Rotation]) -> str:
+def refused_then(
+    rate_rad_s: float, gap_s: float, spread: np.ndarray, sigma_bias: float, turns: list[Rotation]
+) -> str:
     """Status of the last solution of a filter that the gyro turns about x, with one solution after each gap.
 
     turns : error of each solution, applied to an attitude that is half a radian from the filter's
@@ -585,26 +669,38 @@ def refused_then(rate_rad_s: float, gap_s: float, spread: np.ndarray, sigma_bias
     status = ""
     for k, turn in enumerate(turns):
         t_s = gap_s * (k + np.arange(1, 101) / 100)
-        mekf.propagate(t_s, np.tile([rate_rad_s * gap_s / 100, 0.0, 0.0], (100, 1)), np.zeros(100, bool))
+        mekf.propagate(
+            t_s, np.tile([rate_rad_s * gap_s / 100, 0.0, 0.0], (100, 1)), np.zeros(100, bool)
+        )
         attitude = Rotation.from_rotvec([-rate_rad_s * t_s[-1], 0.0, 0.0]) * wild(0.0, 0.5, 0.0)
         status = mekf.update(t_s[-1], turn * attitude, spread).status
     return status
 
 
-@pytest.mark.parametrize(("axis", "status"), [((0.0, 0.0, 4e-3), RESET), ((0.0, 4e-3, 0.0), OUTSIDE_GATE)])
-def test_an_earlier_error_turns_with_the_body_before_it_is_compared(axis: tuple[float, ...], status: str) -> None:
+@pytest.mark.parametrize(
+    ("axis", "status"), [((0.0, 0.0, 4e-3), RESET), ((0.0, 4e-3, 0.0), OUTSIDE_GATE)]
+)
+def test_an_earlier_error_turns_with_the_body_before_it_is_compared(
+    axis: tuple[float, ...], status: str
+) -> None:
     """The first solution is 4 sigma off in roll about z (allowed), or as much about y (400 sigma).
 
     45 deg later its error is about an axis between y and z, where the second solution alone is 100 times as precise.
     """
     spread = np.diag([1e-5, 1e-5, 1e-3]) ** 2
-    assert refused_then(np.pi / 4, 1.0, spread, 0.0, [Rotation.from_rotvec(axis), HOME, HOME]) == status
+    assert (
+        refused_then(np.pi / 4, 1.0, spread, 0.0, [Rotation.from_rotvec(axis), HOME, HOME])
+        == status
+    )
 
 
 @pytest.mark.parametrize(("sigmas", "status"), [(4.0, RESET), (8.0, OUTSIDE_GATE)])
-def test_solutions_confirm_each_other_within_what_the_bias_turns(sigmas: float, status: str) -> None:
+def test_solutions_confirm_each_other_within_what_the_bias_turns(
+    sigmas: float, status: str
+) -> None:
     """A bias of b turns the prediction by 3 b in 3 s; the solutions themselves err by less than 1% of that."""
-    sigma_bias, gap_s = 1e-3, 3.0
+    sigma_bias = 1e-3
+    gap_s = 3.0
     drift = [wild(0.0, 0.0, sigmas * sigma_bias * gap_s * k) for k in range(3)]
     assert refused_then(0.0, gap_s, 1e-10 * np.eye(3), sigma_bias, drift) == status
 
@@ -642,7 +738,9 @@ def test_a_bad_covariance_is_one_clear_line(covariance: np.ndarray, what: str) -
         ([9.0], np.zeros((1, 3)), [False], "a tenth of bias_time_s"),
     ],
 )
-def test_bad_samples_are_one_clear_line(t_s: list, angle: np.ndarray, saturated: list, what: str) -> None:
+def test_bad_samples_are_one_clear_line(
+    t_s: list, angle: np.ndarray, saturated: list, what: str
+) -> None:
     mekf = AttitudeFilter(GyroModel(1e-5, 1e-6, 20.0), 1.0, HOME, 1e-3, 1e-5)
     with pytest.raises(ValueError, match=f"propagate: .*{what}") as caught:
         mekf.propagate(t_s, angle, saturated)
@@ -652,7 +750,9 @@ def test_bad_samples_are_one_clear_line(t_s: list, angle: np.ndarray, saturated:
 
 def test_bad_settings_and_a_solution_from_the_future_are_named() -> None:
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5)
-    with pytest.raises(ValueError, match=r"a solution at 1.0 s; allowed: up to the last gyro sample, 0.0 s"):
+    with pytest.raises(
+        ValueError, match=r"a solution at 1.0 s; allowed: up to the last gyro sample, 0.0 s"
+    ):
         mekf.update(1.0, HOME, TRACKER_RAD2)
     with pytest.raises(ValueError, match=r"sigma_attitude_rad is -1\.0"):
         AttitudeFilter(QUIET, 0.0, HOME, -1.0, 1e-5)

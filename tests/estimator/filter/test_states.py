@@ -14,13 +14,18 @@ from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
 
 ARCSEC_RAD = np.pi / 180 / 3600
 ARW_RAD_SQRT_S = np.radians(0.07) / 60
-RATE_HZ, SECONDS, RUNS = 50, 20, 200
+RATE_HZ = 50
+SECONDS = 20
+RUNS = 200
 NOISE_RAD2 = np.diag([10.0, 10.0, 60.0]) ** 2 * ARCSEC_RAD**2
 GYRO = GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf)
-SIGMA_RAD, SIGMA_BIAS = 1e-3, 1e-5
+SIGMA_RAD = 1e-3
+SIGMA_BIAS = 1e-5
 SCALE = replace(GYRO, scale=1e-3)
 ASKEW = replace(GYRO, misalignment_rad=1e-3)
-SLOW = TrackerModel(systematic_rad=30 * ARCSEC_RAD, systematic_time_s=30.0, systematic_angle_rad=5.0)
+SLOW = TrackerModel(
+    systematic_rad=30 * ARCSEC_RAD, systematic_time_s=30.0, systematic_angle_rad=5.0
+)
 MOUNTED = TrackerModel(mounting_rad=1e-3)
 EVERYTHING = replace(SLOW, mounting_rad=1e-3)
 T_S = np.arange(SECONDS * RATE_HZ + 1) / RATE_HZ
@@ -36,22 +41,33 @@ class Flight:
     others: dict[str, np.ndarray]
 
 
-def drawn(gyro: GyroModel, tracker: TrackerModel, truth: Rotation, rng: np.random.Generator) -> Flight:
+def drawn(
+    gyro: GyroModel, tracker: TrackerModel, truth: Rotation, rng: np.random.Generator
+) -> Flight:
     """Errors of the models about the tumble; `truth` at each second, from 0 on."""
-    bias, scale = SIGMA_BIAS * rng.normal(size=3), gyro.scale * rng.normal(size=3)
-    askew, mount = gyro.misalignment_rad * rng.normal(size=6), tracker.mounting_rad * rng.normal(size=3)
+    bias = SIGMA_BIAS * rng.normal(size=3)
+    scale = gyro.scale * rng.normal(size=3)
+    askew = gyro.misalignment_rad * rng.normal(size=6)
+    mount = tracker.mounting_rad * rng.normal(size=3)
     response = np.eye(3) + np.diag(scale)
     response[~np.eye(3, dtype=bool)] += askew
     noise = gyro.arw_rad_sqrt_s / np.sqrt(RATE_HZ) * rng.normal(size=(len(T_S) - 1, 3))
     angle = tumble_angle_rad(T_S) @ response.T + bias / RATE_HZ + noise
-    slow, solutions = rng.normal(size=3), []
+    slow = rng.normal(size=3)
+    solutions = []
     for k in range(1, SECONDS + 1):
         turned = (truth[k] * truth[k - 1].inv()).magnitude()
         kept = np.exp(-1 / tracker.systematic_time_s - turned / tracker.systematic_angle_rad)
         slow = kept * slow + np.sqrt(1 - kept**2) * rng.normal(size=3)
-        error = mount + tracker.systematic_rad * slow + np.sqrt(np.diag(NOISE_RAD2)) * rng.normal(size=3)
+        error = (
+            mount
+            + tracker.systematic_rad * slow
+            + np.sqrt(np.diag(NOISE_RAD2)) * rng.normal(size=3)
+        )
         solutions.append(Rotation.from_rotvec(-error) * truth[k])
-    return Flight(angle, solutions, bias, {"scale": scale, "misalignment": askew, "mounting": mount})
+    return Flight(
+        angle, solutions, bias, {"scale": scale, "misalignment": askew, "mounting": mount}
+    )
 
 
 def flown(flight: Flight, mekf: AttitudeFilter) -> FilterState:
@@ -69,14 +85,17 @@ def squared(
     runs: int = RUNS,
 ) -> tuple[float, float, int]:
     """Mean NEES of the attitude (3 degrees of freedom) and of all states, and the number of states."""
-    rng, nees = np.random.default_rng(7), []
+    rng = np.random.default_rng(7)
+    nees = []
     truth = tumble_body_from_ref(np.arange(SECONDS + 1.0))
     for _ in range(runs):
         flight = drawn(*drawing, truth, rng)
         start = Rotation.from_rotvec(SIGMA_RAD * rng.normal(size=3)) * truth[0]
         # Without a gate: a wrong model is to be seen in the errors.
         gyro, tracker = assumed
-        mekf = AttitudeFilter(gyro, 0.0, start, SIGMA_RAD, SIGMA_BIAS, 0.0, np.inf, tracker, considered=considered)
+        mekf = AttitudeFilter(
+            gyro, 0.0, start, SIGMA_RAD, SIGMA_BIAS, 0.0, np.inf, tracker, considered=considered
+        )
         state = flown(flight, mekf)
         turned = (state.body_from_ref * truth[-1].inv()).as_rotvec()
         others = [flight.others[name] - values for name, values in state.others.items()]
@@ -105,7 +124,9 @@ def test_each_state_s_errors_are_what_the_covariance_says(name: str, considers: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("considered", [(), ("mounting", "systematic"), ("scale", "misalignment", "systematic")])
+@pytest.mark.parametrize(
+    "considered", [(), ("mounting", "systematic"), ("scale", "misalignment", "systematic")]
+)
 def test_all_states_together_are_what_the_covariance_says(considered: tuple[str, ...]) -> None:
     gyro = replace(SCALE, misalignment_rad=1e-3)
     attitude, every, states = squared((gyro, EVERYTHING), (gyro, EVERYTHING), considered)
@@ -128,16 +149,22 @@ def test_without_its_state_an_error_is_not_claimed(name: str) -> None:
 @pytest.mark.parametrize("named_by", ["the filter's model", "the solutions", "half each"])
 def test_a_constant_error_of_the_tracker_is_claimed_once(named_by: str) -> None:
     """30 arcsec about each axis, in 60 solutions of 10 arcsec at rest: NEES 3, and the claim is 30 to 32 arcsec."""
-    rng, nees, common = np.random.default_rng(30), [], 30 * ARCSEC_RAD
+    rng = np.random.default_rng(30)
+    nees = []
+    common = 30 * ARCSEC_RAD
     noise_rad2 = (10 * ARCSEC_RAD) ** 2 * np.eye(3)
     share = {"the filter's model": 1.0, "the solutions": 0.0, "half each": 0.5}[named_by]
     tracker = TrackerModel(systematic_rad=common * np.sqrt(share))
     named_rad2 = (1 - share) * common**2 * np.eye(3)
     for _ in range(100):
-        mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, tracker=tracker)
+        mekf = AttitudeFilter(
+            GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, tracker=tracker
+        )
         offset = common * rng.normal(size=3)
         for k in range(60):
-            mekf.propagate([k + 1.0], SIGMA_BIAS + ARW_RAD_SQRT_S * rng.normal(size=(1, 3)), [False])
+            mekf.propagate(
+                [k + 1.0], SIGMA_BIAS + ARW_RAD_SQRT_S * rng.normal(size=(1, 3)), [False]
+            )
             seen = Rotation.from_rotvec(-offset - 10 * ARCSEC_RAD * rng.normal(size=3))
             assert mekf.update(k + 1.0, seen, noise_rad2 + named_rad2, named_rad2).status == USED
         state = mekf.state
@@ -150,18 +177,22 @@ def test_a_constant_error_of_the_tracker_is_claimed_once(named_by: str) -> None:
 
 def test_an_error_that_changes_faster_than_assumed_does_not_close_the_gate() -> None:
     """A slow error, assumed constant, is the opposite after a minute: 6.4 sigma, or 4.5 of two independent ones."""
-    noise_rad2, tracker = (2 * ARCSEC_RAD) ** 2 * np.eye(3), TrackerModel(200 * ARCSEC_RAD, np.inf, np.inf)
+    noise_rad2 = (2 * ARCSEC_RAD) ** 2 * np.eye(3)
+    tracker = TrackerModel(200 * ARCSEC_RAD, np.inf, np.inf)
     mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), 1.0, 0.0, tracker=tracker)
     for k in range(80):
         mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
         offset = np.array([360.0, -400.0, 350.0]) * ARCSEC_RAD * (1 if k < 60 else -1)
         assert mekf.update(k + 1.0, Rotation.from_rotvec(-offset), noise_rad2).status == USED
-    assert (np.abs(mekf.state.body_from_ref.as_rotvec()) < 2.5 * mekf.state.sigma_attitude_rad).all()
+    assert (
+        np.abs(mekf.state.body_from_ref.as_rotvec()) < 2.5 * mekf.state.sigma_attitude_rad
+    ).all()
 
 
 def test_the_slow_error_is_another_one_after_a_turn() -> None:
     """Two solutions with the same slow error S average to S, and to S / 2 if the vehicle turned a long way between."""
-    noise_rad2, sigma = (0.1 * ARCSEC_RAD) ** 2 * np.eye(3), 30 * ARCSEC_RAD
+    noise_rad2 = (0.1 * ARCSEC_RAD) ** 2 * np.eye(3)
+    sigma = 30 * ARCSEC_RAD
     still = GyroModel(0.0, 0.0, np.inf)
     claims = {}
     for turned in (0.0, 0.2, 3.0):
@@ -169,7 +200,9 @@ def test_the_slow_error_is_another_one_after_a_turn() -> None:
         mekf = AttitudeFilter(still, 0.0, Rotation.identity(), 1.0, 0.0, tracker=tracker)
         assert mekf.update(0.0, Rotation.identity(), noise_rad2).status == USED
         mekf.propagate([1.0], [[turned, 0.0, 0.0]], [False])
-        assert mekf.update(1.0, Rotation.from_rotvec([-turned, 0.0, 0.0]), noise_rad2).status == USED
+        assert (
+            mekf.update(1.0, Rotation.from_rotvec([-turned, 0.0, 0.0]), noise_rad2).status == USED
+        )
         claims[turned] = mekf.state.sigma_attitude_rad[0] / sigma
     # The mean of two errors of correlation r has the variance S (1 + r) / 2.
     for turned, claim in claims.items():
@@ -179,13 +212,19 @@ def test_the_slow_error_is_another_one_after_a_turn() -> None:
 # ---- Observability ----
 
 
-def turning_about(axis: int, seconds: int, gyro: GyroModel, considered: tuple[str, ...] = ()) -> FilterState:
+def turning_about(
+    axis: int, seconds: int, gyro: GyroModel, considered: tuple[str, ...] = ()
+) -> FilterState:
     """A turn of 0.3 rad/s about one axis; the gyro has a scale factor of 800 ppm there and no other error."""
-    mekf = AttitudeFilter(gyro, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, considered=considered)
+    mekf = AttitudeFilter(
+        gyro, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, considered=considered
+    )
     step = np.zeros((RATE_HZ, 3))
     step[:, axis] = 0.3 / RATE_HZ
     for k in range(seconds):
-        mekf.propagate(k + np.arange(1, RATE_HZ + 1) / RATE_HZ, step * (1 + 8e-4), np.zeros(RATE_HZ, bool))
+        mekf.propagate(
+            k + np.arange(1, RATE_HZ + 1) / RATE_HZ, step * (1 + 8e-4), np.zeros(RATE_HZ, bool)
+        )
         turned = np.zeros(3)
         turned[axis] = -0.3 * (k + 1)
         assert mekf.update(k + 1.0, Rotation.from_rotvec(turned), NOISE_RAD2).status == USED
@@ -195,7 +234,8 @@ def turning_about(axis: int, seconds: int, gyro: GyroModel, considered: tuple[st
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_turn_shows_the_scale_factor_of_its_axis_alone(axis: int) -> None:
     state = turning_about(axis, 40, replace(SCALE, misalignment_rad=1e-3))
-    sigma, elsewhere = state.sigma("scale"), np.arange(3) != axis
+    sigma = state.sigma("scale")
+    elsewhere = np.arange(3) != axis
     # The bias hides behind it: SIGMA_BIAS / 0.3 rad/s = 33 ppm is what remains, at most.
     assert sigma[axis] < 50e-6
     assert abs(state.others["scale"][axis] - 8e-4) < 3 * sigma[axis]
@@ -237,7 +277,12 @@ def test_the_rate_is_corrected_by_the_gyro_s_matrix() -> None:
     mekf = AttitudeFilter(SCALE, 0.0, Rotation.identity(), 1e-6, 0.0, considered=())
     for k in range(30):
         mekf.propagate([k + 1.0], [[0.3 * 1.001, 0.0, 0.0]], [False])
-        assert mekf.update(k + 1.0, Rotation.from_rotvec([-0.3 * (k + 1), 0, 0]), NOISE_RAD2 / 100).status == USED
+        assert (
+            mekf.update(
+                k + 1.0, Rotation.from_rotvec([-0.3 * (k + 1), 0, 0]), NOISE_RAD2 / 100
+            ).status
+            == USED
+        )
     assert mekf.rate_rad_s == pytest.approx([0.3, 0.0, 0.0], abs=3e-6)
 
 
@@ -249,20 +294,29 @@ def test_bad_options_are_one_clear_line() -> None:
         return AttitudeFilter(GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, **options)  # type: ignore[arg-type]
 
     with pytest.raises(
-        ValueError, match=r"considered: 'gain'; allowed: bias, scale, misalignment, mounting, systematic"
+        ValueError,
+        match=r"considered: 'gain'; allowed: bias, scale, misalignment, mounting, systematic",
     ):
         built(considered=("scale", "gain"))
     with pytest.raises(ValueError, match=r"gyro: scale is -1; allowed: finite, 0 or more"):
         replace(GYRO, scale=-1)
     with pytest.raises(ValueError, match=r"gyro: limit_rad_s is 0; allowed: above 0, also inf"):
         replace(GYRO, limit_rad_s=0)
-    with pytest.raises(ValueError, match=r"tracker: systematic_rad is inf; allowed: finite, 0 or more"):
+    with pytest.raises(
+        ValueError, match=r"tracker: systematic_rad is inf; allowed: finite, 0 or more"
+    ):
         TrackerModel(np.inf)
-    with pytest.raises(ValueError, match=r"tracker: systematic_time_s is nan; allowed: above 0, also inf"):
+    with pytest.raises(
+        ValueError, match=r"tracker: systematic_time_s is nan; allowed: above 0, also inf"
+    ):
         TrackerModel(systematic_time_s=np.nan)
-    with pytest.raises(ValueError, match=r"update: systematic_rad2 .*allowed: .* less than covariance_rad2"):
+    with pytest.raises(
+        ValueError, match=r"update: systematic_rad2 .*allowed: .* less than covariance_rad2"
+    ):
         built().update(0.0, Rotation.identity(), NOISE_RAD2, NOISE_RAD2)
-    with pytest.raises(ValueError, match=r"update: systematic_rad2 .*allowed: \(3, 3\), symmetric, not negative"):
+    with pytest.raises(
+        ValueError, match=r"update: systematic_rad2 .*allowed: \(3, 3\), symmetric, not negative"
+    ):
         built().update(0.0, Rotation.identity(), NOISE_RAD2, -NOISE_RAD2)
     with pytest.raises(KeyError, match="gain"):
         built().state.sigma("gain")

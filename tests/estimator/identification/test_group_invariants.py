@@ -22,13 +22,19 @@ def test_a_family_s_transforms_leave_its_invariants_alone(name: str, matrix: Flo
     """And the lights that fix a transform predict the image of every other one."""
     family = dome_invariants.TRANSFORMS[name]
     x = np.concatenate(
-        [np.random.default_rng(3).uniform(-0.4, 0.4, (9, family.lights, 2)), np.ones((9, family.lights, 1))], axis=2
+        [
+            np.random.default_rng(3).uniform(-0.4, 0.4, (9, family.lights, 2)),
+            np.ones((9, family.lights, 1)),
+        ],
+        axis=2,
     )
     y = image(x, matrix)
     before, after = (dome_invariants.invariants(one, name) for one in (x, y))
     np.testing.assert_allclose(after, before, rtol=1e-9)
     for source, target in zip(x, y, strict=True):
-        found = dome_invariants.predicted(name, source[: family.fixed_by], target[: family.fixed_by], source)
+        found = dome_invariants.predicted(
+            name, source[: family.fixed_by], target[: family.fixed_by], source
+        )
         np.testing.assert_allclose(found, target[:, :2], atol=1e-9)
     mirrored = dome_invariants.invariants(np.roll(x, 1, axis=1), name)
     assert np.abs(mirrored - before).min() > 1e-6  # the order of the lights counts

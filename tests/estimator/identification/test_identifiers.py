@@ -17,7 +17,8 @@ pytestmark = pytest.mark.slow  # much is compiled
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000
-SIGMA_RAD, EPSILON_MAG = 10 * ARCSEC_RAD, 0.25
+SIGMA_RAD = 10 * ARCSEC_RAD
+EPSILON_MAG = 0.25
 HALF_TAN = np.tan(np.radians(8))  # a field of 16 x 16 degrees
 SLOW = {"shefex", "master_star", "saa"}  # ten seconds and more for the 40 fields, or to compile
 
@@ -35,18 +36,25 @@ GIVES_UP = 1_000_000  # angles compared: on the real sky each finds within some 
 def sky() -> pair_index.PairIndex:
     """The real sky to V 5.2, stars that noise could swap merged: some 13 stars a field."""
     stars = catalog.merge_doubles(catalog.brighter_than(catalog.read(FILE), 5.2), 180 * ARCSEC_RAD)
-    return pair_index.build(stars.vectors, 2 * np.arctan(np.sqrt(2) * HALF_TAN), magnitude=stars.v_mag)
+    return pair_index.build(
+        stars.vectors, 2 * np.arctan(np.sqrt(2) * HALF_TAN), magnitude=stars.v_mag
+    )
 
 
 class Field:
     """Noisy directions, brightest first, their magnitudes, and the catalog row of each (-1: a false star)."""
 
-    def __init__(self, rng: np.random.Generator, vectors: Floats, magnitude: Floats, false: int = 0) -> None:
+    def __init__(
+        self, rng: np.random.Generator, vectors: Floats, magnitude: Floats, false: int = 0
+    ) -> None:
         self.cam_from_icrs = Rotation.random(rng=rng)
         x, y, z = self.cam_from_icrs.apply(vectors).T
         row = np.flatnonzero((z > 0) & (abs(x) < HALF_TAN * z) & (abs(y) < HALF_TAN * z))
         tangents = np.vstack(
-            [np.column_stack([x, y])[row] / z[row, None], rng.uniform(-HALF_TAN, HALF_TAN, (false, 2))]
+            [
+                np.column_stack([x, y])[row] / z[row, None],
+                rng.uniform(-HALF_TAN, HALF_TAN, (false, 2)),
+            ]
         )
         tangents += rng.normal(0, SIGMA_RAD, tangents.shape)
         light = np.concatenate([magnitude[row], rng.choice(magnitude, false)])
@@ -58,14 +66,19 @@ class Field:
         self.row: Ints = np.concatenate([row, np.full(false, -1)])[order]
 
 
-def identify(name: str, field: Field, sky: pair_index.PairIndex, **options: object) -> StarMatch | None:
+def identify(
+    name: str, field: Field, sky: pair_index.PairIndex, **options: object
+) -> StarMatch | None:
     known = {"magnitude": field.light, "epsilon_mag": EPSILON_MAG, "max_checks": GIVES_UP}
     return IDENTIFIERS[name](field.seen, sky, 5 * SIGMA_RAD, **(known | options))
 
 
-def fields(sky: pair_index.PairIndex, count: int, seed: int, least: int = 8, false: int = 0) -> list[Field]:
+def fields(
+    sky: pair_index.PairIndex, count: int, seed: int, least: int = 8, false: int = 0
+) -> list[Field]:
     """Random fields with so many true stars at least."""
-    rng, out = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    out = []
     while len(out) < count:
         one = Field(rng, sky.vectors, sky.magnitude, false)
         if (one.row >= 0).sum() >= least:
@@ -97,7 +110,11 @@ def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex,
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_mirrored_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
     for one in fields(sky, 10, 91):
-        assert identify(name, one, sky) is not None or name in ("fialho_1", "fialho_2", "master_star")
+        assert identify(name, one, sky) is not None or name in (
+            "fialho_1",
+            "fialho_2",
+            "master_star",
+        )
         one.seen = one.seen * [-1, 1, 1]
         assert identify(name, one, sky) is None
 
@@ -153,7 +170,9 @@ def test_what_it_cannot_work_with_is_refused(sky: pair_index.PairIndex, name: st
     one = fields(sky, 1, 96)[0]
     method: Callable[..., StarMatch | None] = IDENTIFIERS[name]
     assert method(one.seen[:3], sky, 1e-4) is None
-    with pytest.raises(ImageError, match="the focal length is uncertain; allowed: a calibrated camera, or pyramid"):
+    with pytest.raises(
+        ImageError, match="the focal length is uncertain; allowed: a calibrated camera, or pyramid"
+    ):
         method(one.seen, sky, 1e-4, focal_unknown=True)
     with pytest.raises(ImageError, match="tolerance 0"):
         method(one.seen, sky, 0.0)

@@ -26,10 +26,13 @@ LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
 
 @law(LedCode.templates, LedCode.phases, LedCode.bits)
 @given(rng=SEEDS, begin_s=some.floats(-50, 50), length_s=some.floats(1e-4, 3.0))
-def test_a_template_is_the_mean_level_of_an_exposure(rng: np.random.Generator, begin_s: float, length_s: float) -> None:
+def test_a_template_is_the_mean_level_of_an_exposure(
+    rng: np.random.Generator, begin_s: float, length_s: float
+) -> None:
     """Against two thousand moments of it; a frame of a triggered code shows its bit."""
     levels = rng.random((5, 7))
-    free, triggered = LedCode(levels, 0.3), LedCode(levels)
+    free = LedCode(levels, 0.3)
+    triggered = LedCode(levels)
     time = begin_s + (np.arange(2000) + 0.5) / 2000 * length_s
     bit = np.floor(time / 0.3 + free.phases[:, None]).astype(int) % free.bits
     found, spread = free.templates(0, begin_s, begin_s + length_s)
@@ -58,7 +61,9 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
 
     for n, row in enumerate(template):
         start = min(np.linspace(3e3, 2e4, 2000), key=lambda one: misfit(one, row))
-        best = minimize_scalar(misfit, args=(row,), bounds=(start - 20, start + 20), method="bounded").fun
+        best = minimize_scalar(
+            misfit, args=(row,), bounds=(start - 20, start + 20), method="bounded"
+        ).fun
         assert found[0, n] >= best - 1e-6
         if n == 0:
             assert found[0, n] == pytest.approx(best, abs=0.02)
@@ -75,7 +80,9 @@ def test_a_true_word_is_seldom_suspicious() -> None:
 
 @law(codes.excess_noise)
 @given(rng=SEEDS, factor=some.floats(0.3, 4.0))
-def test_noise_beyond_the_declared_is_found_from_the_misfits(rng: np.random.Generator, factor: float) -> None:
+def test_noise_beyond_the_declared_is_found_from_the_misfits(
+    rng: np.random.Generator, factor: float
+) -> None:
     """Squared errors `factor`^2 times the declared ones; one light in nine is no LED. Never below 1."""
     measured = np.full(90, 24)
     least = factor**2 * rng.chisquare(measured) / 2
@@ -86,13 +93,17 @@ def test_noise_beyond_the_declared_is_found_from_the_misfits(rng: np.random.Gene
 
 @law(naming.is_supported)
 @given(lights=some.integers(2, 6), rival=some.floats(0.0, 30.0))
-def test_names_hold_only_at_a_common_time_and_against_the_other_lights(lights: int, rival: float) -> None:
+def test_names_hold_only_at_a_common_time_and_against_the_other_lights(
+    lights: int, rival: float
+) -> None:
     """Two lights that are perfect at different phases of the clock, or together at one; and lights without a name."""
     misfit = np.full((2, lights, 4), 20.0)
     misfit[0, 0, 1] = misfit[1, 1, 2] = 0.0
     misfit[1, 0, 1] = misfit[0, 1, 2] = rival
     match = StarMatch(np.array([0, 1]), np.array([1, 2]), Rotation.identity(), 0.0)
-    assert naming.is_supported(match, misfit, lights) == (lights == 2 and rival <= naming.TRUSTED * np.sqrt(2))
+    assert naming.is_supported(match, misfit, lights) == (
+        lights == 2 and rival <= naming.TRUSTED * np.sqrt(2)
+    )
 
 
 def dome(count: int) -> naming.Sphere:
@@ -115,7 +126,8 @@ def field(sphere: naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, Float
 @given(rng=SEEDS, known=some.floats(0, 40), lied=some.integers(0, 1))
 def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied: int) -> None:
     """Codes that know each LED by `known`, and in some cases one that claims another: then no attitude is wrong."""
-    sphere, truth = dome(100), turn(rng, 0.3)
+    sphere = dome(100)
+    truth = turn(rng, 0.3)
     seen, xy_px = field(sphere, truth)
     misfit = known * (np.arange(100) != seen[:, None]).astype(float)
     if lied:
@@ -135,14 +147,17 @@ def test_lights_keep_their_tracks_while_the_vehicle_turns(
     rng: np.random.Generator, rate_rad_s: float, gyro: bool, dark: bool
 ) -> None:
     """Ten frames of 20 ms; light n has the brightness n + 1, or is dark in some frames: no track has two of them."""
-    sphere, start, axis = dome(100), turn(rng, 0.3), units(rng, 1)[0]
+    sphere = dome(100)
+    start = turn(rng, 0.3)
+    axis = units(rng, 1)[0]
     tracks = LightTracks(CAMERA, LEVER.camera_body_m, 1.2, 10, 40.0, 2, dark)
     tracks.clear()
     for frame in range(10):
         turned = Rotation.from_rotvec(axis * rate_rad_s * 0.02 * frame)
         seen, xy_px = field(sphere, turned * start)
         lit = rng.random(len(seen)) > 0.2 * dark * (frame > 2)
-        seen, xy_px = seen[lit], xy_px[lit]
+        seen = seen[lit]
+        xy_px = xy_px[lit]
         centroids = Centroids(xy_px, np.full(len(seen), 0.1), seen + 1.0)
         step = Rotation.from_rotvec(axis * rate_rad_s * 0.02) if gyro else None
         tracks.advance(centroids, 0.01 * (seen + 1.0), 0.02, step)
@@ -155,13 +170,17 @@ def test_lights_keep_their_tracks_while_the_vehicle_turns(
     assert len(tracks.row) == 0
 
 
-@pytest.mark.parametrize("levels", [np.ones((3, 4)), np.full((2, 2), 2.0), np.zeros((0, 3)), np.ones(3)])
+@pytest.mark.parametrize(
+    "levels", [np.ones((3, 4)), np.full((2, 2), 2.0), np.zeros((0, 3)), np.ones(3)]
+)
 def test_codes_that_name_nothing_are_refused(levels: Floats) -> None:
     assert answered(lambda: LedCode(levels), ImageError) is None
 
 
 @pytest.mark.parametrize(("excess", "decided"), [(2.0, False), (11.0, False), (12.0, True)])
-def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likely(excess: float, decided: bool) -> None:
+def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likely(
+    excess: float, decided: bool
+) -> None:
     """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""
     azimuth = np.arange(8) * np.pi / 4
     ring = np.column_stack([0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)])
@@ -170,5 +189,7 @@ def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likel
     misfit = np.full((2, 8), 100.0)
     misfit[[0, 1], [0, 1]] = 3.0
     misfit[[0, 1], [4, 5]] = 3.0 + excess / 2
-    found = naming.identify(naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere)
+    found = naming.identify(
+        naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere
+    )
     assert (found == naming.UNDECIDED) if not decided else found.star.tolist() == [0, 1]

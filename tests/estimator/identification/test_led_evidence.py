@@ -18,13 +18,20 @@ from estimator.identification.leds.index import DomeIndex, build_dome_index
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
 LEVER = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
 # Six LEDs near the apex of a flat panel, in no regular pattern.
-PLACES_M = np.array([[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02], [-0.01, -0.04]])
+PLACES_M = np.array(
+    [[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02], [-0.01, -0.04]]
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("boards", "second", "further"),
-    [([0, 0, 0, 0, 0, 0], 1, 4), ([0, 0, 0, 1, 1, 1], 2, 2), ([0, 0, 1, 1, 2, 2], 3, 0), ([0, 1, 2, 3, 3, 3], 1, 1)],
+    [
+        ([0, 0, 0, 0, 0, 0], 1, 4),
+        ([0, 0, 0, 1, 1, 1], 2, 2),
+        ([0, 0, 1, 1, 2, 2], 3, 0),
+        ([0, 1, 2, 3, 3, 3], 1, 1),
+    ],
 )
 def test_matches_on_one_board_count_little(boards: list[int], second: int, further: int) -> None:
     """A board's first match counts in full, log10(1 / (2 pi sigma^2 rho)), its second 1, each further one 0.3.
@@ -36,7 +43,9 @@ def test_matches_on_one_board_count_little(boards: list[int], second: int, furth
     dome = build_dome_index(leds, LEVER, CAMERA)
     sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(sigma=np.full(6, sigma))
+    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(
+        sigma=np.full(6, sigma)
+    )
     boarded = dome._replace(pairs=dome.pairs._replace(group=np.array(boards)))
     apart = dome._replace(pairs=dome.pairs._replace(group=np.arange(6)))
     found = [evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)]
@@ -66,7 +75,9 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.7, 0.5)])
 def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, float]) -> None:
     """Gauss-Newton of exact detections squares the error: 0.5 deg, some 1e-4 rad, below 1e-6 rad."""
-    dome, detections, R_cam_from_lab = wide_field(Rotation.from_euler("xyz", [5, -8, 30], degrees=True))
+    dome, detections, R_cam_from_lab = wide_field(
+        Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
+    )
     off = Rotation.from_rotvec(np.radians(0.5) * np.array(axis)).as_matrix() @ R_cam_from_lab
     hypothesis = evidence.evaluate(detections, dome, off, 0, 0, 3)
     assert len(hypothesis.star) == 6
@@ -80,24 +91,34 @@ def test_the_information_is_that_of_the_projection_s_slopes(uncertainty: float) 
 
     And by the logarithm of the focal length, if that is uncertain.
     """
-    dome, detections, R_cam_from_lab = wide_field(Rotation.from_euler("xyz", [5, -8, 30], degrees=True))
-    rows, step = np.arange(6), 1e-6
+    dome, detections, R_cam_from_lab = wide_field(
+        Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
+    )
+    rows = np.arange(6)
+    step = 1e-6
 
     def tangents(change: Floats) -> Floats:
-        q = dome.position_m @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T - dome.pupil_m
+        q = (
+            dome.position_m @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T
+            - dome.pupil_m
+        )
         return 1.07 * np.exp(change[3]) * (q[:, :2] / q[:, 2:]).ravel()
 
     unknowns = np.eye(4)[: 4 if uncertainty else 3]
     slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in unknowns])
     detections = detections._replace(focal_uncertainty=uncertainty)
     info, _ = evidence._fit(detections, dome, R_cam_from_lab.copy(), 1.07, rows, rows)
-    np.testing.assert_allclose(info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max())
+    np.testing.assert_allclose(
+        info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max()
+    )
 
 
 @pytest.mark.slow
 def test_two_fits_of_attitude_and_focal_length_come_to_the_truth() -> None:
     """Tangents of a lens 8 % longer than assumed; the start is 0.3 deg and 1 % off."""
-    dome, detections, R_cam_from_lab = wide_field(Rotation.from_euler("xyz", [5, -8, 30], degrees=True))
+    dome, detections, R_cam_from_lab = wide_field(
+        Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
+    )
     zoomed = detections._replace(tangent=1.08 * detections.tangent, focal_uncertainty=0.1)
     off = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix() @ R_cam_from_lab
     hypothesis = evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
@@ -109,18 +130,25 @@ def test_two_fits_of_attitude_and_focal_length_come_to_the_truth() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("sigmas", "matched"), [(3.0, 6), (-3.0, 6), (8.0, 0)])
-def test_leds_are_matched_within_the_error_of_their_pair_s_direction(sigmas: float, matched: int) -> None:
+def test_leds_are_matched_within_the_error_of_their_pair_s_direction(
+    sigmas: float, matched: int
+) -> None:
     """Two detections of error sigma, s apart, give the roll about their middle to sqrt(2) sigma / s.
 
     At 3 standard deviations of the roll all LEDs are within 3.5 of their own places. At 8 the pair itself is not:
     each is 0.5 s from the middle, 5.7 sigma from its place, where the gate is 3.5 sqrt(1 + 1 / 2 + 1 / 2) sigma.
     """
-    place_m = np.array([[0.015, 0], [-0.015, 0], [0.04, 0.03], [-0.03, 0.045], [-0.045, -0.03], [0.03, -0.04]])
+    place_m = np.array(
+        [[0.015, 0], [-0.015, 0], [0.04, 0.03], [-0.03, 0.045], [-0.045, -0.03], [0.03, -0.04]]
+    )
     place_m = np.column_stack([place_m, np.full(6, 1.2192)])
     leds = LedMap(np.arange(6), place_m, np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
-    dome, sigma = build_dome_index(leds, LEVER, CAMERA), 0.2 / CAMERA.focal_px
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(sigma=np.full(6, sigma))
+    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(
+        sigma=np.full(6, sigma)
+    )
     apart = 0.03 / (1.2192 - 0.381)
     rolled = Rotation.from_euler("z", sigmas * np.sqrt(2) * sigma / apart).as_matrix()
     hypothesis = evidence.evaluate(detections, dome, rolled, 0, 0, 1)
@@ -132,9 +160,12 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(sigmas: flo
 def test_dead_leds_cost_the_beta_function_of_the_counts(dead: list[int]) -> None:
     """Against the same frame on a dome without these LEDs, by the interpreter; the rest are matched all the same."""
     plain = interpreted("estimator.identification.leds.evidence")
-    place_m = np.column_stack([np.vstack([PLACES_M, [[0.02, 0.045], [0.06, 0.02]]]), np.full(8, 1.2192)])
+    place_m = np.column_stack(
+        [np.vstack([PLACES_M, [[0.02, 0.045], [0.06, 0.02]]]), np.full(8, 1.2192)]
+    )
     kept = np.setdiff1d(np.arange(8), dead)
-    dex, surface = [], (np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
+    dex = []
+    surface = (np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
     rays = CAMERA.rays(project(Rotation.identity(), place_m[kept], LEVER, CAMERA))
     for rows in (np.arange(8), kept):
         dome = build_dome_index(LedMap(rows, place_m[rows], *surface), LEVER, CAMERA)

@@ -24,9 +24,13 @@ from estimator.trackers.pipeline import Settings
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
 LEVER = Lever(np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3]))
-OVAL = np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264])  # measured: 38.88 and 28.60 in
+OVAL = (
+    np.array([0.0, 0.003, 0.492]),
+    np.array([0.9876, 0.9876, 0.7264]),
+)  # measured: 38.88 and 28.60 in
 FLAT = np.zeros(3), np.array([np.inf, np.inf, 1.2192])  # a panel at 48 in
-NOISE_PX, ERROR_M = 0.2, 0.2e-3
+NOISE_PX = 0.2
+ERROR_M = 0.2e-3
 
 
 def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0) -> LedMap:
@@ -39,7 +43,9 @@ def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float
     rays = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
     darts = on_surface(rays, np.zeros(3), nowhere)
     spacing = 1.22 * np.sqrt(2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count) * 0.7
-    tree, free, chosen = cKDTree(darts), np.ones(len(darts), bool), []
+    tree = cKDTree(darts)
+    free = np.ones(len(darts), bool)
+    chosen = []
     for n, dart in enumerate(darts):
         if free[n] and len(chosen) < count:
             chosen.append(n)
@@ -50,7 +56,9 @@ def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float
 def surveyed(leds: LedMap, seed: int) -> LedMap:
     """The map in the tracker's head: every LED out of place by ERROR_M along each axis."""
     error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
-    return LedMap(leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M)
+    return LedMap(
+        leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M
+    )
 
 
 def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
@@ -62,7 +70,11 @@ def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
 
 
 def lights(
-    leds: LedMap, body_from_lab: Rotation, rng: np.random.Generator, dead: float = 0.0, false: int = 0
+    leds: LedMap,
+    body_from_lab: Rotation,
+    rng: np.random.Generator,
+    dead: float = 0.0,
+    false: int = 0,
 ) -> tuple[Floats, Floats]:
     """Pixels in any order, and which LED each is; -1 for a reflection."""
     xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
@@ -99,7 +111,8 @@ def names_right(match: StarMatch, names: Floats) -> bool:
 def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least):
     truth = spread(1400, surface, 1)
     leds = surveyed(truth, 2)
-    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(3)
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    rng = np.random.default_rng(3)
     found = 0
     for _ in range(80):
         pixels, names = lights(truth, pose(rng, 25), rng, dead, false)
@@ -114,7 +127,8 @@ def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least
 def test_a_better_survey_finds_leds_of_which_half_are_dead():
     """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
     truth = spread(1400, OVAL, 4)
-    dome, rng = build_dome_index(truth, LEVER, CAMERA), np.random.default_rng(5)
+    dome = build_dome_index(truth, LEVER, CAMERA)
+    rng = np.random.default_rng(5)
     tries = [lights(truth, pose(rng), rng, 0.5, 5) for _ in range(80)]
     enough = [(pixels, names) for pixels, names in tries if np.sum(names >= 0) >= 4]
     came = [(identified(pixels, dome), names) for pixels, names in enough]
@@ -127,7 +141,8 @@ def test_a_better_survey_finds_leds_of_which_half_are_dead():
 def test_lights_that_fell_anywhere_are_no_attitude():
     """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
-    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(8)
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    rng = np.random.default_rng(8)
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
@@ -143,18 +158,24 @@ def test_lights_that_fell_anywhere_are_no_attitude():
 def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
     """By which a pair is looked up: both rays carried to the one sphere, against the index's angle."""
     leds = spread(600, surface, 9)
-    dome, rng = build_dome_index(leds, LEVER, CAMERA), np.random.default_rng(10)
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    rng = np.random.default_rng(10)
     keys = dict(zip(map(frozenset, dome.pairs.pair.tolist()), dome.pairs.angle_rad, strict=True))
     checked = 0
     for _ in range(60):
         body_from_lab = pose(rng)
         xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
         seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9)))
-        direction = on_sphere(CAMERA.rays(xy[seen]), dome.pupil_m, dome.median_radius_m) / dome.median_radius_m
+        direction = (
+            on_sphere(CAMERA.rays(xy[seen]), dome.pupil_m, dome.median_radius_m)
+            / dome.median_radius_m
+        )
         for a in range(len(seen)):
             for b in range(a):
                 angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b]) / 2)
-                assert abs(angle - keys[frozenset((seen[a], seen[b]))]) < dome.scaling_error_rad + 1e-9
+                assert (
+                    abs(angle - keys[frozenset((seen[a], seen[b]))]) < dome.scaling_error_rad + 1e-9
+                )
                 checked += 1
     assert checked > 300
 
@@ -163,7 +184,8 @@ def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
     """Patch boards of 3x3 LEDs around the apex, one at each azimuth, all alike; and perhaps one LED more."""
     lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
     places = [
-        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219])) for turn in turns_deg
+        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
+        for turn in turns_deg
     ]
     place = np.concatenate([*places, *([[[0.02, -0.036, 1.219]]] if extra else [])])
     board = np.repeat(np.arange(len(turns_deg)), 9)
@@ -174,16 +196,21 @@ def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
 def seen_by_tracker(leds: LedMap, yaw_deg: float) -> tuple[str, float]:
     """The dome tracker's status, and its attitude's error in degrees."""
     lever = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
-    tracker, rng = DomeTracker(CAMERA, leds, lever), np.random.default_rng(11)
+    tracker = DomeTracker(CAMERA, leds, lever)
+    rng = np.random.default_rng(11)
     truth = Rotation.from_euler("z", yaw_deg, degrees=True)
     pixels = project(truth, leds.position_m, lever, CAMERA)
     pixels = rng.permutation(pixels + 0.05 * rng.standard_normal(pixels.shape))
-    answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels))))
+    answer = tracker.solve_centroids(
+        Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels)))
+    )
     error = (answer.cam_from_ref * truth.inv()).magnitude() if answer.solved else np.inf
     return answer.status, float(np.degrees(error))
 
 
-@pytest.mark.parametrize("turns", [(0.0, 180.0), (0.0, 120.0, 240.0)], ids=["two boards", "three boards"])
+@pytest.mark.parametrize(
+    "turns", [(0.0, 180.0), (0.0, 120.0, 240.0)], ids=["two boards", "three boards"]
+)
 def test_a_pattern_that_is_its_own_twin_is_called_ambiguous(turns):
     assert seen_by_tracker(boards(turns, extra=False), 33.0)[0] == search.AMBIGUOUS
 
@@ -206,13 +233,16 @@ def test_too_few_lights_are_no_attitude():
 @pytest.mark.long
 def test_the_covariance_holds_the_map_s_own_errors():
     """NEES over maps drawn anew: chi-square of three degrees, mean 3 +- sqrt(6 / 100)."""
-    rng, nees = np.random.default_rng(14), []
+    rng = np.random.default_rng(14)
+    nees = []
     truth = spread(1400, OVAL, 15)
     for n in range(100):
         body_from_lab = pose(rng)
         pixels, _ = lights(truth, body_from_lab, rng)
         tracker = DomeTracker(CAMERA, surveyed(truth, 100 + n), LEVER)
-        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels))))
+        answer = tracker.solve_centroids(
+            Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
+        )
         if answer.solved:
             error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
             nees.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
@@ -225,15 +255,22 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
     lone = spread(1400, OVAL, 16)
     beside = lone.position_m + np.array([0.0025, 0, 0])  # 26 px
     leds = LedMap(np.arange(2800), np.concatenate([lone.position_m, beside]), *OVAL)
-    tracker, rng, pulls = DomeTracker(CAMERA, leds, LEVER), np.random.default_rng(17), []
+    tracker = DomeTracker(CAMERA, leds, LEVER)
+    rng = np.random.default_rng(17)
+    pulls = []
     for _ in range(30):
         body_from_lab = pose(rng)
         xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
         seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy[:1400], nan=-1e9), 40))
-        sharp, blend = seen[2:], seen[:2]
-        pixels = np.concatenate([xy[sharp], xy[sharp + 1400], 0.6 * xy[blend] + 0.4 * xy[blend + 1400]])
+        sharp = seen[2:]
+        blend = seen[:2]
+        pixels = np.concatenate(
+            [xy[sharp], xy[sharp + 1400], 0.6 * xy[blend] + 0.4 * xy[blend + 1400]]
+        )
         pixels += 0.05 * rng.standard_normal(pixels.shape)
-        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels))))
+        answer = tracker.solve_centroids(
+            Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels)))
+        )
         assert answer.solved
         error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
         pulls.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
@@ -244,9 +281,13 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
 @pytest.mark.long
 def test_the_covariance_holds_a_lever_s_error():
     """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
-    truth, rng, nees = spread(1400, OVAL, 18), np.random.default_rng(19), []
+    truth = spread(1400, OVAL, 18)
+    rng = np.random.default_rng(19)
+    nees = []
     for _ in range(60):
-        aside = Lever(LEVER.camera_body_m + 1e-3 * rng.standard_normal(3), LEVER.cam_from_body, 1e-3)
+        aside = Lever(
+            LEVER.camera_body_m + 1e-3 * rng.standard_normal(3), LEVER.cam_from_body, 1e-3
+        )
         body_from_lab = pose(rng)
         pixels, _ = lights(truth, body_from_lab, rng)
         answer = DomeTracker(CAMERA, truth, aside).solve_centroids(
@@ -261,7 +302,8 @@ def test_the_covariance_holds_a_lever_s_error():
 
 def test_the_index_knows_the_errors_and_the_field_as_angles() -> None:
     """Errors of LEDs and pupil over the least distance from the camera; the sensor's area in tangents squared."""
-    leds, lever = spread(60, OVAL, seed=1), Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)
+    leds = spread(60, OVAL, seed=1)
+    lever = Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)
     leds = replace(leds, sigma_m=2e-4)
     dome = build_dome_index(leds, lever, CAMERA)
     least_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(LEVER.camera_body_m)
@@ -278,10 +320,12 @@ PLAIN = interpreted("estimator.identification.leds.search")
 def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
     """Directions over the dome and beyond its rim, gates from a tenth of a grid's cell to three cells."""
     dome = build_dome_index(spread(150, OVAL, seed=1), LEVER, CAMERA)
-    rng, found = np.random.default_rng(2), 0
+    rng = np.random.default_rng(2)
+    found = 0
     for _ in range(500):
         x, y = rng.uniform(-0.8, 0.8, 2)
-        direction, gate = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))]), dome.grid.cell * rng.uniform(0.1, 3)
+        direction = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))])
+        gate = dome.grid.cell * rng.uniform(0.1, 3)
         near = np.linalg.norm(dome.grid.direction - direction, axis=1).min() < gate
         assert PLAIN._has_led_near(dome.grid, tuple(direction), gate) == near
         found += near
@@ -302,14 +346,24 @@ def test_a_ray_meets_the_sphere_of_an_led_s_radius() -> None:
 def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     """3.5 standard deviations along the worst axis, as an angle about the bearing: (R - M) / R of the camera's."""
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
-    sigma, rng, a, b = 1e-5, np.random.default_rng(3), 0, 2
+    sigma = 1e-5
+    rng = np.random.default_rng(3)
+    a = 0
+    b = 2
     places = np.array([[0.05, 0.02], [0.0, 0.03], [-0.04, 0.01], [0.07, -0.05]])
     rays = np.column_stack([places, np.ones(4)])
-    detections = search.build_detections(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome)
+    detections = search.build_detections(
+        rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome
+    )
     seen = places[:, 0] + 1j * places[:, 1]
-    noisy = seen + sigma * (rng.standard_normal((20_000, 4)) + 1j * rng.standard_normal((20_000, 4)))
+    noisy = seen + sigma * (
+        rng.standard_normal((20_000, 4)) + 1j * rng.standard_normal((20_000, 4))
+    )
     turn = (
-        (noisy[:, b] - noisy[:, a]) / np.abs(noisy[:, b] - noisy[:, a]) / (seen[b] - seen[a]) * abs(seen[b] - seen[a])
+        (noisy[:, b] - noisy[:, a])
+        / np.abs(noisy[:, b] - noisy[:, a])
+        / (seen[b] - seen[a])
+        * abs(seen[b] - seen[a])
     )
     middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
     errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
@@ -318,30 +372,48 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     for n in (1, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
         angle = gates[n] - dome.scaling_error_rad
-        assert angle == pytest.approx(3.5 * np.sqrt(worst2) * ratio, rel=0.02)  # 4 deviations of a variance
+        assert angle == pytest.approx(
+            3.5 * np.sqrt(worst2) * ratio, rel=0.02
+        )  # 4 deviations of a variance
 
 
-@pytest.mark.parametrize(("dead", "required", "found"), [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)])
+@pytest.mark.parametrize(
+    ("dead", "required", "found"), [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)]
+)
 def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, found: int) -> None:
     """Five exact detections; without the LEDs of some it ends where the rest cannot reach what is required."""
     places = np.array([[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02]])
     position_m = np.column_stack([places, np.full(5, 1.2192)])
-    camera, lever = Camera(1600, 1200, 8698.0, (799.5, 599.5)), Lever(np.array([0, 0, 0.381]), Rotation.identity())
+    camera = Camera(1600, 1200, 8698.0, (799.5, 599.5))
+    lever = Lever(np.array([0, 0, 0.381]), Rotation.identity())
     leds = LedMap(np.arange(5), position_m, *FLAT)
     whole = build_dome_index(leds, lever, camera)
     kept = np.setdiff1d(np.arange(5), dead)
     dome = build_dome_index(LedMap(kept, position_m[kept], *FLAT), lever, camera) if dead else whole
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
     detections = search.build_detections(rays, np.full(5, 1e-5), dome)
-    gates, R_grid_from_cam = np.full(5, 1e-4), dome.grid.R_grid_from_lab
+    gates = np.full(5, 1e-4)
+    R_grid_from_cam = dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
-    assert PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) == found
-    zoomed = search.build_detections(
-        camera.zoomed(1 / 1.08).rays(camera.pixels(rays)), np.full(5, 1e-5), dome, focal_uncertainty=0.1
+    assert (
+        PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required)
+        == found
     )
-    assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required) == found
+    zoomed = search.build_detections(
+        camera.zoomed(1 / 1.08).rays(camera.pixels(rays)),
+        np.full(5, 1e-5),
+        dome,
+        focal_uncertainty=0.1,
+    )
+    assert (
+        PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required)
+        == found
+    )
     if found > 2:
-        assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) < found
+        assert (
+            PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required)
+            < found
+        )
 
 
 @pytest.mark.parametrize("ratio", [0.89, 1.0, 1.11])
@@ -349,13 +421,18 @@ def test_a_pair_tells_the_focal_length_at_which_it_is_two_leds(ratio: float) -> 
     """At the exact chord, radii of 1.1 m and 1.3 m; the error left by three iterations is below 1e-6."""
     rays = CAMERA.rays(np.array([[100.0, 300.0], [1500.0, 900.0]]))
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
-    ends = [np.array(PLAIN._direction_from_bearing(*one)) for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))]
+    ends = [
+        np.array(PLAIN._direction_from_bearing(*one))
+        for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))
+    ]
     pixels = CAMERA.pixels(rays)
     seen = search.build_detections(
         CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, focal_uncertainty=0.12
     )
     chord = float(np.linalg.norm(ends[0] - ends[1]))
-    assert PLAIN._fit_focal_ratio(seen, dome, 0, 1, 1.1, 1.3, chord) == pytest.approx(ratio, abs=1e-6)
+    assert PLAIN._fit_focal_ratio(seen, dome, 0, 1, 1.1, 1.3, chord) == pytest.approx(
+        ratio, abs=1e-6
+    )
     known = seen._replace(focal_uncertainty=0.0)
     assert PLAIN._fit_focal_ratio(known, dome, 0, 1, 1.1, 1.3, chord) == 1
 
@@ -365,7 +442,8 @@ def test_a_second_pair_is_the_first_that_shares_the_fewest_detections_with_the_b
     rng = np.random.default_rng(4)
     for matched in (2, 3, 4, 6):
         pairs = rng.permutation(list(itertools.combinations(range(6), 2)))
-        best, rank = SimpleNamespace(observed=rng.permutation(6)[:matched]), int(rng.integers(len(pairs)))
+        best = SimpleNamespace(observed=rng.permutation(6)[:matched])
+        rank = int(rng.integers(len(pairs)))
         unmatched = (~np.isin(pairs, best.observed)).sum(axis=1)
         shared = np.isin(pairs, pairs[rank]).sum(axis=1)
         wanted = np.lexsort([np.arange(len(pairs)), shared, unmatched])[0]
@@ -378,7 +456,8 @@ def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
     rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     detections = search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
-    across, apart = detections.sigma.min() / np.sqrt(2), np.hypot(0.09, 0.01)
+    across = detections.sigma.min() / np.sqrt(2)
+    apart = np.hypot(0.09, 0.01)
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
     wanted = np.log10(np.sqrt(np.linalg.det(2 * np.pi * covariance)) / dome.prior_volume)
     assert PLAIN._attitude_dex(detections, dome, 0, 1) == pytest.approx(wanted, abs=1e-9)
@@ -393,13 +472,16 @@ def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
 
 def uncalibrated(leds: LedMap, ratio: float) -> DomeTracker:
     """A tracker that assumes a focal length `ratio` times too short, and knows no better."""
-    settings = Settings(identifier="non_dimensional", solver="rotation_only", centroid_sigma_px=NOISE_PX)
+    settings = Settings(
+        identifier="non_dimensional", solver="rotation_only", centroid_sigma_px=NOISE_PX
+    )
     return DomeTracker(CAMERA.zoomed(1 / ratio), leds, LEVER, settings)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("error_m", "surface_m", "least"), [(0.2e-3, 0.0, 0.98), (1e-3, 0.0, 0.7), (3e-2, 0.0, 0.0), (0.2e-3, 3e-2, 0.95)]
+    ("error_m", "surface_m", "least"),
+    [(0.2e-3, 0.0, 0.98), (1e-3, 0.0, 0.7), (3e-2, 0.0, 0.0), (0.2e-3, 3e-2, 0.95)],
 )
 def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
     error_m: float, surface_m: float, least: float
@@ -408,19 +490,29 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
 
     surface_m : an error that all LEDs share, along the normals, whose scale goes into the focal length
     """
-    rng, truth, tries = np.random.default_rng(20), spread(1400, OVAL, 21), 60 if error_m < 1e-2 else 5
-    nees, focal = [], []
+    rng = np.random.default_rng(20)
+    truth = spread(1400, OVAL, 21)
+    tries = 60 if error_m < 1e-2 else 5
+    nees = []
+    focal = []
     for n in range(tries):
         if n % 3 == 0:
             outward = (truth.position_m - truth.center_m) / truth.semi_axes_m**2
             shift_m = surface_m * outward / np.linalg.norm(outward, axis=1, keepdims=True)
             believed_m = truth.position_m + error_m * rng.standard_normal(truth.position_m.shape)
             believed_m += rng.standard_normal() * shift_m
-            leds = replace(truth, position_m=believed_m, sigma_m=error_m, common_m=shift_m[None] if surface_m else None)
+            leds = replace(
+                truth,
+                position_m=believed_m,
+                sigma_m=error_m,
+                common_m=shift_m[None] if surface_m else None,
+            )
             tracker = uncalibrated(leds, 1 + rng.uniform(-0.1, 0.1))
         body_from_lab = pose(rng, 25)
         pixels, names = lights(truth, body_from_lab, rng)
-        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 1e-3), np.ones(len(pixels))))
+        answer = tracker.solve_centroids(
+            Centroids(pixels, np.full(len(pixels), 1e-3), np.ones(len(pixels)))
+        )
         if answer.solved:
             assert np.array_equal(names[answer.match.observed], answer.match.star)
             error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
@@ -437,13 +529,20 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
 @pytest.mark.slow
 def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() -> None:
     """What the search with a free focal length is for: the angles of all pairs are wrong."""
-    truth, rng = spread(1400, OVAL, 21), np.random.default_rng(22)
-    leds, solved = surveyed(truth, 23), []
+    truth = spread(1400, OVAL, 21)
+    rng = np.random.default_rng(22)
+    leds = surveyed(truth, 23)
+    solved = []
     for identifier in ("led_pairs", "non_dimensional"):
-        settings = Settings(identifier=identifier, solver="rotation_only", centroid_sigma_px=NOISE_PX)
+        settings = Settings(
+            identifier=identifier, solver="rotation_only", centroid_sigma_px=NOISE_PX
+        )
         tracker = DomeTracker(CAMERA.zoomed(1.1), leds, LEVER, settings)
         seen = [lights(truth, pose(rng, 25), rng)[0] for _ in range(10)]
-        answers = [tracker.solve_centroids(Centroids(one, np.full(len(one), 1e-3), np.ones(len(one)))) for one in seen]
+        answers = [
+            tracker.solve_centroids(Centroids(one, np.full(len(one), 1e-3), np.ones(len(one))))
+            for one in seen
+        ]
         solved.append(sum(answer.solved for answer in answers))
     assert solved[0] == 0
     assert solved[1] >= 9
@@ -453,10 +552,13 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
 def test_lights_that_fell_anywhere_have_no_attitude_at_any_focal_length() -> None:
     """As for a calibrated camera: evidence of x powers of ten is met in one frame of 10^x at most."""
     dome = build_dome_index(surveyed(spread(1400, OVAL, 6), 7), LEVER, CAMERA.zoomed(0.88))
-    rng, dex = np.random.default_rng(8), []
+    rng = np.random.default_rng(8)
+    dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12)
+        fallen = search.build_detections(
+            rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12
+        )
         best, _ = search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)

@@ -19,7 +19,12 @@ from estimator.catalog.catalog import unit
 from estimator.core.arrays import Floats
 from estimator.identification.options import Options
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa_search import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.saa_search import (
+    UNMATCHED_COST,
+    Gates,
+    Primary,
+    SearchInput,
+)
 from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions
 from estimator.identification.registry import IDENTIFIERS
 
@@ -37,20 +42,27 @@ PYRAMID, SHEFEX, FIALHO, SAA, SEARCH, DIRECT = (
 )
 TOLERANCE_RAD = 1e-4
 EDGES = (-0.05, 0.08, -0.07, 0.06)  # tangents of a field off its center
-CAP_RAD, FIELD_RAD, MAX_ANGLE_RAD = 0.3, 0.12, 0.24
+CAP_RAD = 0.3
+FIELD_RAD = 0.12
+MAX_ANGLE_RAD = 0.24
 
 
 def cap(rng: np.random.Generator, count: int, radius_rad: float) -> Floats:
     """Unit vectors, uniform within an angle of z."""
-    z, azimuth = rng.uniform(np.cos(radius_rad), 1, count), rng.uniform(0, 2 * np.pi, count)
+    z = rng.uniform(np.cos(radius_rad), 1, count)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
     across = np.sqrt(1 - z**2)
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
 
 
-def field(seed: int, false: int = 0, count: int = 60) -> tuple[Floats, Floats, Floats, pair_index.PairIndex, Rotation]:
+def field(
+    seed: int, false: int = 0, count: int = 60
+) -> tuple[Floats, Floats, Floats, pair_index.PairIndex, Rotation]:
     """Rays of a field's stars in camera axes, brightest first, their magnitudes and rows (-1: false), index, truth."""
     rng = np.random.default_rng(seed)
-    stars, magnitude, truth = cap(rng, count, CAP_RAD), np.linspace(1, 6, count), Rotation.random(rng=rng)
+    stars = cap(rng, count, CAP_RAD)
+    magnitude = np.linspace(1, 6, count)
+    truth = Rotation.random(rng=rng)
     index = pair_index.build(truth.inv().apply(stars), MAX_ANGLE_RAD, magnitude=magnitude)
     rows = np.flatnonzero(stars[:, 2] > np.cos(FIELD_RAD))
     rays = np.vstack([stars[rows], cap(rng, false, FIELD_RAD)])
@@ -67,7 +79,8 @@ NAMES = [name for name in IDENTIFIERS if name != "default"]
 @pytest.mark.parametrize("false", [0, 2])
 def test_every_method_names_the_stars_and_gives_their_attitude(name: str, false: int) -> None:
     """A false star among the brightest three stops the first two versions of Fialho's method, as published."""
-    found, required = 0, (0 if name in ("fialho_1", "fialho_2") else 1) if false else 3
+    found = 0
+    required = (0 if name in ("fialho_1", "fialho_2") else 1) if false else 3
     for seed in range(3):
         rays, magnitude, rows, index, truth = field(seed, false)
         match = PLAIN[name](rays, index, TOLERANCE_RAD, magnitude=magnitude, epsilon_mag=0.1)
@@ -76,7 +89,9 @@ def test_every_method_names_the_stars_and_gives_their_attitude(name: str, false:
         found += 1
         np.testing.assert_array_equal(match.star, rows[match.observed])
         assert len(match.star) >= 0.8 * np.count_nonzero(rows >= 0)
-        assert (match.cam_from_ref * truth.inv()).magnitude() < 1e-13  # rounding over the field's 0.2 rad
+        assert (
+            match.cam_from_ref * truth.inv()
+        ).magnitude() < 1e-13  # rounding over the field's 0.2 rad
         assert match.log10_chance < -5
     assert found >= required
 
@@ -92,7 +107,9 @@ def test_a_tolerance_must_be_positive(name: str, tolerance_rad: float) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_no_method_takes_a_mirror_image(name: str) -> None:
     rays, magnitude, _, index, _ = field(0)
-    match = PLAIN[name](rays * [-1, 1, 1], index, TOLERANCE_RAD, magnitude=magnitude, epsilon_mag=0.1)
+    match = PLAIN[name](
+        rays * [-1, 1, 1], index, TOLERANCE_RAD, magnitude=magnitude, epsilon_mag=0.1
+    )
     assert match is None
 
 
@@ -107,7 +124,8 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
         rows = inside[:-missing]
         known = {"magnitude": magnitude[rows], "epsilon_mag": 0.1, "field_tan": EDGES}
         free, charged = (
-            PLAIN[name](rays[rows], index, TOLERANCE_RAD, missed_dex=dex, **known).log10_chance for dex in (0.0, 0.07)
+            PLAIN[name](rays[rows], index, TOLERANCE_RAD, missed_dex=dex, **known).log10_chance
+            for dex in (0.0, 0.07)
         )
         assert charged - free == pytest.approx(0.07 * missing, abs=1e-12)
 
@@ -125,11 +143,15 @@ def test_a_match_counts_as_the_binomial_tail_of_its_gates() -> None:
     """Three of five random directions: their gates cover a share p of the sky of the catalog's local density."""
     rays, _, rows, index, _ = field(1)
     strays = unit(np.array([[0.1, 0.05, 1.0], [-0.08, 0.06, 1.0]]))
-    seen, corners, hypotheses = np.vstack([rays, strays]), np.arange(3), 7
+    seen = np.vstack([rays, strays])
+    corners = np.arange(3)
+    hypotheses = 7
     for stretch in (0.0, 1e-3):
         match = DIRECT.match_field(seen, index, corners, rows[:3], 2e-3, stretch, hypotheses)
         assert match.observed.tolist() == list(range(len(rays)))
-        neighbors = np.sum(np.linalg.norm(index.vectors - index.vectors[rows[0]], axis=1) < 2 * np.sin(0.12))
+        neighbors = np.sum(
+            np.linalg.norm(index.vectors - index.vectors[rows[0]], axis=1) < 2 * np.sin(0.12)
+        )
         density = neighbors / (2 * np.pi * (1 - np.cos(MAX_ANGLE_RAD)))
         radius = 2e-3 + stretch * np.arctan2(np.hypot(*seen[:, :2].T), seen[:, 2])
         p = -np.expm1(-density * np.pi * np.mean(radius**2))
@@ -186,19 +208,26 @@ def test_a_side_may_be_off_by_both_directions_errors_and_its_stretch(
     unknown: bool, side: int, share: float, hypotheses: int
 ) -> None:
     """sqrt(2) tolerances beyond the stretch; a third of the stretch after one factor for the whole perimeter."""
-    sides, tolerance, stretch = np.array([0.1, 0.12, 0.14]), 1e-4, 0.002
-    part = 1 - sides[side] / sides.sum() if unknown else 1.0  # of a side's error that the perimeter's factor leaves
+    sides = np.array([0.1, 0.12, 0.14])
+    tolerance = 1e-4
+    stretch = 0.002
+    part = (
+        1 - sides[side] / sides.sum() if unknown else 1.0
+    )  # of a side's error that the perimeter's factor leaves
     own_stretch = (stretch / 3 if unknown else stretch) * sides[side]
     longer = sides + np.eye(3)[side] * (share * np.sqrt(2) * tolerance + own_stretch) / part
     index = pair_index.build(triangle(longer), 0.2)
-    options, tried = pyramid.SearchOptions(tolerance, stretch, unknown, 10, 1000, 3, 0.0, *EDGES), np.zeros(3, np.int64)
+    options = pyramid.SearchOptions(tolerance, stretch, unknown, 10, 1000, 3, 0.0, *EDGES)
+    tried = np.zeros(3, np.int64)
     PYRAMID._triangle(triangle(sides), index, np.arange(3), options, tried)
     assert tried[1] == hypotheses
 
 
 def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
     """Beyond the three corners' tries, the direct match's effort shows that a fourth star was taken."""
-    rng, tolerance, taken = np.random.default_rng(8), 1e-4, 0
+    rng = np.random.default_rng(8)
+    tolerance = 1e-4
+    taken = 0
     corners = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1]]))
     options = pyramid.SearchOptions(tolerance, 0.0, False, 10, 1000, 4, 0.0, *EDGES)
     for _ in range(100):
@@ -206,12 +235,15 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
         moved = unit(fourth + rng.normal(0, 1.5 * tolerance, 3))
         # As far from the first corner as the fourth star, in another direction.
         decoy = Rotation.from_rotvec(corners[0]).apply(fourth)
-        rays, index = np.vstack([corners, fourth]), pair_index.build(np.vstack([corners, moved, decoy]), 0.4)
+        rays = np.vstack([corners, fourth])
+        index = pair_index.build(np.vstack([corners, moved, decoy]), 0.4)
         errors = np.abs(np.arccos(corners @ fourth[0]) - np.arccos(corners @ moved[0]))
         tried = np.array([0, 1, 0])
         PYRAMID._pyramid(rays, index, np.arange(3), np.arange(3), options, 0.0, tried)
         fits = errors.max() <= np.sqrt(2) * tolerance
-        assert tried[2] == 4 + fits * 4 * 4  # four tries; four rays against the corner's four neighbors
+        assert (
+            tried[2] == 4 + fits * 4 * 4
+        )  # four tries; four rays against the corner's four neighbors
         taken += fits
     assert 20 < taken < 80
 
@@ -219,18 +251,28 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
 @pytest.mark.parametrize("name", ["pyramid", "shefex"])
 def test_as_many_triangles_are_tried_as_allowed(name: str) -> None:
     """The first three of four triangles have a false star; the first that has none is the last in order."""
-    stars = unit(np.array([[-0.1, -0.02, 1], [0.06, 0.07, 1], [0.09, -0.08, 1], [-0.05, 0.06, 1], [0.01, 0.03, 1]]))
+    stars = unit(
+        np.array(
+            [[-0.1, -0.02, 1], [0.06, 0.07, 1], [0.09, -0.08, 1], [-0.05, 0.06, 1], [0.01, 0.03, 1]]
+        )
+    )
     false = unit(np.array([[0.04, -0.05, 1]]))
-    index, seen = pair_index.build(stars, 0.4), np.vstack([false, stars])
+    index = pair_index.build(stars, 0.4)
+    seen = np.vstack([false, stars])
     limits = {"base_stars": 6, "max_checks": 10**6}
-    least = next(n for n in range(1, 21) if PLAIN[name](seen, index, 1e-5, max_triangles=n, **limits) is not None)
+    least = next(
+        n
+        for n in range(1, 21)
+        if PLAIN[name](seen, index, 1e-5, max_triangles=n, **limits) is not None
+    )
     # Six stars in the order of pyramid: (0 1 2) (1 2 3); of shefex: ten triangles with the false star first.
     assert least == {"pyramid": 2, "shefex": 11}[name]
 
 
 def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
     rays, _, rows, index, _ = field(4)
-    options, tried = pyramid.SearchOptions(TOLERANCE_RAD, 0.0, False, 10, 10**6, 12, 0.0, *EDGES), np.array([0, 40, 0])
+    options = pyramid.SearchOptions(TOLERANCE_RAD, 0.0, False, 10, 10**6, 12, 0.0, *EDGES)
+    tried = np.array([0, 40, 0])
     match = PYRAMID._triangle(rays, index, np.arange(3), options, tried)
     np.testing.assert_array_equal(match.star, rows[match.observed])
     assert tried[1] >= 41
@@ -241,7 +283,9 @@ def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
 # ---- the areas of gates
 
 
-def crossing_area_sr(center: Floats, rings: list[tuple[Floats, float]], step: float = 2e-5) -> float:
+def crossing_area_sr(
+    center: Floats, rings: list[tuple[Floats, float]], step: float = 2e-5
+) -> float:
     """Area where rings about stars cross: each of directions as far from its star as `center`, to a half-width."""
     steps = np.arange(-150, 151) * step
     across, down = np.linalg.svd(center[None])[2][1:]
@@ -249,28 +293,42 @@ def crossing_area_sr(center: Floats, rings: list[tuple[Floats, float]], step: fl
     inside = np.ones(places.shape[:2], bool)
     for star, half_width in rings:
         angles = np.arctan2(np.linalg.norm(np.cross(places, star), axis=2), places @ star)
-        inside &= np.abs(angles - np.arctan2(np.linalg.norm(np.cross(center, star)), center @ star)) < half_width
+        inside &= (
+            np.abs(angles - np.arctan2(np.linalg.norm(np.cross(center, star)), center @ star))
+            < half_width
+        )
     return float(inside.sum() * step**2)
 
 
 def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
-    rays = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.06, -0.08, 1]]))
+    rays = unit(
+        np.array(
+            [[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.06, -0.08, 1]]
+        )
+    )
     options = SearchOptions(1e-5, 1e-6, 100, 10**6, 5)
     gates = SHEFEX._angle_gates(rays, np.arange(3), options)
     assert (gates[:3, 9] == 0).all()
     for n in (3, 4):
         half = (gates[n, 3:6] - gates[n, :3]) / 2
         pairs = [(0, 1), (1, 2), (2, 0)]
-        areas = [crossing_area_sr(rays[n], [(rays[a], half[a]), (rays[b], half[b])]) for a, b in pairs]
-        assert gates[n, 9] == pytest.approx(min(areas), rel=0.03)  # of the lattice, and of the rings' curvature
+        areas = [
+            crossing_area_sr(rays[n], [(rays[a], half[a]), (rays[b], half[b])]) for a, b in pairs
+        ]
+        assert gates[n, 9] == pytest.approx(
+            min(areas), rel=0.03
+        )  # of the lattice, and of the rings' curvature
 
 
 def test_shefex_counts_the_other_stars_in_the_gates_by_the_binomial_law() -> None:
     rays, _, rows, index, _ = field(2)
-    options, tried = SearchOptions(2e-5, TOLERANCE_RAD, 100, 10**6, 12), np.zeros(3, np.int64)
+    options = SearchOptions(2e-5, TOLERANCE_RAD, 100, 10**6, 12)
+    tried = np.zeros(3, np.int64)
     match = SHEFEX.search(rays, index, options, tried)
     np.testing.assert_array_equal(match.star, rows[match.observed])
-    neighbors = np.sum(np.linalg.norm(index.vectors - index.vectors[match.star[0]], axis=1) < 2 * np.sin(0.12))
+    neighbors = np.sum(
+        np.linalg.norm(index.vectors - index.vectors[match.star[0]], axis=1) < 2 * np.sin(0.12)
+    )
     density = neighbors / (2 * np.pi * (1 - np.cos(MAX_ANGLE_RAD)))
     area_sr = SHEFEX._angle_gates(rays, match.observed[:3], options)[:, 9].sum()
     p = -np.expm1(-density * area_sr / (len(rays) - 3))
@@ -294,21 +352,28 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
 
 def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
     """Among many stars and with wide gates, by all of them: angles, side of the base, least sum of differences."""
-    rng, found = np.random.default_rng(9), 0
+    rng = np.random.default_rng(9)
+    found = 0
     for _ in range(20):
-        rays, strays = cap(rng, 4, 0.15), cap(rng, 300, 0.17)
+        rays = cap(rng, 4, 0.15)
+        strays = cap(rng, 300, 0.17)
         index = pair_index.build(np.vstack([rays[:3], strays]), 0.4)
         gates = SHEFEX._angle_gates(rays, np.arange(3), SearchOptions(1e-3, 1e-6, 1, 1, 4))
-        cosines, tried = rays[:3] @ index.vectors.T, np.zeros(3, np.int64)
+        cosines = rays[:3] @ index.vectors.T
+        tried = np.zeros(3, np.int64)
         angles = np.arccos(np.clip(cosines, -1, 1))
         fits = ((angles >= gates[3, :3, None]) & (angles <= gates[3, 3:6, None])).all(axis=0)
         volumes = [np.linalg.det(rays[[m, (m + 1) % 3, 3]]) for m in range(3)]
         far = int(np.argmax(np.abs(volumes)))
         fits &= index.vectors @ np.cross(rays[far], rays[(far + 1) % 3]) * volumes[far] > 0
         fits[:3] = False
-        difference = np.where(fits, np.abs(cosines - (rays[:3] @ rays[3])[:, None]).sum(axis=0), np.inf)
+        difference = np.where(
+            fits, np.abs(cosines - (rays[:3] @ rays[3])[:, None]).sum(axis=0), np.inf
+        )
         wanted = int(np.argmin(difference)) if fits.any() else -1
-        assert SHEFEX._partner(rays, index, np.arange(3), np.arange(3), 3, gates[3], tried) == wanted
+        assert (
+            SHEFEX._partner(rays, index, np.arange(3), np.arange(3), 3, gates[3], tried) == wanted
+        )
         found += np.count_nonzero(fits) > 1
     assert found > 5
 
@@ -320,19 +385,25 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     match = SHEFEX.search(rays[:4], index, options._replace(base=4), np.zeros(3, np.int64))
     np.testing.assert_array_equal(match.star, rows[:4])
     strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
-    assert len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
-    # Within wide gates of the angles, but 30 tolerances from its place.
-    moved, wide = (
-        unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0])),
-        options._replace(cos_error=1e-4, tolerance_rad=1e-5),
+    assert (
+        len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
     )
+    # Within wide gates of the angles, but 30 tolerances from its place.
+    moved = unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0]))
+    wide = options._replace(cos_error=1e-4, tolerance_rad=1e-5)
     assert len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star) == 0
 
 
 # ---- SAA
 
-SEPARATION_RAD, POSITION_RAD, STRETCH = 1e-4, 1e-2, 1e-4
-FIVE = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.15, -0.12, 1]]))
+SEPARATION_RAD = 1e-4
+POSITION_RAD = 1e-2
+STRETCH = 1e-4
+FIVE = unit(
+    np.array(
+        [[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.15, -0.12, 1]]
+    )
+)
 
 
 def primary_of(rays: Floats, position_rad: float = POSITION_RAD) -> Primary:
@@ -350,7 +421,9 @@ def test_saa_s_gates_of_angles_cross_in_an_area_about_each_star() -> None:
         for side, row in enumerate(primary.rows):
             angle = np.arccos(FIVE[n] @ FIVE[row])
             assert primary.corner_rad[side, k] == pytest.approx(angle, abs=1e-12)
-            assert primary.gate_rad[side, k] == pytest.approx(3 * SEPARATION_RAD + STRETCH * angle, rel=1e-9)
+            assert primary.gate_rad[side, k] == pytest.approx(
+                3 * SEPARATION_RAD + STRETCH * angle, rel=1e-9
+            )
             rings.append((FIVE[row], primary.gate_rad[side, k]))
         assert primary.area_sr[k] == pytest.approx(crossing_area_sr(FIVE[n], rings), rel=0.03)
     midpoint = unit(FIVE[[0]] + FIVE[2])[0]
@@ -360,7 +433,9 @@ def test_saa_s_gates_of_angles_cross_in_an_area_about_each_star() -> None:
 
 def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> None:
     """Noise of all three stars: the worst axis of where the pair's attitude puts a star beside where it is seen."""
-    sigma_rad, rng, errors = 1e-5, np.random.default_rng(6), []
+    sigma_rad = 1e-5
+    rng = np.random.default_rng(6)
+    errors = []
     primary = primary_of(FIVE, sigma_rad)
     for _ in range(2000):
         seen = unit(FIVE + sigma_rad * rng.normal(size=FIVE.shape))
@@ -368,18 +443,26 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
         errors.append((FIVE @ R.T - seen)[primary.others])
     for k, n in enumerate(primary.others):
         worst2 = np.linalg.eigvalsh(np.cov(np.array(errors)[:, k].T)).max()
-        assert primary.sigma_rad[k] ** 2 == pytest.approx(worst2, rel=0.12)  # 4 deviations of a variance of 2,000
+        assert primary.sigma_rad[k] ** 2 == pytest.approx(
+            worst2, rel=0.12
+        )  # 4 deviations of a variance of 2,000
         far_rad = np.arccos(FIVE[n] @ primary.midpoint)
-        assert primary.radius_rad[k] == pytest.approx(3 * primary.sigma_rad[k] + STRETCH * far_rad, rel=1e-9)
+        assert primary.radius_rad[k] == pytest.approx(
+            3 * primary.sigma_rad[k] + STRETCH * far_rad, rel=1e-9
+        )
         assert primary.area_sr[k] == pytest.approx(np.pi * primary.radius_rad[k] ** 2, rel=1e-12)
 
 
 def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
     """Catalog stars in the field and about the pair, of about the magnitude, over the area that they share."""
-    rng, seen = np.random.default_rng(7), FIVE[:4]
+    rng = np.random.default_rng(7)
+    seen = FIVE[:4]
     catalog = np.vstack([seen, cap(rng, 400, 0.4)])
-    magnitude, seen_mag = np.concatenate([[1, 2, 3, 4], rng.uniform(0, 5, 400)]), np.array([1.0, 2, 3, 4])
-    stars = SearchInput(seen, seen_mag, catalog, magnitude, None, Gates(SEPARATION_RAD, 1e-3, 0.4, 0.0))
+    magnitude = np.concatenate([[1, 2, 3, 4], rng.uniform(0, 5, 400)])
+    seen_mag = np.array([1.0, 2, 3, 4])
+    stars = SearchInput(
+        seen, seen_mag, catalog, magnitude, None, Gates(SEPARATION_RAD, 1e-3, 0.4, 0.0)
+    )
     primary = SAA.build_primary(stars, 0, 2)
     x, y = (catalog[:, :2] / catalog[:, 2:]).T
     in_field = (x > -0.3) & (x < 0.08) & (y > -0.1) & (y < 0.07)
@@ -389,7 +472,9 @@ def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
     similar = np.sum(np.abs(magnitude[rows] - seen_mag[primary.others][:, None]) <= 1.2, axis=1)
     share = primary.area_sr / (2 * np.pi * (1 - np.cos(primary.reach_rad)))
     # Star 3 of the field is seen and has no partner.
-    p, missing = SAA._chance_statistics(stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07))
+    p, missing = SAA._chance_statistics(
+        stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07)
+    )
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
     alone = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
@@ -400,8 +485,11 @@ def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
 def test_saa_tries_every_pair_that_gives_the_roll_the_brightest_first(base: int) -> None:
     rays = cap(np.random.default_rng(10), 9, 0.01)
     gates = Gates(SEPARATION_RAD, 1e-3, np.inf, 0.0)
-    unknown, max_rad = np.full(9, np.nan), 0.012
-    pairs = list(SAA._primary_pairs(SearchInput(rays, unknown, rays, unknown, None, gates), base, max_rad))
+    unknown = np.full(9, np.nan)
+    max_rad = 0.012
+    pairs = list(
+        SAA._primary_pairs(SearchInput(rays, unknown, rays, unknown, None, gates), base, max_rad)
+    )
     angle = np.arccos(np.clip(rays @ rays.T, -1, 1))
     fitting = (angle > 12 * SEPARATION_RAD) & (angle <= max_rad + 3 * SEPARATION_RAD)
     wanted = {(a, b) for a, b in np.argwhere(fitting) if a < b < base}
@@ -409,24 +497,32 @@ def test_saa_tries_every_pair_that_gives_the_roll_the_brightest_first(base: int)
     assert {(a, b) for a, b, _ in pairs} == wanted
     assert len(pairs) == len(wanted)
     assert (np.diff([a + b for a, b, _ in pairs]) >= 0).all()
-    np.testing.assert_allclose([size for _, _, size in pairs], [angle[a, b] for a, b, _ in pairs], rtol=1e-6)
+    np.testing.assert_allclose(
+        [size for _, _, size in pairs], [angle[a, b] for a, b, _ in pairs], rtol=1e-6
+    )
 
 
 def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
     """Needelman's: magnitude, position, and the angles to A and to B; by all stars of a crowded field."""
-    rng, gates = np.random.default_rng(11), Gates(2e-3, 3e-3, 0.3, 0.0)
+    rng = np.random.default_rng(11)
+    gates = Gates(2e-3, 3e-3, 0.3, 0.0)
     several = 0
     for _ in range(20):
-        seen, crowd = cap(rng, 5, 0.1), cap(rng, 300, 0.12)
+        seen = cap(rng, 5, 0.1)
+        crowd = cap(rng, 300, 0.12)
         index = pair_index.build(np.vstack([seen[[0, 2]], crowd]), 0.3)
         magnitude = np.concatenate([[1, 1], rng.uniform(0, 3, 300)])
         seen_mag = np.array([1, 1.5, 1, 1.5, np.nan])
         stars = SearchInput(seen, seen_mag, index.vectors, magnitude, index.cells, gates)
-        primary, nearby = SAA.build_primary(stars, 0, 2), np.empty(302, np.int64)
-        partner, cost = np.empty(3, np.int64), np.empty(3)
+        primary = SAA.build_primary(stars, 0, 2)
+        nearby = np.empty(302, np.int64)
+        partner = np.empty(3, np.int64)
+        cost = np.empty(3)
         SEARCH._partners(stars, primary, 0, 1, nearby, partner, cost)
         for k, n in enumerate((1, 3, 4)):
-            distance = np.linalg.norm(index.vectors - seen[n], axis=1)  # the reference's axes are the camera's
+            distance = np.linalg.norm(
+                index.vectors - seen[n], axis=1
+            )  # the reference's axes are the camera's
             off = np.arccos(index.vectors @ seen[[0, 2]].T) - np.arccos(seen[n] @ seen[[0, 2]].T)
             unlike = np.nan_to_num((magnitude - seen_mag[n]) / 0.3)
             fits = (np.abs(unlike) <= 3) & (2 * np.arcsin(distance / 2) <= primary.radius_rad[k])
@@ -435,14 +531,17 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
             total = np.where(fits, own_cost + (distance / primary.sigma_rad[k]) ** 2, np.inf)
             best = int(total.argmin()) if fits.any() else -1
             assert partner[k] == best
-            assert cost[k] == pytest.approx(own_cost[best] if best >= 0 else UNMATCHED_COST, rel=1e-6)
+            assert cost[k] == pytest.approx(
+                own_cost[best] if best >= 0 else UNMATCHED_COST, rel=1e-6
+            )
             several += np.count_nonzero(fits) > 1
     assert several > 15
 
 
 def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
     for costs, kept in (([1.0, 2.0], 0), ([2.0, 1.0], 2)):
-        partner, cost = np.array([7, 3, 7, -1]), np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
+        partner = np.array([7, 3, 7, -1])
+        cost = np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
         assert SEARCH._remove_duplicates(partner, cost) == 2
         assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
         assert cost[2 - kept] == UNMATCHED_COST
@@ -453,34 +552,61 @@ def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -
     """All but one of them are matched; each catalog star of the field that is not seen costs half a power of ten."""
     rays, _, rows, index, _ = field(0)
     unknown = np.full(len(rays), np.nan)
-    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, Gates(1e-4, 1e-4, np.inf, 0.0))
-    pool, best = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.5), rows.astype(np.int32)
+    stars = SearchInput(
+        rays,
+        unknown,
+        index.vectors,
+        np.full(60, np.nan),
+        index.cells,
+        Gates(1e-4, 1e-4, np.inf, 0.0),
+    )
+    pool = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.5)
+    best = rows.astype(np.int32)
     best[-1] = -1
-    pool.add(SAA.build_primary(stars, 0, 1), (best[None], np.array([3.0]), np.array([len(rows) - 3])))
+    pool.add(
+        SAA.build_primary(stars, 0, 1), (best[None], np.array([3.0]), np.array([len(rows) - 3]))
+    )
     tail = stats.binom.logsf(len(rows) - 4, len(rows) - 2, pool.p) / np.log(10)
     assert pool.log10_chance == pytest.approx(tail + 0.5 * pool.missing, abs=1e-9)
 
 
 @pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
-def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(ratio: float, accepted: bool) -> None:
+def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(
+    ratio: float, accepted: bool
+) -> None:
     """A cost is a squared number of standard deviations: the likelihood is exp(-cost / 2)."""
     rays, _, rows, index, _ = field(0)
     unknown = np.full(len(rays), np.nan)
-    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, Gates(1e-4, 1e-4, np.inf, 0.0))
-    pool, primary = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.0), SAA.build_primary(stars, 0, 1)
-    best, rival = rows.astype(np.int32), np.full(len(rows), -1, np.int32)
+    stars = SearchInput(
+        rays,
+        unknown,
+        index.vectors,
+        np.full(60, np.nan),
+        index.cells,
+        Gates(1e-4, 1e-4, np.inf, 0.0),
+    )
+    pool = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.0)
+    primary = SAA.build_primary(stars, 0, 1)
+    best = rows.astype(np.int32)
+    rival = np.full(len(rows), -1, np.int32)
     rival[:4] = np.roll(best[:4], 1)
     costs = np.array([3.0, 3.0 + 2 * np.log(ratio)])
     pool.add(primary, (np.array([best, rival]), costs, np.array([len(rows) - 2, 0])))
     assert (pool.best_match() is not None) == accepted
 
 
-@pytest.mark.parametrize(("limit", "tried"), [(3, 3), (1000, 2 + SAA.RIVAL_PAIRS), (10**6, 2 + SAA.RIVAL_PAIRS)])
-def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(limit: int, tried: int) -> None:
+@pytest.mark.parametrize(
+    ("limit", "tried"), [(3, 3), (1000, 2 + SAA.RIVAL_PAIRS), (10**6, 2 + SAA.RIVAL_PAIRS)]
+)
+def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(
+    limit: int, tried: int
+) -> None:
     """The second pair's best is significant."""
     rays, _, _, index, _ = field(0)
-    unknown, gates = np.full(len(rays), np.nan), Gates(1e-4, 1e-4, np.inf, 0.0)
-    stars, added = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, gates), []
+    unknown = np.full(len(rays), np.nan)
+    gates = Gates(1e-4, 1e-4, np.inf, 0.0)
+    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, gates)
+    added = []
 
     class Pool:
         count = 0
@@ -497,16 +623,22 @@ def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(l
 
 
 @pytest.mark.parametrize(("share", "matched"), [(0.5, False), (0.49, True)])
-def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: float, matched: bool) -> None:
+def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(
+    share: float, matched: bool
+) -> None:
     """Of twice as many lights as there are stars, all stars match."""
     rays, _, rows, index, _ = field(1)
     strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
     options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)
-    match = FIALHO._direct_match(np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1)
+    match = FIALHO._direct_match(
+        np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1
+    )
     assert len(match.observed) == (len(rays) if matched else 0)
 
 
-@pytest.mark.parametrize(("triangles", "checks", "tried"), [(10**6, 10**6, None), (5, 10**6, 5), (10**6, 20, 3)])
+@pytest.mark.parametrize(
+    ("triangles", "checks", "tried"), [(10**6, 10**6, None), (5, 10**6, 5), (10**6, 20, 3)]
+)
 def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
     triangles: int, checks: int, tried: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -43,7 +43,9 @@ def bright_sky() -> pair_index.PairIndex:
 class Field:
     """What a camera sees: pixels, brightest first, and the catalog row of each (-1: a false star)."""
 
-    def __init__(self, rng: np.random.Generator, vectors: Floats, noise_px: float, false: float) -> None:
+    def __init__(
+        self, rng: np.random.Generator, vectors: Floats, noise_px: float, false: float
+    ) -> None:
         self.cam_from_icrs = Rotation.random(rng=rng)
         cam = self.cam_from_icrs.apply(vectors)
         pixels = np.nan_to_num(CAMERA.pixels(cam), nan=-1e9)
@@ -52,9 +54,12 @@ class Field:
         seen = pixels[rows] + rng.normal(0, noise_px, (len(rows), 2))
         self.xy = np.vstack([seen, rng.uniform(0, [658, 492], (count, 2))])
         self.star = np.concatenate([rows, np.full(count, -1)])
-        brightness = np.concatenate([np.arange(len(rows)), rng.uniform(0, max(len(rows), 1), count)])
+        brightness = np.concatenate(
+            [np.arange(len(rows)), rng.uniform(0, max(len(rows), 1), count)]
+        )
         order = np.argsort(brightness, kind="stable")
-        self.xy, self.star = self.xy[order], self.star[order]
+        self.xy = self.xy[order]
+        self.star = self.star[order]
 
     def off_px(self, match: StarMatch) -> float:
         """How far the match's boresight is from the true one."""
@@ -70,7 +75,13 @@ class Field:
 def solved(
     xy: Floats, index: pair_index.PairIndex, tolerance_px: float = 1.0, triangles: int = 3000
 ) -> StarMatch | None:
-    return pyramid(CAMERA.rays(xy), index, tolerance_px / CAMERA.focal_px, stretch=5e-4, max_triangles=triangles)
+    return pyramid(
+        CAMERA.rays(xy),
+        index,
+        tolerance_px / CAMERA.focal_px,
+        stretch=5e-4,
+        max_triangles=triangles,
+    )
 
 
 @pytest.mark.long
@@ -118,7 +129,9 @@ def test_each_blob_and_each_star_is_matched_once(sky: pair_index.PairIndex) -> N
     rng = np.random.default_rng(62)
     for _ in range(30):
         match = solved(Field(rng, sky.vectors, 0.5, 0.2).xy, sky, 2.0)
-        assert len(set(match.observed)) == len(match.observed) == len(set(match.star)) >= MIN_MATCHES
+        assert (
+            len(set(match.observed)) == len(match.observed) == len(set(match.star)) >= MIN_MATCHES
+        )
 
 
 @pytest.mark.long
@@ -149,7 +162,9 @@ def test_another_sky_is_refused(bright_sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(66)
     other = rng.normal(size=bright_sky.vectors.shape)
     other /= np.linalg.norm(other, axis=1, keepdims=True)
-    assert sum(solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300)) == 0
+    assert (
+        sum(solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300)) == 0
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
@@ -158,10 +173,16 @@ def test_fewer_than_four_stars_are_refused(sky: pair_index.PairIndex, count: int
     assert solved(xy.reshape(-1, 2), sky) is None
 
 
-def test_four_stars_of_a_field_are_not_beyond_chance_but_eight_are(sky: pair_index.PairIndex) -> None:
+def test_four_stars_of_a_field_are_not_beyond_chance_but_eight_are(
+    sky: pair_index.PairIndex,
+) -> None:
     # One match beyond a triangle's own three is expected among the many triangles of a whole sky.
     rng = np.random.default_rng(68)
-    fields = [field for field in (Field(rng, sky.vectors, 0.1, 0.0) for _ in range(40)) if len(field.xy) >= 8]
+    fields = [
+        field
+        for field in (Field(rng, sky.vectors, 0.1, 0.0) for _ in range(40))
+        if len(field.xy) >= 8
+    ]
     assert len(fields) > 30
     assert sum(solved(field.xy[:4], sky) is not None for field in fields) < len(fields)
     eights = [(field, solved(field.xy[:8], sky)) for field in fields]
@@ -181,7 +202,9 @@ def test_a_match_is_the_same_in_any_order_of_the_false_stars(sky: pair_index.Pai
 
 
 @pytest.mark.parametrize("zoom", [0.985, 1.0, 1.012])
-def test_an_unknown_focal_length_is_measured_by_the_triangles(sky: pair_index.PairIndex, zoom: float) -> None:
+def test_an_unknown_focal_length_is_measured_by_the_triangles(
+    sky: pair_index.PairIndex, zoom: float
+) -> None:
     rng = np.random.default_rng(70)
     found = 0
     for _ in range(20):
@@ -210,4 +233,6 @@ def test_directions_of_a_longer_lens_are_unit_vectors_of_scaled_tangents() -> No
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     scaled = _scale_tangents(rays, 1.2)
     np.testing.assert_allclose(np.linalg.norm(scaled, axis=1), 1, rtol=1e-14)
-    np.testing.assert_allclose(scaled[:, :2] / scaled[:, 2:], 1.2 * rays[:, :2] / rays[:, 2:], rtol=1e-14)
+    np.testing.assert_allclose(
+        scaled[:, :2] / scaled[:, 2:], 1.2 * rays[:, :2] / rays[:, 2:], rtol=1e-14
+    )

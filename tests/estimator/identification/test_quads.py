@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
-from star_fields import CHECKS, FIELD, SEARCHED, SKY, attitude_error, detections_of, observe, random_sky
+from star_fields import (
+    CHECKS,
+    FIELD,
+    SEARCHED,
+    SKY,
+    attitude_error,
+    detections_of,
+    observe,
+    random_sky,
+)
 
 from estimator.catalog import quad_index, sky_index
 from estimator.core.camera import Camera
@@ -55,10 +64,15 @@ def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> Non
         longest = apart[np.ix_(four, four)].max()
         if quad_index.SHORTEST * height < longest < quad_index.LONGEST * height - bin_rad:
             expected.add(four)
-    found = {tuple(sorted(star)): code for star, code in zip(index.star.tolist(), index.code, strict=True)}
+    found = {
+        tuple(sorted(star)): code
+        for star, code in zip(index.star.tolist(), index.code, strict=True)
+    }
     assert len(found) == len(index.star) > 100
     missing = expected - found.keys()
-    assert len(missing) < 0.01 * len(expected)  # of stars with more than NEIGHBORS neighbors, or at a bin's edge
+    assert len(missing) < 0.01 * len(
+        expected
+    )  # of stars with more than NEIGHBORS neighbors, or at a bin's edge
     for star, code in zip(index.star, index.code, strict=True):
         by_definition, order = code_of(vectors[star])
         np.testing.assert_allclose(code, by_definition, atol=1e-9)
@@ -68,7 +82,9 @@ def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> Non
 def test_a_quad_is_in_the_cell_of_its_code() -> None:
     number = np.repeat(np.arange(quad_index.SIDE**4), np.diff(all_quads().first))
     bound = np.array([quad_index.ALONG, quad_index.ACROSS] * 2)
-    cell = np.clip((all_quads().code + bound) / (2 * bound) * quad_index.SIDE, 0, quad_index.SIDE - 1).astype(int)
+    cell = np.clip(
+        (all_quads().code + bound) / (2 * bound) * quad_index.SIDE, 0, quad_index.SIDE - 1
+    ).astype(int)
     np.testing.assert_array_equal(cell @ quad_index.SIDE ** np.arange(3, -1, -1), number)
 
 
@@ -97,7 +113,8 @@ def identify(detections, calibrated=False):
 
 @pytest.mark.parametrize("ratio", [0.955, 1.0, 1.045])
 def test_a_focal_length_that_is_wrong_by_some_percent_is_found(ratio: float) -> None:
-    rng, solved = np.random.default_rng(11), 0
+    rng = np.random.default_rng(11)
+    solved = 0
     for _ in range(20):
         truth = Rotation.random(rng=rng)
         tangent, mag, row = observe(truth, rng, zoom=ratio)
@@ -118,7 +135,10 @@ def test_half_of_the_lights_may_be_false_and_the_brightest() -> None:
         truth = Rotation.random(rng=rng)
         tangent, mag, _ = observe(truth, rng, zoom=1.03)
         false = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (min(len(mag), 8), 2))
-        lights = np.concatenate([false, tangent]), np.concatenate([np.full(len(false), mag[0] - 1), mag])
+        lights = (
+            np.concatenate([false, tangent]),
+            np.concatenate([np.full(len(false), mag[0] - 1), mag]),
+        )
         solution = identify(detections_of(*lights, zoom=0.05))
         assert np.linalg.norm(attitude_error(solution, truth)) < 1e-3
 
@@ -128,7 +148,9 @@ def test_lights_anywhere_and_a_mirrored_sky_are_refused() -> None:
     rng = np.random.default_rng(13)
     for _ in range(200):
         tangent = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (rng.integers(4, 40), 2))
-        assert not len(identify(detections_of(tangent, rng.choice(SKY.mag, len(tangent)), zoom=0.05)).star)
+        assert not len(
+            identify(detections_of(tangent, rng.choice(SKY.mag, len(tangent)), zoom=0.05)).star
+        )
         tangent, mag, _ = observe(Rotation.random(rng=rng), rng)
         assert not len(identify(detections_of(tangent * [-1, 1], mag, zoom=0.05)).star)
 
@@ -158,20 +180,28 @@ def test_a_right_focal_length_is_kept() -> None:
 
 
 def test_a_calibrated_tracker_finds_that_its_focal_length_is_wrong() -> None:
-    camera, rng = Camera.from_fov(659, 494, fov_deg=14.87), np.random.default_rng(17)
-    tracker = StarTracker.for_sky(camera.zoomed(1.01), limit_mag=5.75, settings=Settings(centroid_sigma_px=0.0))
+    camera = Camera.from_fov(659, 494, fov_deg=14.87)
+    rng = np.random.default_rng(17)
+    tracker = StarTracker.for_sky(
+        camera.zoomed(1.01), limit_mag=5.75, settings=Settings(centroid_sigma_px=0.0)
+    )
     solved = []
     for _ in range(20):
         truth = Rotation.random(rng=rng)
         xy = camera.pixels(truth.apply(tracker.stars.vectors))
         row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
-        lights = Centroids(xy[row] + 0.1 * rng.normal(size=(len(row), 2)), np.full(len(row), 0.1), 1.0 / (1 + row))
+        lights = Centroids(
+            xy[row] + 0.1 * rng.normal(size=(len(row), 2)), np.full(len(row), 0.1), 1.0 / (1 + row)
+        )
         attitude = tracker.solve_centroids(lights)
         solved.append(attitude.solved)
         if attitude.solved:
             assert attitude.camera.focal_px == pytest.approx(camera.focal_px, rel=2e-3)
             assert (attitude.cam_from_ref * truth.inv()).magnitude() < 1e-3
             known = replace(tracker.camera, focal_px=camera.focal_px)
-            assert StarTracker.for_sky(known, 5.75).solve_centroids(lights).camera.focal_px == camera.focal_px
+            assert (
+                StarTracker.for_sky(known, 5.75).solve_centroids(lights).camera.focal_px
+                == camera.focal_px
+            )
     assert np.mean(solved) > 0.9
     assert search.DECISIVE_DEX == 10.0

@@ -27,11 +27,25 @@ RARE = 1e-4
 
 # Twelve LEDs on AFIT's 8 mm lattice at 48 in, some places empty, unequal.
 LATTICE = np.array(
-    [[-2, -2], [-2, 0], [-2, 1], [-1, 2], [-1, -1], [0, 0], [0, 2], [1, -2], [1, 1], [2, -1], [2, 0], [2, 2]]
+    [
+        [-2, -2],
+        [-2, 0],
+        [-2, 1],
+        [-1, 2],
+        [-1, -1],
+        [0, 0],
+        [0, 2],
+        [1, -2],
+        [1, 1],
+        [2, -1],
+        [2, 0],
+        [2, 2],
+    ]
 )
 PITCH_RAD = 8e-3 / 1.2192
 MAGNITUDE = np.array([150.0, 35, 110, 70, 130, 50, 90, 20, 145, 60, 100, 40])
-SIGMA_RAD, EPSILON_MAG = 5 * ARCSEC_RAD, 5.0
+SIGMA_RAD = 5 * ARCSEC_RAD
+EPSILON_MAG = 5.0
 EPSILON_SEP = np.sqrt(2) * SIGMA_RAD
 
 
@@ -53,23 +67,37 @@ def observed(
     seen = unit(np.vstack([seen, reflection]) + rng.normal(0, SIGMA_RAD, (len(seen) + false, 3)))
     # The patch is brought before the camera, as a field is.
     upright = Rotation.align_vectors([[0, 0, 1]], [seen.mean(axis=0)])[0]
-    seen, truth = upright.apply(seen), upright * truth
+    seen = upright.apply(seen)
+    truth = upright * truth
     if mirrored:
         seen = seen * [-1, 1, 1]
-    light = np.concatenate([magnitude + rng.normal(0, EPSILON_MAG, len(vectors)), rng.uniform(20, 150, false)])
+    light = np.concatenate(
+        [magnitude + rng.normal(0, EPSILON_MAG, len(vectors)), rng.uniform(20, 150, false)]
+    )
     row = np.concatenate([np.arange(len(vectors)), np.full(false, -1)])
     order = np.argsort(-light)
     return seen[order], light[order], row[order], truth
 
 
-def found(seen: Floats, light: Floats, known: PairCatalog, epsilon_mag: float = EPSILON_MAG) -> StarMatch | None:
-    return saa(seen, known, 3 * SIGMA_RAD, magnitude=light, epsilon_mag=epsilon_mag, epsilon_sep_rad=EPSILON_SEP)
+def found(
+    seen: Floats, light: Floats, known: PairCatalog, epsilon_mag: float = EPSILON_MAG
+) -> StarMatch | None:
+    return saa(
+        seen,
+        known,
+        3 * SIGMA_RAD,
+        magnitude=light,
+        epsilon_mag=epsilon_mag,
+        epsilon_sep_rad=EPSILON_SEP,
+    )
 
 
 @pytest.mark.parametrize("false", [0, 4])
 def test_a_patch_of_unequal_leds_is_identified_and_never_wrongly(false: int) -> None:
-    rng, known = np.random.default_rng(74), build_pair_catalog(patch(LATTICE), MAGNITUDE)
-    right, z2 = 0, []
+    rng = np.random.default_rng(74)
+    known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
+    right = 0
+    z2 = []
     for _ in range(100):
         seen, light, row, truth = observed(rng, patch(LATTICE), MAGNITUDE, false)
         match = found(seen, light, known)
@@ -92,7 +120,8 @@ SQUARE = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
 
 @pytest.mark.parametrize("places", [SQUARE, SQUARE[[1, 3, 4, 5, 7]], SQUARE[[0, 2, 6, 8]]])
 def test_a_symmetric_pattern_of_equal_leds_is_refused(places: Floats) -> None:
-    rng, equal = np.random.default_rng(75), np.full(len(places), 100.0)
+    rng = np.random.default_rng(75)
+    equal = np.full(len(places), 100.0)
     known = build_pair_catalog(patch(places), equal)
     for _ in range(3):
         seen, light, _, _ = observed(rng, patch(places), equal)
@@ -102,8 +131,10 @@ def test_a_symmetric_pattern_of_equal_leds_is_refused(places: Floats) -> None:
 def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
     # So that the refusal above is the symmetry's, not a gate's. Magnitudes 20 epsilons apart: at two to
     # four a full square, on which false assumptions find partners too, is mostly refused.
-    rng, magnitude = np.random.default_rng(76), 100.0 * np.random.default_rng(80).permutation(9) + 100
-    known, named = build_pair_catalog(patch(SQUARE), magnitude), 0
+    rng = np.random.default_rng(76)
+    magnitude = 100.0 * np.random.default_rng(80).permutation(9) + 100
+    known = build_pair_catalog(patch(SQUARE), magnitude)
+    named = 0
     for _ in range(30):
         seen, light, row, _ = observed(rng, patch(SQUARE), magnitude)
         match = found(seen, light, known)
@@ -116,7 +147,8 @@ def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
 def test_without_magnitudes_an_irregular_pattern_is_enough_and_a_k_vector_will_do() -> None:
     rng = np.random.default_rng(77)
     places = rng.uniform(-3, 3, (14, 2))
-    known, kvector = build_pair_catalog(patch(places), np.zeros(14)), pair_index.build(patch(places), 0.1)
+    known = build_pair_catalog(patch(places), np.zeros(14))
+    kvector = pair_index.build(patch(places), 0.1)
     right = 0
     for _ in range(15):
         seen, _, row, _ = observed(rng, patch(places), np.full(14, 100.0))
@@ -143,7 +175,9 @@ def test_a_mirror_image_and_mere_noise_are_refused() -> None:
 def test_three_stars_and_an_uncertain_focal_length_are_not_its_business() -> None:
     known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
     assert saa(patch(LATTICE[:3]), known, SIGMA_RAD) is None
-    with pytest.raises(ImageError, match="saa: the focal length is uncertain; allowed: a calibrated camera"):
+    with pytest.raises(
+        ImageError, match="saa: the focal length is uncertain; allowed: a calibrated camera"
+    ):
         saa(patch(LATTICE), known, SIGMA_RAD, focal_unknown=True)
     with pytest.raises(ImageError, match="saa: tolerance 0"):
         saa(patch(LATTICE), known, 0.0)
@@ -154,20 +188,31 @@ def test_three_stars_and_an_uncertain_focal_length_are_not_its_business() -> Non
 
 def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops() -> None:
     # Table 6's stops, centroids of .3 px, the IMU exact: catalog, epsilons and pairs all from the frames.
-    camera, lever = (
-        Camera(1600, 1200, 8750.0, (799.5, 599.5)),
-        Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity()),
-    )
+    camera = Camera(1600, 1200, 8750.0, (799.5, 599.5))
+    lever = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
     ball = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.full(3, 1.2192))
     leds = replace(ball, id=np.arange(12), position_m=1.2192 * patch(LATTICE))
-    stops = np.radians([[0, 0, 0], [-0.009, 2.3, 0.007], [0.25, -2.1, 0.004], [3.3, -0.14, -0.028], [-1.9, 0.28, 0.19]])
-    rng, attitudes = np.random.default_rng(79), Rotation.from_euler("ZYX", stops[:, ::-1])
+    stops = np.radians(
+        [
+            [0, 0, 0],
+            [-0.009, 2.3, 0.007],
+            [0.25, -2.1, 0.004],
+            [3.3, -0.14, -0.028],
+            [-1.9, 0.28, 0.19],
+        ]
+    )
+    rng = np.random.default_rng(79)
+    attitudes = Rotation.from_euler("ZYX", stops[:, ::-1])
 
     def frame(stop: int) -> Sighting:
         xy = project(attitudes[stop], leds.position_m, lever, camera) + rng.normal(0, 0.3, (12, 2))
-        return Sighting(stop, attitudes[stop], leds.id, xy, MAGNITUDE + rng.normal(0, EPSILON_MAG, 12))
+        return Sighting(
+            stop, attitudes[stop], leds.id, xy, MAGNITUDE + rng.normal(0, EPSILON_MAG, 12)
+        )
 
-    home = calibrate([frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever, sine=True)
+    home = calibrate(
+        [frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever, sine=True
+    )
     known = build_pair_catalog(home.vectors, home.brightness)
     named = 0
     for stop in np.repeat(np.arange(5), 8):

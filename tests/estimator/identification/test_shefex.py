@@ -7,13 +7,22 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog, pair_index
 from estimator.core.arrays import Floats
 from estimator.identification.published.master_star import master_star
-from estimator.identification.published.shefex import SearchOptions, angle_interval, cos_error, search
+from estimator.identification.published.shefex import (
+    SearchOptions,
+    angle_interval,
+    cos_error,
+    search,
+)
 
 pytestmark = pytest.mark.slow  # much is compiled
 
 ARCSEC_RAD = np.pi / 648_000
-SCREEN_CORNERS = catalog.unit(np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]]))
-PIXEL_RAD = np.radians(0.02)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
+SCREEN_CORNERS = catalog.unit(
+    np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]])
+)
+PIXEL_RAD = np.radians(
+    0.02
+)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
 
 
 @pytest.mark.parametrize(("centroid_px", "factor"), [(0.1, 4.95), (0.2, 2.47), (0.3, 1.65)])
@@ -23,8 +32,12 @@ def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -
     assert error == pytest.approx(5.5e-5, rel=0.01)
 
 
-@pytest.mark.parametrize(("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)])
-def test_cos_error_is_reference_h5_s_tolerance_of_angles(angle_deg: float, tolerance_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)]
+)
+def test_cos_error_is_reference_h5_s_tolerance_of_angles(
+    angle_deg: float, tolerance_deg: float
+) -> None:
     low, high = np.degrees(angle_interval(np.radians(angle_deg), 5.5e-5))
     assert (high - low) / 2 == pytest.approx(tolerance_deg, abs=6e-4)  # its last digit
 
@@ -39,10 +52,15 @@ def test_the_gate_s_ends_are_off_by_cos_error_in_the_cosine() -> None:
     assert angle_interval(0.001, 5.5e-5)[0] == 0
 
 
-@pytest.mark.parametrize(("triangles", "checks", "begun"), [(3, 10**6, 3), (100, 0, 0), (100, 10**6, 20)])
-def test_no_triangle_is_begun_once_the_effort_is_used_up(triangles: int, checks: int, begun: int) -> None:
+@pytest.mark.parametrize(
+    ("triangles", "checks", "begun"), [(3, 10**6, 3), (100, 0, 0), (100, 10**6, 20)]
+)
+def test_no_triangle_is_begun_once_the_effort_is_used_up(
+    triangles: int, checks: int, begun: int
+) -> None:
     """Six stars have 20 triangles; no star of the catalog is near theirs, so that none is found."""
-    seen, index = catalog.unit(screen(np.random.default_rng(5))[:6]), pair_index.build(SCREEN_CORNERS, 0.5)
+    seen = catalog.unit(screen(np.random.default_rng(5))[:6])
+    index = pair_index.build(SCREEN_CORNERS, 0.5)
     tried = np.zeros(3, np.int64)
     search(seen, index, SearchOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
     assert tried[2] == begun
@@ -53,7 +71,9 @@ def test_no_triangle_is_begun_once_the_effort_is_used_up(triangles: int, checks:
 
 def screen(rng: np.random.Generator) -> Floats:
     """Directions of nine stars, the brightest first."""
-    return catalog.unit(np.column_stack([rng.uniform([-0.15, -0.11], [0.15, 0.11], (9, 2)), np.ones(9)]))
+    return catalog.unit(
+        np.column_stack([rng.uniform([-0.15, -0.11], [0.15, 0.11], (9, 2)), np.ones(9)])
+    )
 
 
 def observe(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[Floats, Rotation]:
@@ -65,7 +85,8 @@ TOLERANCE_RAD = 500 * ARCSEC_RAD / np.sqrt(2)  # +-500 arcsec of an angle
 
 
 def test_nine_stars_on_a_screen_are_told_by_their_master() -> None:
-    rng, found = np.random.default_rng(120), 0
+    rng = np.random.default_rng(120)
+    found = 0
     for _ in range(40):
         stars = screen(rng)
         seen, truth = observe(rng, stars, 60 * ARCSEC_RAD)
@@ -80,7 +101,8 @@ def test_nine_stars_on_a_screen_are_told_by_their_master() -> None:
 
 def test_six_of_the_nine_are_enough_but_not_without_the_master() -> None:
     # NPS matched "about six stars out of the total nine". The thesis's criticism: all rests on the brightest.
-    rng, found = np.random.default_rng(121), np.zeros(3)
+    rng = np.random.default_rng(121)
+    found = np.zeros(3)
     for _ in range(40):
         stars = screen(rng)
         seen, _ = observe(rng, stars, 20 * ARCSEC_RAD)
@@ -99,7 +121,8 @@ def test_six_of_the_nine_are_enough_but_not_without_the_master() -> None:
 def test_nine_stars_of_another_screen_or_a_mirror_are_refused() -> None:
     rng = np.random.default_rng(122)
     for _ in range(60):
-        stars, other = screen(rng), screen(rng)
+        stars = screen(rng)
+        other = screen(rng)
         index = pair_index.build(stars, 0.5)
         assert master_star(other, index, TOLERANCE_RAD) is None
         assert master_star(stars * [-1, 1, 1], index, TOLERANCE_RAD) is None

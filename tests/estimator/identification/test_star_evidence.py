@@ -18,7 +18,16 @@ SIGMA = 1e-4
 TRUTH = Rotation.from_rotvec([0.3, -0.8, 0.5])
 # Seven stars in the field, brightest first, and one far outside of it.
 TANGENT = np.array(
-    [[0.01, 0.02], [-0.06, 0.05], [0.07, -0.03], [-0.04, -0.05], [0.03, 0.06], [0.05, 0.01], [-0.02, 0.0], [0.5, 0.5]]
+    [
+        [0.01, 0.02],
+        [-0.06, 0.05],
+        [0.07, -0.03],
+        [-0.04, -0.05],
+        [0.03, 0.06],
+        [0.05, 0.01],
+        [-0.02, 0.0],
+        [0.5, 0.5],
+    ]
 )
 RAYS = np.column_stack([TANGENT, np.ones(len(TANGENT))])
 RAYS /= np.linalg.norm(RAYS, axis=1, keepdims=True)
@@ -29,7 +38,9 @@ def seen(tangent: np.ndarray) -> evidence.Detections:
     """Detections without magnitudes, as accurate along as across."""
     sigma = np.full(len(tangent), SIGMA)
     weight = np.column_stack([sigma**-2, sigma**-2, 0 * sigma])
-    return evidence.Detections(tangent.copy(), sigma, weight, np.full(len(tangent), np.nan), 0.25, FIELD, 0.0, np.nan)
+    return evidence.Detections(
+        tangent.copy(), sigma, weight, np.full(len(tangent), np.nan), 0.25, FIELD, 0.0, np.nan
+    )
 
 
 def evaluated(tangent: np.ndarray) -> evidence.Hypothesis:
@@ -51,7 +62,9 @@ def test_evidence_is_the_integral_over_all_attitudes() -> None:
     # Turn about each axis to 6 sigma of it, in steps of half a sigma, along the principal axes of the information.
     spread, axes = np.linalg.eigh(np.linalg.inv(hypothesis.info[:3, :3]))
     step = np.arange(-6, 6.1, 0.5)
-    lattice = np.stack(np.meshgrid(step, step, step), axis=-1).reshape(-1, 3) * np.sqrt(spread) @ axes.T
+    lattice = (
+        np.stack(np.meshgrid(step, step, step), axis=-1).reshape(-1, 3) * np.sqrt(spread) @ axes.T
+    )
     rays = Rotation.from_matrix(hypothesis.R_cam_from_ref).apply(SKY.vectors[stars])
     turned = np.einsum("nij,kj->nki", Rotation.from_rotvec(lattice).as_matrix(), rays)
     residual = TANGENT[stars] + offset - turned[:, :, :2] / turned[:, :, 2:]
@@ -81,9 +94,13 @@ def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> Non
 @pytest.mark.parametrize(("limit_mag", "missing"), [(4.4, 0), (5.4, 1), (6.4, 2), (np.nan, 0)])
 def test_stars_to_the_limiting_magnitude_are_missed(limit_mag: float, missing: int) -> None:
     """Stars 0 to 3, of magnitudes 1 to 4, are seen; stars 4 and 5 are not."""
-    lights, gates, dex = seen(TANGENT[:4]), np.full(4, 0.01), []
+    lights = seen(TANGENT[:4])
+    gates = np.full(4, 0.01)
+    dex = []
     for limit in 4.4, limit_mag:
-        found = evidence.evaluate(lights._replace(limit_mag=limit), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+        found = evidence.evaluate(
+            lights._replace(limit_mag=limit), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf
+        )
         assert found.star.tolist() == [0, 1, 2, 3]
         dex.append(found.dex)
     toll = (betaln(5, missing + 1) - betaln(5, 1)) / np.log(10)
@@ -94,13 +111,16 @@ def test_stars_outside_of_the_field_are_not_missed() -> None:
     """The faintest match is fainter than all; the eighth star is out of the field, one more is behind the camera."""
     behind = np.vstack([-SKY.vectors[:1], SKY.vectors[:7]])
     sky = sky_index.build_without_pairs(behind, np.arange(1.0, 9.0))
-    hypothesis = evidence.evaluate(seen(TANGENT[:7]), sky, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    hypothesis = evidence.evaluate(
+        seen(TANGENT[:7]), sky, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
+    )
     assert hypothesis.dex == pytest.approx(evaluated(TANGENT[:7]).dex, abs=1e-9)
 
 
 def test_bright_strays_cost_half_a_power_of_ten_each_beyond_the_matches() -> None:
     """Four matches after 4, 5 and 7 strays, which also make the detections denser: by the ratio of the counts."""
-    places, dex = np.array([[0.01 * n, -0.06] for n in range(-3, 4)]), []
+    places = np.array([[0.01 * n, -0.06] for n in range(-3, 4)])
+    dex = []
     for strays in (4, 5, 7):
         hypothesis = evaluated(np.concatenate([places[:strays], TANGENT[:4]]))
         assert hypothesis.star.tolist() == [0, 1, 2, 3]
@@ -113,31 +133,43 @@ def test_bright_strays_cost_half_a_power_of_ten_each_beyond_the_matches() -> Non
 def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> None:
     """All tangents are `ratio` times those of the assumed focal length, known to 0.01; twice that is no solution."""
     detections = seen(ratio * TANGENT[:7])._replace(focal_uncertainty=0.01)
-    hypothesis = evidence.evaluate(detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    hypothesis = evidence.evaluate(
+        detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
+    )
     solved = abs(ratio - 1) < 0.01
     assert hypothesis.star.tolist() == list(range(7) if solved else [])
-    assert hypothesis.focal_ratio == pytest.approx(ratio if solved else 1.0, abs=1e-6)  # of two Gauss-Newton steps
+    assert hypothesis.focal_ratio == pytest.approx(
+        ratio if solved else 1.0, abs=1e-6
+    )  # of two Gauss-Newton steps
 
 
 @pytest.mark.parametrize(("sigmas", "matched"), [(3.4, 7), (3.6, 6)])
-def test_a_match_is_within_three_and_a_half_standard_deviations(sigmas: float, matched: int) -> None:
+def test_a_match_is_within_three_and_a_half_standard_deviations(
+    sigmas: float, matched: int
+) -> None:
     """Of the fitted place. The seventh star's error ellipse is wide and weighs a hundredth in the fit."""
-    wide, detections = 10 * SIGMA, seen(TANGENT[:7])
+    wide = 10 * SIGMA
+    detections = seen(TANGENT[:7])
     detections.tangent[6] += sigmas * wide * np.array([0.6, 0.8])
     detections.sigma[6], detections.weight[6, :2] = wide, wide**-2
-    hypothesis = evidence.evaluate(detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    hypothesis = evidence.evaluate(
+        detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
+    )
     assert len(hypothesis.star) == matched
 
 
 def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
     """A normal law of the smoothing about each star's magnitude; below and above all stars, that of the end."""
     rng = np.random.default_rng(2)
-    vectors, mag = rng.normal(size=(2000, 3)), np.sort(6 + 2 * np.log10(rng.uniform(1e-3, 1, 2000)))
+    vectors = rng.normal(size=(2000, 3))
+    mag = np.sort(6 + 2 * np.log10(rng.uniform(1e-3, 1, 2000)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     sky = sky_index.build_without_pairs(vectors, mag)
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
-        assert evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)  # of bins of MAG_STEP
+        assert evidence.magnitude_density(sky, value) == pytest.approx(
+            wanted, rel=0.1
+        )  # of bins of MAG_STEP
     assert evidence.magnitude_density(sky, -9.0) == evidence.magnitude_density(sky, mag[0])
     assert evidence.magnitude_density(sky, 30.0) == evidence.magnitude_density(sky, mag[-1] + 2)
 
@@ -148,19 +180,24 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     vectors = np.random.default_rng(1).normal(size=(60, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     sky = sky_index.build_without_pairs(vectors, np.linspace(2, 6, 60))
-    mag, share = np.arange(-2, 10, 1e-3), 0.8
+    mag = np.arange(-2, 10, 1e-3)
+    share = 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
     ratio = [evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))]
     density = [evidence.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
-    assert np.dot(ratio, density) * 1e-3 == pytest.approx(0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3)
+    assert np.dot(ratio, density) * 1e-3 == pytest.approx(
+        0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3
+    )
 
 
 @pytest.mark.parametrize("uncertain", [0.0, 0.01])
 def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) -> None:
     """J' W J of the tangents' derivatives by rotation and log focal length, by differences; in the interpreter."""
     plain = interpreted("estimator.identification.stars.evidence")
-    detections, rows, R = seen(1.01 * TANGENT[:7]), np.arange(7), TRUTH.as_matrix()
+    detections = seen(1.01 * TANGENT[:7])
+    rows = np.arange(7)
+    R = TRUTH.as_matrix()
     detections.weight[:, 1] *= 0.25
     detections.weight[:, 2] = 0.2 / SIGMA**2
 
@@ -172,8 +209,13 @@ def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) ->
     xx, yy, xy = detections.weight.T
     weights = np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)
     wanted = np.einsum("ink,nkl,jnl->ij", slopes, weights, slopes)
-    count, info = 4 if uncertain else 3, np.zeros((4, 4))
-    ratio, _ = plain._fit(detections._replace(focal_uncertainty=uncertain), SKY, R, 1.0, rows, rows, info)
-    np.testing.assert_allclose(info[:count, :count], wanted[:count, :count], rtol=0, atol=1e-6 * np.abs(wanted).max())
+    count = 4 if uncertain else 3
+    info = np.zeros((4, 4))
+    ratio, _ = plain._fit(
+        detections._replace(focal_uncertainty=uncertain), SKY, R, 1.0, rows, rows, info
+    )
+    np.testing.assert_allclose(
+        info[:count, :count], wanted[:count, :count], rtol=0, atol=1e-6 * np.abs(wanted).max()
+    )
     assert (info[count:] == 0).all()
     assert ratio == pytest.approx(1.01 if uncertain else 1.0, abs=1e-4)

@@ -61,7 +61,9 @@ coordinate = st.one_of(st.floats(-1, 1), st.sampled_from([-1.0, 0.0, 1.0]))
 def test_the_nearest_star_is_that_of_a_tree(x: float, y: float, z: float, gate: float) -> None:
     where = np.array([x, y, z]) + 1e-3
     where /= np.linalg.norm(where)
-    star, chord2 = sky_index.nearest(SKY.vectors, SKY.cell_first, SKY.cell_star, SKY.side, *where, gate)
+    star, chord2 = sky_index.nearest(
+        SKY.vectors, SKY.cell_first, SKY.cell_star, SKY.side, *where, gate
+    )
     chord, expected = cKDTree(VECTORS).query(where)
     inside = chord < gate
     assert star == (expected if inside else -1)
@@ -70,20 +72,25 @@ def test_the_nearest_star_is_that_of_a_tree(x: float, y: float, z: float, gate: 
 
 def test_a_sky_without_a_pattern_is_refused() -> None:
     in_a_row = Rotation.from_rotvec([[0, 0, 0], [0, 0.15, 0], [0, 0.3, 0]]).apply([0.0, 0.0, 1.0])
-    with pytest.raises(ImageError, match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more"):
+    with pytest.raises(
+        ImageError, match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more"
+    ):
         sky_index.build(in_a_row, MAG[:3], WIDE_RAD)
 
 
 @pytest.mark.parametrize(("share", "brighter"), [(0.5, False), (0.5, True), (0.7, False)])
 def test_false_lights_may_be_the_brightest(share: float, brighter: bool) -> None:
     """Half of the lights false and brighter than any star, or two in three: the search begins with false ones alone."""
-    rng, solved = np.random.default_rng(14), 0
+    rng = np.random.default_rng(14)
+    solved = 0
     for _ in range(40):
         truth = Rotation.random(rng=rng)
         tangent, mag, row = observe(truth, rng)
         false = round(len(row) * share / (1 - share))
         lights = np.vstack([tangent, rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (false, 2))])
-        false_mag = rng.uniform(mag.min() - 2, mag.min() - 1, false) if brighter else rng.choice(MAG, false)
+        false_mag = (
+            rng.uniform(mag.min() - 2, mag.min() - 1, false) if brighter else rng.choice(MAG, false)
+        )
         shown = np.concatenate([mag, false_mag])
         order = np.argsort(shown)
         solution = solve(detections_of(lights[order], shown[order]))
@@ -99,16 +106,22 @@ def test_false_lights_may_be_the_brightest(share: float, brighter: bool) -> None
 
 def test_lights_that_are_worse_along_than_across_count_as_they_are() -> None:
     """Smeared stars: about y, which errors along x turn, the attitude errs as it says, and about x too."""
-    rng, scaled = np.random.default_rng(12), []
-    along, across = 4 * SIGMA, SIGMA / 4
+    rng = np.random.default_rng(12)
+    scaled = []
+    along = 4 * SIGMA
+    across = SIGMA / 4
     for _ in range(150):
         truth = Rotation.random(rng=rng)
         tangent, mag, _ = observe(truth, rng, sigma=0.0)
         tangent = tangent + rng.standard_normal(tangent.shape) * [along, across]
         detections = detections_of(tangent, mag, along)
-        solution = solve(detections._replace(weight=np.tile([along**-2, across**-2, 0], (len(mag), 1))))
+        solution = solve(
+            detections._replace(weight=np.tile([along**-2, across**-2, 0], (len(mag), 1)))
+        )
         if len(solution.star):
-            scaled.append(attitude_error(solution, truth) / np.sqrt(np.diag(solution.covariance_rad2)))
+            scaled.append(
+                attitude_error(solution, truth) / np.sqrt(np.diag(solution.covariance_rad2))
+            )
     assert len(scaled) > 140
     # A mean square of 140 numbers is 1 to 12 %; that of equal weights would be 2 and 1/8.
     np.testing.assert_allclose(np.mean(np.square(scaled), axis=0), 1, rtol=0, atol=0.4)
@@ -128,7 +141,8 @@ def test_true_lights_give_the_true_attitude_and_names() -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_half_of_the_lights_may_be_false(known: bool) -> None:
-    rng, solved = np.random.default_rng(3), 0
+    rng = np.random.default_rng(3)
+    solved = 0
     for _ in range(40):
         truth = Rotation.random(rng=rng)
         tangent, mag, _ = observe(truth, rng)
@@ -141,7 +155,9 @@ def test_half_of_the_lights_may_be_false(known: bool) -> None:
         shown = shown[order] if known else np.full(14, np.nan)
         solution = solve(detections_of(np.concatenate([tangent[:7], strays])[order], shown))
         # Seven stars of 4": a wrong attitude would be tens of degrees off.
-        solved += len(solution.star) > 0 and np.linalg.norm(attitude_error(solution, truth)) < 50 * SIGMA
+        solved += (
+            len(solution.star) > 0 and np.linalg.norm(attitude_error(solution, truth)) < 50 * SIGMA
+        )
     assert solved == 40
 
 
@@ -150,14 +166,18 @@ def test_half_of_the_lights_may_be_false(known: bool) -> None:
 def test_the_covariance_is_true(zoom: float) -> None:
     """NEES of 300 attitudes; with the focal length unknown to 5 % that of the zoom's own error too."""
     rng = np.random.default_rng(4)
-    nees, focal_errors = [], []
+    nees = []
+    focal_errors = []
     for _ in range(300):
-        truth, true_ratio = Rotation.random(rng=rng), 1 + rng.uniform(-zoom, zoom)
+        truth = Rotation.random(rng=rng)
+        true_ratio = 1 + rng.uniform(-zoom, zoom)
         tangent, mag, row = observe(truth, rng, zoom=true_ratio)
         solution = solve(detections_of(tangent, mag, zoom=zoom))
         error = attitude_error(solution, truth)
         nees.append(error @ np.linalg.solve(solution.covariance_rad2, error))
-        focal_errors.append((np.log(solution.focal_ratio / true_ratio)) / zoom_sigma(truth, row, true_ratio))
+        focal_errors.append(
+            (np.log(solution.focal_ratio / true_ratio)) / zoom_sigma(truth, row, true_ratio)
+        )
     # Chi-square of three degrees: mean 3, deviation sqrt(6 / 300) = 0.141; four of them.
     assert np.mean(nees) == pytest.approx(3, abs=0.57)
     # The mean square of 300 normal numbers: deviation sqrt(2 / 300) = 0.082.
@@ -171,7 +191,9 @@ def zoom_sigma(truth: Rotation, row, zoom: float) -> float:
         x, y, z = (Rotation.from_rotvec(p[:3]) * truth).apply(VECTORS[row]).T
         return zoom * np.exp(p[3]) * np.concatenate([x / z, y / z])
 
-    slope = np.column_stack([(model(1e-6 * unit) - model(-1e-6 * unit)) / 2e-6 for unit in np.eye(4)])
+    slope = np.column_stack(
+        [(model(1e-6 * unit) - model(-1e-6 * unit)) / 2e-6 for unit in np.eye(4)]
+    )
     return SIGMA * float(np.sqrt(np.linalg.inv(slope.T @ slope)[3, 3]))
 
 
@@ -197,7 +219,8 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     """Stars that stand twice in the catalog are two attitudes: beyond chance, not decisive, and refused."""
     rng = np.random.default_rng(7)
     sparse, sparse_mag = random_sky(300, 8)
-    once, loose = sky_index.build(sparse, sparse_mag, WIDE_RAD), 5e-4
+    once = sky_index.build(sparse, sparse_mag, WIDE_RAD)
+    loose = 5e-4
     dex = np.inf
     while not search.ACCEPT_DEX < dex < search.DECISIVE_DEX:
         truth = Rotation.random(rng=rng)
@@ -205,10 +228,8 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
         dex = solve(detections_of(tangent, mag, sigma=loose), once).dex if len(row) > 3 else np.inf
     copied = Rotation.from_euler("xyz", [70, 20, 30], degrees=True).apply(sparse[row])
     clear = np.linalg.norm(sparse - copied.mean(axis=0), axis=1) > 0.2
-    vectors, both = (
-        np.concatenate([sparse[clear], copied]),
-        np.concatenate([sparse_mag[clear], sparse_mag[row]]),
-    )
+    vectors = np.concatenate([sparse[clear], copied])
+    both = np.concatenate([sparse_mag[clear], sparse_mag[row]])
     order = np.argsort(both, kind="stable")
     twice = sky_index.build(vectors[order], both[order], WIDE_RAD)
     assert not len(solve(detections_of(tangent, mag, sigma=loose), twice).star)
@@ -231,15 +252,23 @@ def test_one_light_of_another_brightness_costs_little() -> None:
 def test_the_normal_equations_are_solved(seed: int) -> None:
     rng = np.random.default_rng(seed)
     half = rng.normal(size=(4, 4))
-    matrix, right = half @ half.T + 0.1 * np.eye(4), rng.normal(size=4)
-    np.testing.assert_allclose(matrix @ evidence.cholesky_solve(matrix.copy(), right), right, rtol=0, atol=1e-10)
+    matrix = half @ half.T + 0.1 * np.eye(4)
+    right = rng.normal(size=4)
+    np.testing.assert_allclose(
+        matrix @ evidence.cholesky_solve(matrix.copy(), right), right, rtol=0, atol=1e-10
+    )
 
 
 @settings(deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([None, [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([None, [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]]),
+)
 def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
     """Half turns, where the scalar part vanishes, as well."""
-    rotation = Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
+    rotation = (
+        Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
+    )
     again = Rotation.from_quat(quaternion_xyzw(rotation.as_matrix()))
     assert (again * rotation.inv()).magnitude() < 1e-14 * 10
 
@@ -247,7 +276,9 @@ def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
 # ---- steps of the search, by the interpreter
 
 PLAIN = interpreted("estimator.identification.stars.search")
-PLACES = np.array([[0.01, 0.02], [-0.05, 0.03], [0.06, -0.04], [-0.02, -0.06], [0.03, 0.0], [0.012, 0.018]])
+PLACES = np.array(
+    [[0.01, 0.02], [-0.05, 0.03], [0.06, -0.04], [-0.02, -0.06], [0.03, 0.0], [0.012, 0.018]]
+)
 UNEQUAL = np.array([1, 2, 3, 1.5, 1, 1]) * SIGMA
 
 
@@ -259,18 +290,28 @@ def unequal(zoom: float = 0.0) -> evidence.Detections:
 
 def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     """3.5 standard deviations along the worst axis: the pair's middle and direction are fitted, all have noise."""
-    rng, a, b = np.random.default_rng(80), 0, 4  # of equal errors: others' are correlated with the middle's
+    # of equal errors: others' are correlated with the middle's
+    rng = np.random.default_rng(80)
+    a = 0
+    b = 4
     seen = PLACES[:, 0] + 1j * PLACES[:, 1]
-    noisy = seen + UNEQUAL * (rng.standard_normal((20_000, 6)) + 1j * rng.standard_normal((20_000, 6)))
+    noisy = seen + UNEQUAL * (
+        rng.standard_normal((20_000, 6)) + 1j * rng.standard_normal((20_000, 6))
+    )
     turn = (
-        (noisy[:, b] - noisy[:, a]) / np.abs(noisy[:, b] - noisy[:, a]) / (seen[b] - seen[a]) * abs(seen[b] - seen[a])
+        (noisy[:, b] - noisy[:, a])
+        / np.abs(noisy[:, b] - noisy[:, a])
+        / (seen[b] - seen[a])
+        * abs(seen[b] - seen[a])
     )
     middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
     errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
     gates = PLAIN.pair_gates(unequal(), a, b)
     for n in (1, 2, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
-        assert gates[n] == pytest.approx(3.5 * np.sqrt(worst2), rel=0.02)  # 4 deviations of a variance of 20,000
+        assert gates[n] == pytest.approx(
+            3.5 * np.sqrt(worst2), rel=0.02
+        )  # 4 deviations of a variance of 20,000
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.02])
@@ -285,10 +326,14 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
         seen = np.arccos(rays[0] @ rays[1])
         assert chord == pytest.approx(2 * np.sin(seen / 2), rel=1e-9)
         assert gate == pytest.approx(3.5 * np.hypot(UNEQUAL[a], UNEQUAL[b]), rel=1e-9)
-        possible = np.flatnonzero((angle > seen / (1 + zoom) - gate) & (angle < seen / (1 - zoom) + gate))
+        possible = np.flatnonzero(
+            (angle > seen / (1 + zoom) - gate) & (angle < seen / (1 - zoom) + gate)
+        )
         assert begin <= possible.min()
         assert possible.max() < end
-        outside = angle[begin:end] - np.clip(angle[begin:end], seen / (1 + zoom) - gate, seen / (1 - zoom) + gate)
+        outside = angle[begin:end] - np.clip(
+            angle[begin:end], seen / (1 + zoom) - gate, seen / (1 - zoom) + gate
+        )
         assert np.abs(outside).max() <= SKY.bin_rad
 
 
@@ -302,20 +347,28 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
 
 def test_pairs_come_by_length_and_rarity_and_none_twice() -> None:
     detections = unequal()
-    length, rarity = PLAIN._pair_lengths(detections), PLAIN._rarity(detections, SKY)
+    length = PLAIN._pair_lengths(detections)
+    rarity = PLAIN._rarity(detections, SKY)
     least = 0.2 * np.sqrt((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))
     a, b = np.triu_indices(6, 1)
     distance = np.linalg.norm(PLACES[a] - PLACES[b], axis=1)
-    np.testing.assert_allclose(length[a, b][distance >= least], distance[distance >= least], rtol=1e-12)
+    np.testing.assert_allclose(
+        length[a, b][distance >= least], distance[distance >= least], rtol=1e-12
+    )
     short = np.flatnonzero(distance < least)
     assert len(short) > 1
     assert (length[a, b][short] > 100 * least).all()
-    assert (np.argsort(length[a, b][short]) == np.argsort(-distance[short])).all()  # the shorter, the later
+    assert (
+        np.argsort(length[a, b][short]) == np.argsort(-distance[short])
+    ).all()  # the shorter, the later
     for n in range(5):  # within four deviations of the magnitude
         share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
-        assert rarity[n] == pytest.approx(share, rel=0.35)  # the density at the middle, over a range of two magnitudes
+        assert rarity[n] == pytest.approx(
+            share, rel=0.35
+        )  # the density at the middle, over a range of two magnitudes
     assert rarity[5] == 1
-    tried, costs = np.zeros((6, 6), bool), []
+    tried = np.zeros((6, 6), bool)
+    costs = []
     for _ in range(15):
         pair = PLAIN._next_pair(length, tried, rarity)
         assert not tried[pair]
@@ -330,12 +383,17 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     near = np.array([[0.01, 0.004], [-0.008, -0.002]])
     detections = detections_of(near, [np.nan, np.nan], zoom=zoom)
     rays = np.column_stack([near, np.ones(2)])
-    sky = sky_index.build_without_pairs(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.array([1.0, 2.0]))
-    info, both = np.zeros((4, 4)), np.arange(2)
+    sky = sky_index.build_without_pairs(
+        rays / np.linalg.norm(rays, axis=1, keepdims=True), np.array([1.0, 2.0])
+    )
+    info = np.zeros((4, 4))
+    both = np.arange(2)
     evidence._fit(detections, sky, np.eye(3), 1.0, both, both, info)
     count = 4 if zoom else 3
     volume = 8 * np.pi**2 * (2 * zoom if zoom else 1)
-    wanted = np.log10(np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume)
+    wanted = np.log10(
+        np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume
+    )
     assert PLAIN.attitude_dex(detections, 0, 1) == pytest.approx(wanted, abs=1e-3)
 
 
@@ -364,7 +422,9 @@ def test_the_quick_check_stops_as_soon_as_it_knows(
     assert order.tolist() == [2, 3, 4, 5]
     assert PLAIN.other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
-    found = PLAIN.quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
+    found = PLAIN.quick_check(
+        places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses
+    )
     assert found == (lookups, fits)
 
 
@@ -375,17 +435,22 @@ def test_all_lights_must_confirm_what_the_brightest_tell(limit_mag: float, match
     truth = Rotation.random(rng=rng)
     tangent, mag, _ = observe(truth, rng)
     false = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (100, 2))
-    lights = detections_of(np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0)))
+    lights = detections_of(
+        np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0))
+    )
     few = changed(lights, 4, 1.0, 0.0)
     candidate = evidence.evaluate(few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf)
     assert candidate.dex > search.ACCEPT_DEX
-    found = search.fit_to_all(lights._replace(limit_mag=limit_mag), SKY, candidate, search.ACCEPT_DEX, True, False)
+    found = search.fit_to_all(
+        lights._replace(limit_mag=limit_mag), SKY, candidate, search.ACCEPT_DEX, True, False
+    )
     assert len(found.star) == matches
 
 
 def test_the_limiting_magnitude_is_that_of_the_median_light_of_all() -> None:
     lens = Sensor(1000.0, (0.0, 0.0), (0.0,) * 5, FIELD, 20.0, 0.25)
-    sigma_px, flux = np.full(5, 0.1), np.array([900.0, 500.0, 300.0, 200.0, 100.0])
+    sigma_px = np.full(5, 0.1)
+    flux = np.array([900.0, 500.0, 300.0, 200.0, 100.0])
     lights = detections_module.detections_of(
         FlatCentroids(np.eye(5, 2), sigma_px, flux, NO_SPREAD, sigma_px), lens, 0.0
     )

@@ -37,7 +37,9 @@ GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
         (replace(GOOD, stars=3, overexposed=3), 0.002, False, True),
     ],
 )
-def test_each_branch_of_the_chart(seen: Observation, change_s: float, saturated: bool, no_stars: bool) -> None:
+def test_each_branch_of_the_chart(
+    seen: Observation, change_s: float, saturated: bool, no_stars: bool
+) -> None:
     after = step(Exposure(0.03), seen, CONTROL)
     # Microseconds are whole; their sum is not, in binary.
     assert after.time_s == pytest.approx(0.03 + change_s, abs=1e-12)
@@ -52,9 +54,14 @@ def run(start_s: float, seen: Observation, count: int, control: Control) -> list
 
 
 def test_it_stops_at_either_limit_and_comes_back() -> None:
-    dark, bright = replace(GOOD, stars=0), replace(GOOD, mean_dn=4000.0)
-    assert run(0.0471, dark, 4, CONTROL) == pytest.approx([0.0471, 0.0491, 0.05, 0.05, 0.05], abs=1e-12)
-    assert run(0.0031, bright, 4, CONTROL) == pytest.approx([0.0031, 0.0011, 1e-5, 1e-5, 1e-5], abs=1e-12)
+    dark = replace(GOOD, stars=0)
+    bright = replace(GOOD, mean_dn=4000.0)
+    assert run(0.0471, dark, 4, CONTROL) == pytest.approx(
+        [0.0471, 0.0491, 0.05, 0.05, 0.05], abs=1e-12
+    )
+    assert run(0.0031, bright, 4, CONTROL) == pytest.approx(
+        [0.0031, 0.0011, 1e-5, 1e-5, 1e-5], abs=1e-12
+    )
     assert run(1e-5, dark, 2, CONTROL) == pytest.approx([1e-5, 0.00201, 0.00401], abs=1e-12)
     widest = Control(100.0, longest_s=10.0, step_s=2.0)
     assert run(5.0, dark, 4, widest) == pytest.approx([5.0, 7.0, 9.0, 10.0, 10.0])
@@ -96,7 +103,9 @@ def test_objects_with_more_than_one_saturated_pixel_are_counted(kind: str) -> No
     image[20:24, 30] = 255  # four, of which the box holds two
     image[39, 59] = image[38, 59] = 255  # two, in the corner
     image[30, 2:9] = 255  # seven, in no object
-    boxes = np.array([[4, 4, 6, 6], [19, 9, 23, 11], [29, 18, 31, 21], [58, 37, 59, 39], [50, 0, 52, 2]])
+    boxes = np.array(
+        [[4, 4, 6, 6], [19, 9, 23, 11], [29, 18, 31, 21], [58, 37, 59, 39], [50, 0, 52, 2]]
+    )
     seen = observe(image, boxes, 255.0, CONTROL)
     assert (seen.stars, seen.overexposed) == (5, 3)
     assert seen.mean_dn == pytest.approx(image.astype(float).mean(), rel=1e-12)
@@ -132,7 +141,9 @@ def flown(
     lab: Lab, glare_e_s: list[float], start_s: float, control: Control
 ) -> tuple[list[Exposure], list[Observation]]:
     """Frame after frame: taken with the exposure that the chart asked for, under the glare of its moment."""
-    state, states, seen = Exposure(start_s), [], []
+    state = Exposure(start_s)
+    states = []
+    seen = []
     saturation = saturation_dn(lab.scene.camera.detector)
     for index, glare in enumerate(glare_e_s):
         frame, _ = render_at_rest(exposed(lit(lab, glare), state.time_s).camera, lab.start, index)

@@ -32,7 +32,9 @@ ANY = some.floats(width=64)
 KINDS = some.sampled_from(["u2", "f8", ">f8"])
 IMAGES = KINDS.flatmap(lambda kind: arrays(kind, (30, 40), fill=some.just(0)))
 PIXELS = arrays("f8", some.tuples(some.integers(0, 12), some.just(2)), elements=ANY)
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of overflow: what counts is the answer
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning"
+)  # of overflow: what counts is the answer
 
 
 def one_line(error: Exception) -> None:
@@ -53,7 +55,9 @@ def tracker(stars: catalog.StarCatalog) -> StarTracker:
 @pytest.mark.parametrize("detector", DETECTORS)
 @BRIEF
 @given(image=IMAGES, centroider=some.sampled_from(sorted(CENTROIDERS)))
-def test_any_image_gives_centroids_or_one_line(detector: str, centroider: str, image: NDArray) -> None:
+def test_any_image_gives_centroids_or_one_line(
+    detector: str, centroider: str, image: NDArray
+) -> None:
     try:
         blobs = DETECTORS[detector](image, 5.0, 3, 100, FramePriors(None, np.inf))
         seen = CENTROIDERS[centroider](image, blobs, 1.0, FramePriors(None, np.inf))
@@ -77,7 +81,9 @@ def test_no_image_of_noise_has_an_attitude(tracker: StarTracker, image: NDArray)
 @pytest.mark.long
 @BRIEF
 @given(xy_px=PIXELS, data=some.data())
-def test_no_lights_of_noise_have_an_attitude(tracker: StarTracker, xy_px: NDArray, data: some.DataObject) -> None:
+def test_no_lights_of_noise_have_an_attitude(
+    tracker: StarTracker, xy_px: NDArray, data: some.DataObject
+) -> None:
     sigma_px, flux = (data.draw(arrays("f8", len(xy_px), elements=ANY)) for _ in range(2))
     try:
         assert not tracker.solve_centroids(Centroids(xy_px, sigma_px, flux)).solved
@@ -89,7 +95,9 @@ def test_no_lights_of_noise_have_an_attitude(tracker: StarTracker, xy_px: NDArra
 @pytest.mark.parametrize("solver", SOLVERS)
 @BRIEF
 @given(count=some.integers(0, 6), data=some.data())
-def test_any_directions_give_a_rotation_or_one_line(solver: str, count: int, data: some.DataObject) -> None:
+def test_any_directions_give_a_rotation_or_one_line(
+    solver: str, count: int, data: some.DataObject
+) -> None:
     cam, ref = (data.draw(arrays("f8", (count, 3), elements=ANY)) for _ in range(2))
     sigma_rad = data.draw(arrays("f8", count, elements=ANY))
     try:
@@ -119,9 +127,13 @@ def test_any_pixels_and_lens_give_directions_of_their_shape(xy_px: NDArray, k1: 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("count", "seed"), [(30, 1), pytest.param(5000, 3, marks=pytest.mark.long)], ids=["some", "many"]
+    ("count", "seed"),
+    [(30, 1), pytest.param(5000, 3, marks=pytest.mark.long)],
+    ids=["some", "many"],
 )
-def test_hostile_pictures_are_refused(monkeypatch: pytest.MonkeyPatch, count: int, seed: int) -> None:
+def test_hostile_pictures_are_refused(
+    monkeypatch: pytest.MonkeyPatch, count: int, seed: int
+) -> None:
     """No attitude but a true one, no exception, no second over two a megapixel, no eleventh frame of memory."""
     monkeypatch.setattr(hostile, "SEARCHED", 0.0)  # at all focal lengths: see the benchmark
     told = hostile.judged(count, seed)

@@ -20,7 +20,9 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
 
 CAMERA = Camera.from_fov(4056, 3040, np.radians(22))  # 20 arcseconds a pixel
-NOISE_PX, BRIGHT_PX, FIELDS = 0.05, 0.0115, 100
+NOISE_PX = 0.05
+BRIGHT_PX = 0.0115
+FIELDS = 100
 OFF_RAD = 2.2 * ARCSEC_RAD
 
 
@@ -35,7 +37,8 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
     nees = []
     for seed in range(FIELDS):
         rng = np.random.default_rng([25, seed])
-        truth, stars = Rotation.random(rng=rng), tracker.stars
+        truth = Rotation.random(rng=rng)
+        stars = tracker.stars
         xy_px = np.nan_to_num(CAMERA.pixels(truth.apply(stars.vectors)), nan=-1e9)
         star = np.flatnonzero(CAMERA.contains(xy_px))
         sigma_px = np.full(len(star), NOISE_PX)
@@ -43,7 +46,9 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
         noisy_px = xy_px[star] + sigma_px[:, None] * rng.standard_normal((len(star), 2))
         azimuth = rng.uniform(0, 2 * np.pi)
         noisy_px[0] += OFF_RAD * CAMERA.focal_px * np.array([np.cos(azimuth), np.sin(azimuth)])
-        answer = tracker.solve_centroids(Centroids(noisy_px, sigma_px, 10 ** (-0.4 * stars.v_mag[star])))
+        answer = tracker.solve_centroids(
+            Centroids(noisy_px, sigma_px, 10 ** (-0.4 * stars.v_mag[star]))
+        )
         if answer.cam_from_ref is not None:
             error = (answer.cam_from_ref * truth.inv()).as_rotvec()
             nees.append(error @ np.linalg.solve(answer.covariance_rad2, error))
@@ -55,7 +60,8 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
 @given(seed=some.integers(0, 10**6))
 def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    truth, stars = Rotation.random(rng=rng), tracker.stars
+    truth = Rotation.random(rng=rng)
+    stars = tracker.stars
     xy_px = np.nan_to_num(CAMERA.pixels(truth.apply(stars.vectors)), nan=-1e9)
     star = np.flatnonzero(CAMERA.contains(xy_px))
     noise_px = 0.5  # 10 arcseconds
@@ -82,14 +88,17 @@ def test_the_information_holds_each_weight_at_its_axes(seed: int) -> None:
 @given(seed=some.integers(0, 10**6), count=some.integers(4, 12))
 def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    jacobian, residual = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
+    jacobian = rng.standard_normal((count, 2, 3))
+    residual = rng.standard_normal((count, 2))
     root = rng.standard_normal((count, 2, 2)) + 2 * np.eye(2)
     information = root @ np.swapaxes(root, 1, 2)
 
     def fit(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         weighted = np.swapaxes(jacobian[rows], 1, 2) @ information[rows]
         normal = np.sum(weighted @ jacobian[rows], axis=0)
-        return np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residual[rows])), np.linalg.inv(normal)
+        return np.linalg.solve(
+            normal, np.einsum("nij,nj->i", weighted, residual[rows])
+        ), np.linalg.inv(normal)
 
     every = np.arange(count)
     at_best = residual - jacobian @ fit(every)[0]
@@ -97,16 +106,22 @@ def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int)
     for k in range(count):
         step, covariance = fit(np.delete(every, k))
         assert alone[k] == pytest.approx(residual[k] - jacobian[k] @ step, rel=1e-3, abs=1e-3)
-        assert spread[k] == pytest.approx(jacobian[k] @ covariance @ jacobian[k].T, rel=1e-3, abs=1e-6)
+        assert spread[k] == pytest.approx(
+            jacobian[k] @ covariance @ jacobian[k].T, rel=1e-3, abs=1e-6
+        )
 
 
 @law(companions.mean_information)
 @given(sigma=some.floats(0.02, 2.0), off=some.floats(0.0, 20.0), spread=some.floats(0.0, 2.0))
-def test_a_star_loses_information_only_by_what_companions_explain(sigma: float, off: float, spread: float) -> None:
+def test_a_star_loses_information_only_by_what_companions_explain(
+    sigma: float, off: float, spread: float
+) -> None:
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
     own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
     residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = companions.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[0]
+    mean = companions.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[
+        0
+    ]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()
@@ -122,8 +137,10 @@ def test_shares_are_those_of_the_catalogs() -> None:
     """Hipparcos' entries against the center of light of Gaia's stars: shares beyond 0.5 and 1.5 seconds of arc."""
     entries = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
     when = catalog.on_earth(catalog.utc("2012-06-22T21:00"))
-    sky, seen = catalog.read(CATALOGS / "gaia_v8.0.ecsv"), catalog.apparent(entries, when)
-    stars, flux = catalog.apparent(sky, when), 10 ** (-0.4 * sky.v_mag)
+    sky = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
+    seen = catalog.apparent(entries, when)
+    stars = catalog.apparent(sky, when)
+    flux = 10 ** (-0.4 * sky.v_mag)
     off_arcsec = []
     for vector in seen:
         near = np.flatnonzero(stars @ vector > np.cos(40 * ARCSEC_RAD))

@@ -48,7 +48,9 @@ def seen_through(
     rays = CAMERA.rays(rng.uniform(0, [639, 479], (count, 2)))
     lab_from_body = body_from_lab.inv()
     origin = lab_from_body.apply(arm.camera_body_m)
-    places = dome_map.on_surface(lab_from_body.apply(arm.cam_from_body.inv().apply(rays)), origin, surface)
+    places = dome_map.on_surface(
+        lab_from_body.apply(arm.cam_from_body.inv().apply(rays)), origin, surface
+    )
     return replace(surface, id=np.arange(count), position_m=places), rays
 
 
@@ -58,29 +60,42 @@ def even(count: int) -> LedMap:
     z = 1 - (np.arange(count) + 0.5) / count * 0.4
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - z**2)
-    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(0, 0.01, (count, 3))
-    return replace(SPHERE, id=np.arange(count), position_m=1.2 * along / np.linalg.norm(along, axis=1, keepdims=True))
+    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(
+        0, 0.01, (count, 3)
+    )
+    return replace(
+        SPHERE,
+        id=np.arange(count),
+        position_m=1.2 * along / np.linalg.norm(along, axis=1, keepdims=True),
+    )
 
 
 # Surfaces
 
 
 @law(dome_map.on_sphere, dome_map.on_surface, dome_map.project, dome_map.check_lever)
-@given(rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2)))
-def test_rays_meet_the_surface_on_their_way(rng: np.random.Generator, radius_m: float, place_m: Floats) -> None:
+@given(
+    rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2))
+)
+def test_rays_meet_the_surface_on_their_way(
+    rng: np.random.Generator, radius_m: float, place_m: Floats
+) -> None:
     rays = units(rng, 9)
     met = answered(lambda: dome_map.on_sphere(rays, place_m, radius_m))
     assert (met is not None) == (np.linalg.norm(place_m) < radius_m)
     ball = replace(SPHERE, semi_axes_m=np.full(3, radius_m))
     same = dome_map.on_surface(rays, place_m, ball)
     np.testing.assert_allclose(same if met is None else met, same, rtol=0, atol=1e-6)
-    arm, body_from_lab = lever(rng), turn(rng)
+    arm = lever(rng)
+    body_from_lab = turn(rng)
     leds, seen = seen_through(rng, OVAL, arm, body_from_lab, 9)
     on_it = np.sum(((leds.position_m - OVAL.center_m) / OVAL.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(on_it, 1, rtol=0, atol=1e-9)
     pixels = dome_map.project(body_from_lab, leds.position_m, arm, CAMERA)
     np.testing.assert_allclose(CAMERA.rays(pixels), seen, rtol=0, atol=1e-9)
-    far = answered(lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError)
+    far = answered(
+        lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError
+    )
     assert bool(far) == (np.linalg.norm(place_m) < np.linalg.norm(leds.position_m, axis=1).min())
 
 
@@ -94,8 +109,11 @@ def test_rays_meet_the_surface_on_their_way(rng: np.random.Generator, radius_m: 
     off_rad=some.floats(0, 0.05),
     name=some.sampled_from(["rotation_only", "tappe", "ray_on_surface", "pnp"]),
 )
-def test_exact_solves_find_the_truth(rng: np.random.Generator, count: int, off_rad: float, name: str) -> None:
-    arm, truth = lever(rng), turn(rng, 0.4)
+def test_exact_solves_find_the_truth(
+    rng: np.random.Generator, count: int, off_rad: float, name: str
+) -> None:
+    arm = lever(rng)
+    truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
     start = turn(rng, off_rad) * truth
     found, covariance = SOLVERS[name](rays, np.full(count, 1e-4), leds.position_m, leds, arm, start)
@@ -104,12 +122,18 @@ def test_exact_solves_find_the_truth(rng: np.random.Generator, count: int, off_r
 
 
 @law(nearfield.fit_focal_ratio)
-@given(rng=SEEDS, count=some.integers(4, 20), ratio=some.floats(0.85, 1.15), sigma=some.floats(1e-5, 1e-2))
+@given(
+    rng=SEEDS,
+    count=some.integers(4, 20),
+    ratio=some.floats(0.85, 1.15),
+    sigma=some.floats(1e-5, 1e-2),
+)
 def test_a_focal_length_is_fitted_with_the_attitude(
     rng: np.random.Generator, count: int, ratio: float, sigma: float
 ) -> None:
     """Exactly from exact rays, from 2 deg off, whatever the error that all rays have."""
-    arm, truth = lever(rng), turn(rng, 0.4)
+    arm = lever(rng)
+    truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
     seen = CAMERA.zoomed(1 / ratio).rays(CAMERA.pixels(rays))
     start = turn(rng, 0.035) * truth
@@ -119,9 +143,12 @@ def test_a_focal_length_is_fitted_with_the_attitude(
 
 @law(nearfield.fitted_sigma_rad)
 @given(rng=SEEDS, name=some.sampled_from(sorted(SOLVERS)))
-def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(rng: np.random.Generator, name: str) -> None:
+def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(
+    rng: np.random.Generator, name: str
+) -> None:
     """By differences: of a pixel shifted along x and along y, the turn of its ray and the change of its tangents."""
-    pixel, step = rng.uniform([0, 0], [640, 480], (9, 2)), 1e-3
+    pixel = rng.uniform([0, 0], [640, 480], (9, 2))
+    step = 1e-3
     moved = np.array([CAMERA.rays(pixel + step * axis) - CAMERA.rays(pixel) for axis in np.eye(2)])
     turned_rad = np.sqrt(np.sum(moved**2, axis=(0, 2)) / 2)
     expected = np.full(9, step / 900) if name in ("rotation_only", "pnp") else turned_rad
@@ -133,7 +160,8 @@ def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(rng: np.random.G
 @given(rng=SEEDS, name=some.sampled_from(["infinity", "thesis"]))
 def test_the_thesis_s_ways_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
     """Some degrees by the field's few lights, and a light stands on its ray where the slip is put right."""
-    arm, truth = lever(rng), turn(rng, 0.4)
+    arm = lever(rng)
+    truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, SPHERE, arm, truth, 12)
     found, covariance = SOLVERS[name](rays, np.full(12, 1e-4), leds.position_m, leds, arm, truth)
     assert (found * truth.inv()).magnitude() < np.radians(6)
@@ -169,17 +197,25 @@ def eye() -> DomeTracker:
 
 @law(DomeTracker.solve_centroids, search.identify, search.build_detections, dome_tracker.led_pairs)
 @given(rng=SEEDS, false=some.integers(0, 4))
-def test_lights_are_named_as_they_are_or_not_at_all(eye: DomeTracker, rng: np.random.Generator, false: int) -> None:
+def test_lights_are_named_as_they_are_or_not_at_all(
+    eye: DomeTracker, rng: np.random.Generator, false: int
+) -> None:
     truth = turn(rng, 0.3)
     px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
     star = np.flatnonzero(CAMERA.contains(px, 3))
-    xy = np.concatenate([px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))])
+    xy = np.concatenate(
+        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+    )
     star = np.concatenate([star, np.full(false, -1)])
     told = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
     truth_cam = eye.lever.cam_from_body * truth
     assert not told.solved or (told.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
-    assert not told.solved or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
-    rays, sigma = CAMERA.rays(xy), np.full(len(xy), 1e-4)
+    assert (
+        not told.solved
+        or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
+    )
+    rays = CAMERA.rays(xy)
+    sigma = np.full(len(xy), 1e-4)
     dome = index.build_dome_index(eye.leds, eye.lever, CAMERA)
     lights = search.build_detections(rays, sigma, dome)
     np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
@@ -211,15 +247,22 @@ def test_no_lights_of_noise_have_an_attitude_under_a_dome(
 def test_leds_are_named_rightly_at_any_focal_length_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, ratio: float, false: int
 ) -> None:
-    truth, settings = turn(rng, 0.3), replace(eye.settings, identifier="non_dimensional")
+    truth = turn(rng, 0.3)
+    settings = replace(eye.settings, identifier="non_dimensional")
     px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
     star = np.flatnonzero(CAMERA.contains(px, 3))
-    xy = np.concatenate([px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))])
+    xy = np.concatenate(
+        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+    )
     star = np.concatenate([star, np.full(false, -1)])
     camera = CAMERA.zoomed(1 / ratio)
     identify = dome_tracker.non_dimensional(camera, eye.leds, eye.lever, settings)
     match = identify(camera.rays(xy), np.full(len(xy), 1e-4), None)
-    named = np.zeros((0, 2), int) if isinstance(match, str) else np.column_stack([star[match.observed], match.star])
+    named = (
+        np.zeros((0, 2), int)
+        if isinstance(match, str)
+        else np.column_stack([star[match.observed], match.star])
+    )
     assert all(seen in (led, -1) for seen, led in named)
     solved = DomeTracker(camera, eye.leds, eye.lever, settings).solve_centroids(
         Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
@@ -231,7 +274,9 @@ def test_leds_are_named_rightly_at_any_focal_length_or_not_at_all(
 
 @law(DomeTracker.warm_up, slow=True)
 @given(noise=SEEDS)
-def test_a_warm_up_changes_no_answer_under_a_dome(eye: DomeTracker, noise: np.random.Generator) -> None:
+def test_a_warm_up_changes_no_answer_under_a_dome(
+    eye: DomeTracker, noise: np.random.Generator
+) -> None:
     frame = noise.normal(100, 5, (480, 640))
     before = eye.solve(frame).attitude.status
     eye.warm_up()
@@ -254,7 +299,9 @@ def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
 
 @law(index.corner_rays, index.inner_field, index.cap_height)
 @given(rng=SEEDS, factor=some.floats(0.3, 5), margin_rad=some.floats(0, 3))
-def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, margin_rad: float) -> None:
+def test_a_field_holds_its_inner_one(
+    rng: np.random.Generator, factor: float, margin_rad: float
+) -> None:
     corners = index.corner_rays(CAMERA.zoomed(factor))
     (left, right, top, bottom), half = index.inner_field(corners)
     assert 0 < right - left < 2 * half[0]
@@ -266,13 +313,18 @@ def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, ma
 # The claimed error
 
 
-@pytest.mark.parametrize(("led_mm", "lever_mm", "noise_px"), [(0.5, 0.0, 0.5), (0.0, 1.0, 0.5), (0.4, 0.5, 0.2)])
+@pytest.mark.parametrize(
+    ("led_mm", "lever_mm", "noise_px"), [(0.5, 0.0, 0.5), (0.0, 1.0, 0.5), (0.4, 0.5, 0.2)]
+)
 def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
     led_mm: float, lever_mm: float, noise_px: float
 ) -> None:
     """A survey drawn once: over K frames of one attitude the mean error has covariance S + (P - S) / K."""
-    frames, nees, single = 6, [], []
-    arm, body_from_lab = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()), Rotation.from_rotvec([0.1, -0.1, 0.5])
+    frames = 6
+    nees = []
+    single = []
+    arm = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
+    body_from_lab = Rotation.from_rotvec([0.1, -0.1, 0.5])
     dome = even(300)
     px = np.nan_to_num(dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9)
     px = px[CAMERA.contains(px, 3)]
@@ -282,13 +334,17 @@ def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
         position_m = dome.position_m + rng.normal(0, led_mm / 1e3, (len(dome.id), 3))
         camera_m = arm.camera_body_m + rng.normal(0, lever_mm / 1e3, 3)
         leds = replace(dome, position_m=position_m, sigma_m=led_mm / 1e3)
-        tracker = DomeTracker(CAMERA, leds, replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3), settings)
-        noise, flux = np.full(len(px), noise_px), np.linspace(2, 1, len(px))
+        tracker = DomeTracker(
+            CAMERA, leds, replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3), settings
+        )
+        noise = np.full(len(px), noise_px)
+        flux = np.linspace(2, 1, len(px))
         draws_px = px + rng.normal(0, noise_px, (frames, *px.shape))
         found = [tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px]
         assert all(one.solved for one in found)
         errors = np.array([(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found])
-        total, common = found[0].covariance_rad2, found[0].systematic_rad2
+        total = found[0].covariance_rad2
+        common = found[0].systematic_rad2
         mean = errors.mean(axis=0)
         nees.append(mean @ np.linalg.solve(common + (total - common) / frames, mean))
         single.append(errors[0] @ np.linalg.solve(total, errors[0]))
@@ -310,8 +366,11 @@ def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
 def test_a_spread_knows_scale_and_no_shift(
     rng: np.random.Generator, shift: float, scale: float, deviation: Callable[..., Floats]
 ) -> None:
-    value, group, stop = rng.normal(size=40), np.arange(40) % 5, np.arange(40) // 5 % 2
-    one, other = deviation(value, group, stop), deviation(scale * value + shift, group, stop)
+    value = rng.normal(size=40)
+    group = np.arange(40) % 5
+    stop = np.arange(40) // 5 % 2
+    one = deviation(value, group, stop)
+    other = deviation(scale * value + shift, group, stop)
     np.testing.assert_allclose(other, scale * one, rtol=1e-6, atol=0)
     by_numpy = [np.std(value[group == g], ddof=1) for g in range(5)]
     assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
@@ -336,7 +395,13 @@ def test_a_home_catalog_is_of_the_lights_that_were_shown(
     px = dome_map.project(Rotation.identity(), leds.position_m, arm, CAMERA)
     light = rng.uniform(10, 99, 8)
     shown = [
-        Sighting(0, Rotation.identity(), leds.id, px + rng.normal(0, 0.2, px.shape), light + rng.normal(0, 1, 8))
+        Sighting(
+            0,
+            Rotation.identity(),
+            leds.id,
+            px + rng.normal(0, 0.2, px.shape),
+            light + rng.normal(0, 1, 8),
+        )
         for _ in range(frames)
     ]
     told = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
@@ -358,7 +423,9 @@ def test_a_home_catalog_is_of_the_lights_that_were_shown(
     magnitude=NUMBERS,
     position=some.integers(0, 2),
 )
-def test_any_sightings_are_a_catalog_or_refused(led: NDArray, xy: NDArray, magnitude: NDArray, position: int) -> None:
+def test_any_sightings_are_a_catalog_or_refused(
+    led: NDArray, xy: NDArray, magnitude: NDArray, position: int
+) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
     for names in (np.arange(2), np.ravel(np.nan_to_num(led)).clip(-9, 9).astype(np.int64)):
         sighting = Sighting(position, Rotation.identity(), names, xy, magnitude)

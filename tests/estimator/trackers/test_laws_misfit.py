@@ -24,24 +24,32 @@ from estimator.trackers.residuals import misfit
 from estimator.trackers.star_tracker import StarTracker
 
 CAMERA = Camera.from_fov(1024, 780, np.radians(17))
-NOISE_PX, FIELDS = 0.2, 120
+NOISE_PX = 0.2
+FIELDS = 120
 MEAN_SIGMA = np.sqrt(6 / FIELDS)  # of the mean NEES of an honest covariance, 0.22
 
 
 @pytest.fixture(scope="module")
 def tracker() -> StarTracker:
     stars = catalog.brighter_than(catalog.hipparcos(), 6.0)
-    return StarTracker(CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, zero_point_mag=0.0))
+    return StarTracker(
+        CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, zero_point_mag=0.0)
+    )
 
 
-def field(tracker: StarTracker, seed: int, lens: Camera, claimed: float = 1.0) -> tuple[Rotation, Centroids]:
+def field(
+    tracker: StarTracker, seed: int, lens: Camera, claimed: float = 1.0
+) -> tuple[Rotation, Centroids]:
     """A random attitude and its stars' centroids through a lens, whose noise is claimed too small or too great."""
     rng = np.random.default_rng([7, seed])
-    truth, stars = Rotation.random(rng=rng), tracker.stars
+    truth = Rotation.random(rng=rng)
+    stars = tracker.stars
     xy_px = np.nan_to_num(lens.pixels(truth.apply(stars.vectors)), nan=-1e9)
     star = np.flatnonzero(lens.contains(xy_px))
     noisy_px = xy_px[star] + NOISE_PX * rng.standard_normal((len(star), 2))
-    return truth, Centroids(noisy_px, np.full(len(star), claimed * NOISE_PX), 10 ** (-0.4 * stars.v_mag[star]))
+    return truth, Centroids(
+        noisy_px, np.full(len(star), claimed * NOISE_PX), 10 ** (-0.4 * stars.v_mag[star])
+    )
 
 
 def errors_squared(tracker: StarTracker, lens: Camera, claimed: float = 1.0) -> Floats:
@@ -63,13 +71,17 @@ def test_right_model_keeps_its_covariance(tracker: StarTracker) -> None:
     assert stats.kstest(nees, stats.chi2(3).cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("times", [3, *(pytest.param(times, marks=pytest.mark.slow) for times in (2, 5))])
+@pytest.mark.parametrize(
+    "times", [3, *(pytest.param(times, marks=pytest.mark.slow) for times in (2, 5))]
+)
 def test_noise_that_is_claimed_too_small_is_found(tracker: StarTracker, times: int) -> None:
     assert 2 < errors_squared(tracker, CAMERA, 1 / times).mean() < 4.5
 
 
 @pytest.mark.parametrize(
-    "lens", [CAMERA.zoomed(1.003), replace(CAMERA, distortion=(0.15, 0.0, 0.0, 0.0, 0.0))], ids=["focal", "distortion"]
+    "lens",
+    [CAMERA.zoomed(1.003), replace(CAMERA, distortion=(0.15, 0.0, 0.0, 0.0, 0.0))],
+    ids=["focal", "distortion"],
 )
 def test_lens_that_drifted_is_found(tracker: StarTracker, lens: Camera) -> None:
     assert 2 < errors_squared(tracker, lens).mean() < 4
@@ -77,7 +89,8 @@ def test_lens_that_drifted_is_found(tracker: StarTracker, lens: Camera) -> None:
     found = tracker.solve_centroids(centroids).camera
     corners = np.array([[0.0, 0.0], [1023.0, 779.0]])
     lost_px, left_px = (
-        CAMERA.focal_px * np.abs(one.tangents(corners) - lens.tangents(corners)).max() for one in (CAMERA, found)
+        CAMERA.focal_px * np.abs(one.tangents(corners) - lens.tangents(corners)).max()
+        for one in (CAMERA, found)
     )
     assert left_px < 0.5 * lost_px
 
@@ -91,15 +104,22 @@ def test_wider_errors_without_new_matches_need_no_match(
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
     wide = changed(detections, len(centroids), 25.0, 0.0)
     found = search.lost_in_space(wide, tracker.sky, 80, 100_000)
-    R_cam_from_ref, gates = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix(), np.full(len(centroids), 0.01)
+    R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
+    gates = np.full(len(centroids), 0.01)
     hypothesis = evidence.evaluate(detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf)
     kept = centroids.take(hypothesis.observed)
     detections = tracker.detections(kept, tracker.sigma_px(kept))
-    hypothesis = evidence.evaluate(detections, tracker.sky, hypothesis.R_cam_from_ref, 1.0, gates[: len(kept)], -np.inf)
+    hypothesis = evidence.evaluate(
+        detections, tracker.sky, hypothesis.R_cam_from_ref, 1.0, gates[: len(kept)], -np.inf
+    )
     matched = evidence.build_solution(detections, tracker.sky, hypothesis)
-    quick, quick_factor = misfit.widened(matched, hypothesis.R_cam_from_ref, detections, tracker.sky)
+    quick, quick_factor = misfit.widened(
+        matched, hypothesis.R_cam_from_ref, detections, tracker.sky
+    )
     monkeypatch.setattr(evidence, "count_near", lambda *_: 1)
-    slow, slow_factor = misfit.widened.py_func(matched, hypothesis.R_cam_from_ref, detections, tracker.sky)
+    slow, slow_factor = misfit.widened.py_func(
+        matched, hypothesis.R_cam_from_ref, detections, tracker.sky
+    )
     assert len(matched.star) == len(slow.star)
     assert quick_factor == pytest.approx(slow_factor, rel=1e-3)
     assert quick.dex == pytest.approx(slow.dex, abs=1e-2)
@@ -109,7 +129,9 @@ def test_wider_errors_without_new_matches_need_no_match(
 
 @law(misfit.refit, misfit.with_lens, misfit.variance_of, StarTracker.refit, slow=True)
 @given(seed=some.integers(0, 10**6), claimed=some.floats(0.2, 3.0))
-def test_no_covariance_is_less_than_the_model_s(tracker: StarTracker, seed: int, claimed: float) -> None:
+def test_no_covariance_is_less_than_the_model_s(
+    tracker: StarTracker, seed: int, claimed: float
+) -> None:
     _, centroids = field(tracker, seed, CAMERA, claimed)
     answer = tracker.solve_centroids(centroids)
     if answer.match is not None:

@@ -38,7 +38,9 @@ def tracker() -> StarTracker:
     return StarTracker(WIDE, stars, stars.vectors, SETTINGS)
 
 
-def star_frame(tracker: StarTracker, seed: int, rate_deg_s: Floats = RATE_DEG_S) -> tuple[Moving, Centroids]:
+def star_frame(
+    tracker: StarTracker, seed: int, rate_deg_s: Floats = RATE_DEG_S
+) -> tuple[Moving, Centroids]:
     """A field of the catalog before a turning camera, and its exact centroids."""
     truth = Rotation.random(rng=np.random.default_rng(seed))
     _, xy_px = tracker.field_matcher.in_field(WIDE, truth)
@@ -57,7 +59,9 @@ def error_arcsec(attitude: Attitude, seen: Moving) -> Floats:
 
 
 def test_a_rolling_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker) -> None:
-    blind = StarTracker(replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS)
+    blind = StarTracker(
+        replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
+    )
     signs = 0
     for seed in range(6):
         seen, found = star_frame(tracker, seed)
@@ -78,18 +82,26 @@ def test_a_rolling_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker
 def test_an_uncorrected_shear_turns_the_field_by_what_it_should(tracker: StarTracker) -> None:
     """A shear s of x by y is best met by the roll -s sum(y^2) / sum(x^2 + y^2): of a slow rate, which still solves."""
     slow_deg_s = np.array([0.0, 0.05, 0.0])
-    blind = StarTracker(replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, Settings())
+    blind = StarTracker(
+        replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, Settings()
+    )
     for seed in range(3):
         seen, found = star_frame(tracker, seed, slow_deg_s)
         attitude = blind.solve_centroids(found)
         assert attitude.match is not None
         x, y = (seen.still_px[attitude.match.observed] - WIDE.center_px).T
-        x, y = x - x.mean(), y - y.mean()
+        x = x - x.mean()
+        y = y - y.mean()
         shear = -np.radians(0.05) * WIDE.focal_px * WIDE.row_time_s
         expected = -shear * np.sum(y**2) / np.sum(x**2 + y**2) / ARCSEC_RAD
         assert abs(expected) > 10
         assert error_arcsec(attitude, seen)[2] == pytest.approx(expected, rel=0.1)
-        assert np.linalg.norm(error_arcsec(tracker.solve_centroids(found, exposure_s=EXPOSURE_S), seen)) < 0.1
+        assert (
+            np.linalg.norm(
+                error_arcsec(tracker.solve_centroids(found, exposure_s=EXPOSURE_S), seen)
+            )
+            < 0.1
+        )
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -105,7 +117,11 @@ def test_of_two_signs_the_one_with_more_evidence_is_kept(
         tried.append(rate)
         chance = -38.0 if rate.rate_rad_s @ seen.rate_rad_s > 0 else -7.0
         return Attitude(
-            "solved", seen.cam_from_ref, np.eye(3), StarMatch(*2 * [np.arange(7)], seen.cam_from_ref, chance), rate=rate
+            "solved",
+            seen.cam_from_ref,
+            np.eye(3),
+            StarMatch(*2 * [np.arange(7)], seen.cam_from_ref, chance),
+            rate=rate,
         )
 
     monkeypatch.setattr(rolling_shutter, "_solve_with", both_solve)
@@ -126,11 +142,16 @@ def test_rows_alone_tell_a_slow_rate_with_its_sign(tracker: StarTracker) -> None
 
 
 def test_a_global_frame_s_rate_has_the_sign_that_a_gyro_tells(tracker: StarTracker) -> None:
-    still = StarTracker(replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS)
+    still = StarTracker(
+        replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
+    )
     seen, _ = star_frame(tracker, 1)
     found = replace(seen, camera=still.camera).centroids()
     rough = RateEstimate(1.2 * seen.rate_rad_s, 1e-4 * np.eye(3))
-    told, open_sign = (still.solve_centroids(found, exposure_s=EXPOSURE_S, rate=rate).rate for rate in (rough, None))
+    told, open_sign = (
+        still.solve_centroids(found, exposure_s=EXPOSURE_S, rate=rate).rate
+        for rate in (rough, None)
+    )
     assert told is not None
     assert open_sign is not None
     assert (told.sign_known, open_sign.sign_known) == (True, False)
@@ -143,18 +164,27 @@ def test_a_global_frame_s_rate_has_the_sign_that_a_gyro_tells(tracker: StarTrack
 
 def test_leds_of_a_rolling_frame_are_solved_at_the_middle_row_s_time() -> None:
     """On a dome of two radii, with the camera on its lever arm: the images of near LEDs move more."""
-    rng, camera = np.random.default_rng(4), Camera(1600, 1200, 8000.0, (799.5, 599.5), row_time_s=80e-6)
+    rng = np.random.default_rng(4)
+    camera = Camera(1600, 1200, 8000.0, (799.5, 599.5), row_time_s=80e-6)
     cap = Rotation.from_rotvec(np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.zeros(500)]))
     place_m = cap.apply([0.0, 0.0, 1.0]) * rng.uniform(0.95, 1.0, (500, 1))
     lever = Lever(np.array([0.01, -0.02, 0.3]), Rotation.identity())
     leds = LedMap(np.arange(500), place_m, np.zeros(3), np.ones(3))
-    dome = DomeTracker(camera, leds, lever, Settings(identifier="led_pairs", solver="rotation_only"))
+    dome = DomeTracker(
+        camera, leds, lever, Settings(identifier="led_pairs", solver="rotation_only")
+    )
     for seed in range(3):
         truth = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, 0.05, 3))
         xy_px = camera.pixels(truth.apply(place_m) - lever.camera_body_m)
         inside = camera.contains(xy_px, 150.0)
         radius_m = np.linalg.norm(place_m[inside], axis=1)
-        seen = Moving(truth, np.radians([2.0, 3.0, -1.0]), xy_px[inside], Sight(lever.camera_body_m, radius_m), camera)
+        seen = Moving(
+            truth,
+            np.radians([2.0, 3.0, -1.0]),
+            xy_px[inside],
+            Sight(lever.camera_body_m, radius_m),
+            camera,
+        )
         found = seen.centroids()
         for arguments in {"rate": exact(seen.rate_rad_s)}, {"exposure_s": EXPOSURE_S}:
             attitude = dome.solve_centroids(found, **arguments)  # type: ignore[arg-type]
@@ -178,18 +208,30 @@ def test_candidates_hold_the_rate_and_refusals_stay(rng: np.random.Generator) ->
     # Enough lights for streaks, whether or not they are stars.
     seen = replace(seen, still_px=rng.uniform(200, 1000, (20, 2)))
     found = seen.centroids()
-    lights = rolling_shutter.Lights(stars.vectors, np.zeros(3), lambda some, _: tracker.with_errors(some))
+    lights = rolling_shutter.Lights(
+        stars.vectors, np.zeros(3), lambda some, _: tracker.with_errors(some)
+    )
     assert lights.sight.radius_m == pytest.approx(1)
     rates = list(rolling_shutter.candidates(WIDE, lights.sight, found, None, EXPOSURE_S))
     assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one, _ in rates) < 1e-3
     assert not any(one.sign_known for one, _ in rates)
-    slow = list(rolling_shutter.candidates(WIDE, lights.sight, replace(found, streak_px=None), None, EXPOSURE_S))
+    slow = list(
+        rolling_shutter.candidates(
+            WIDE, lights.sight, replace(found, streak_px=None), None, EXPOSURE_S
+        )
+    )
     assert slow[-1][0].rate_rad_s.tolist() == [0, 0, 0]
     gyro = RateEstimate(seen.rate_rad_s, np.eye(3))
-    assert list(rolling_shutter.candidates(WIDE, lights.sight, found, gyro, EXPOSURE_S)) == [(gyro, gyro)]
-    both = list(rolling_shutter.candidates(WIDE, lights.sight, found, replace(gyro, sign_known=False), None))
+    assert list(rolling_shutter.candidates(WIDE, lights.sight, found, gyro, EXPOSURE_S)) == [
+        (gyro, gyro)
+    ]
+    both = list(
+        rolling_shutter.candidates(WIDE, lights.sight, found, replace(gyro, sign_known=False), None)
+    )
     assert_allclose(both[0][0].rate_rad_s, -both[1][0].rate_rad_s, rtol=0, atol=0)
-    refused = rolling_shutter.solve_rolling(WIDE, lights, found, lambda _: Attitude("no"), None, EXPOSURE_S)
+    refused = rolling_shutter.solve_rolling(
+        WIDE, lights, found, lambda _: Attitude("no"), None, EXPOSURE_S
+    )
     assert refused.status == "no"
     assert rolling_shutter.with_streak_rate(refused, found, EXPOSURE_S) is refused
     total = tracker.with_errors(found)

@@ -70,10 +70,18 @@ class World:
     fialho_options,
     AssumptionPool.add,
 )
-@given(rng=SEEDS, name=some.sampled_from(sorted(IDENTIFIERS)), false=some.integers(0, 6), told=some.booleans())
-def test_what_is_identified_is_what_is_there(rng: np.random.Generator, name: str, false: int, told: bool) -> None:
+@given(
+    rng=SEEDS,
+    name=some.sampled_from(sorted(IDENTIFIERS)),
+    false=some.integers(0, 6),
+    told=some.booleans(),
+)
+def test_what_is_identified_is_what_is_there(
+    rng: np.random.Generator, name: str, false: int, told: bool
+) -> None:
     """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
-    world, tolerance_rad = World(rng), 2e-4
+    world = World(rng)
+    tolerance_rad = 2e-4
     seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
     mag = np.concatenate([world.mag[world.star], np.full(false, 6.0)])
     star = np.concatenate([world.star, np.full(false, -1)])
@@ -83,14 +91,18 @@ def test_what_is_identified_is_what_is_there(rng: np.random.Generator, name: str
     match = match or StarMatch(np.arange(len(world.star)), world.star, world.truth, -9.0)
     assert len(set(match.observed.tolist())) == len(match.observed) >= min(4, len(world.star))
     assert match.log10_chance <= -5
-    off = np.linalg.norm(match.cam_from_ref.apply(world.vectors[match.star]) - seen[match.observed], axis=1)
+    off = np.linalg.norm(
+        match.cam_from_ref.apply(world.vectors[match.star]) - seen[match.observed], axis=1
+    )
     assert (off < 3 * tolerance_rad).all()
     assert (match.cam_from_ref * world.truth.inv()).magnitude() < 10 * tolerance_rad
     true = star[match.observed] >= 0
     assert (match.star == star[match.observed])[true].all()
 
 
-@law(pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, to_star_match)
+@law(
+    pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, to_star_match
+)
 @given(
     rng=SEEDS,
     rays=RAYS,
@@ -101,7 +113,8 @@ def test_what_is_identified_is_what_is_there(rng: np.random.Generator, name: str
 def test_directions_of_nothing_are_no_stars(
     rng: np.random.Generator, rays: NDArray, tolerance: float, mag: NDArray, name: str
 ) -> None:
-    world, count = World(rng, 60), len(rays)
+    world = World(rng, 60)
+    count = len(rays)
     for light in (None, mag):
         more = {"max_checks": 100_000, "magnitude": light}
         told = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
@@ -117,10 +130,14 @@ def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, 
     world = World(rng)
     light = 10 ** (-0.4 * world.mag[world.star])
     centroids = Centroids(CAMERA.pixels(world.seen), np.full(len(light), 0.05), light)
-    camera, uncertainty = CAMERA.zoomed(1 / (1 + STEP * steps)), 0.04 if steps else 0.0
-    found = candidates("pyramid", centroids, camera, world.index, uncertainty, 0.05, Settings().base_stars)
+    camera = CAMERA.zoomed(1 / (1 + STEP * steps))
+    uncertainty = 0.04 if steps else 0.0
+    found = candidates(
+        "pyramid", centroids, camera, world.index, uncertainty, 0.05, Settings().base_stars
+    )
     right = (
-        abs(lens.focal_px / CAMERA.focal_px - 1) < 1e-9 and (cam_from_ref * world.truth.inv()).magnitude() < 1e-3
+        abs(lens.focal_px / CAMERA.focal_px - 1) < 1e-9
+        and (cam_from_ref * world.truth.inv()).magnitude() < 1e-3
         for lens, cam_from_ref in found
     )
     assert any(right)
@@ -140,9 +157,12 @@ def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
 @given(rng=SEEDS)
 def test_a_pool_without_assumptions_answers_nothing(rng: np.random.Generator) -> None:
     world = World(rng, 60)
-    known, unknown = world.index, np.full(len(world.seen), np.nan)
+    known = world.index
+    unknown = np.full(len(world.seen), np.nan)
     gates = saa_search.Gates(1e-4, 1e-4, np.inf, 0.0)
-    seen = saa_search.SearchInput(world.seen, unknown, known.vectors, known.magnitude, known.cells, gates)
+    seen = saa_search.SearchInput(
+        world.seen, unknown, known.vectors, known.magnitude, known.cells, gates
+    )
     pool = AssumptionPool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)
     assert pool.log10_chance == 0
     assert pool.best_match() is None
@@ -161,8 +181,12 @@ def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: 
 
 @law(magnitude_zero)
 @given(rng=SEEDS, shift=some.floats(-5, 5), often=some.integers(1, 3))
-def test_the_magnitudes_offset_is_a_shift(rng: np.random.Generator, shift: float, often: int) -> None:
-    vectors, v_mag, seen = units(rng, 9), rng.uniform(0, 6, 9), rng.normal(0, 1, 9)
+def test_the_magnitudes_offset_is_a_shift(
+    rng: np.random.Generator, shift: float, often: int
+) -> None:
+    vectors = units(rng, 9)
+    v_mag = rng.uniform(0, 6, 9)
+    seen = rng.normal(0, 1, 9)
     one = magnitude_zero(seen, v_mag, vectors)
     order = rng.permutation(9 * often)
     many = (
@@ -185,17 +209,22 @@ def eye() -> StarTracker:
     return StarTracker(CAMERA, stars, stars.vectors)
 
 
-def seen_by(eye: StarTracker, rng: np.random.Generator, truth: Rotation) -> tuple[Centroids, NDArray]:
+def seen_by(
+    eye: StarTracker, rng: np.random.Generator, truth: Rotation
+) -> tuple[Centroids, NDArray]:
     """The field's stars, brightest first, each a tenth of a pixel off, and their rows."""
     rows, xy = eye.field_matcher.in_field(CAMERA, truth)
     inside = CAMERA.contains(xy, 2)
-    rows, xy = rows[inside], xy[inside] + rng.normal(0, 0.1, (int(inside.sum()), 2))
+    rows = rows[inside]
+    xy = xy[inside] + rng.normal(0, 0.1, (int(inside.sum()), 2))
     return Centroids(xy, np.full(len(rows), 0.1), 10 ** (-0.4 * eye.stars.v_mag[rows])), rows
 
 
 @law(FieldMatcher.nearest, FieldMatcher.refine)
 @given(rng=SEEDS)
-def test_a_field_is_matched_from_a_near_attitude(eye: StarTracker, rng: np.random.Generator) -> None:
+def test_a_field_is_matched_from_a_near_attitude(
+    eye: StarTracker, rng: np.random.Generator
+) -> None:
     truth = turn(rng)
     centroids, rows = seen_by(eye, rng, truth)
     observed, star = eye.field_matcher.nearest(centroids, CAMERA, truth, 3.0)
@@ -208,17 +237,24 @@ def test_a_field_is_matched_from_a_near_attitude(eye: StarTracker, rng: np.rando
 
 @law(FieldMatcher.misfits, FieldMatcher.near_misses, FieldMatcher.fits, FieldMatcher.lens_radii_px)
 @given(rng=SEEDS, aside=some.booleans())
-def test_stars_beside_detections_tell_a_wrong_camera(eye: StarTracker, rng: np.random.Generator, aside: bool) -> None:
+def test_stars_beside_detections_tell_a_wrong_camera(
+    eye: StarTracker, rng: np.random.Generator, aside: bool
+) -> None:
     truth = turn(rng)
     centroids, rows = seen_by(eye, rng, truth)
-    matcher, count = eye.field_matcher, len(rows)
+    matcher = eye.field_matcher
+    count = len(rows)
     assert matcher.lens_radii_px[0] == max(matcher.lens_radii_px)
     assert min(matcher.lens_radii_px) > 1
-    moved = np.arange(count) % 2 == 1  # every second star: by more than its error, by less than the gate
+    moved = (
+        np.arange(count) % 2 == 1
+    )  # every second star: by more than its error, by less than the gate
     centroids.xy_px[moved] += 3.0 * aside
     matched = np.flatnonzero(~moved if aside else moved | ~moved)
     nothing = np.zeros((3, 3))
-    solution = Solution(matched, rows[matched], truth.as_quat(), nothing, 1.0, 0.1 / CAMERA.focal_px, 1.0, 20.0)
+    solution = Solution(
+        matched, rows[matched], truth.as_quat(), nothing, 1.0, 0.1 / CAMERA.focal_px, 1.0, 20.0
+    )
     near, by_chance = matcher.near_misses(solution, centroids)
     assert near >= moved.sum() * aside
     assert by_chance < 0.2 * max(count, 1)
@@ -235,7 +271,9 @@ def test_stars_beside_detections_tell_a_wrong_camera(eye: StarTracker, rng: np.r
     Attitude.solved,
 )
 @given(rng=SEEDS, false=some.integers(0, 8))
-def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Generator, false: int) -> None:
+def test_an_attitude_is_the_sky_s_or_none(
+    eye: StarTracker, rng: np.random.Generator, false: int
+) -> None:
     truth = turn(rng)
     centroids, rows = seen_by(eye, rng, truth)
     everywhere = np.nan_to_num(CAMERA.pixels(truth.apply(eye.stars.vectors)), nan=-1e9)
@@ -248,7 +286,12 @@ def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Gener
     xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
     mixed = Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
     told = eye.solve_centroids(mixed)
-    assert told.solved == (told.status == "solved") == (told.match is not None) == (told.camera is not None)
+    assert (
+        told.solved
+        == (told.status == "solved")
+        == (told.match is not None)
+        == (told.camera is not None)
+    )
     assert not told.solved or (told.cam_from_ref * truth.inv()).magnitude() < 0.02
     assert not told.solved or set(told.match.observed.tolist()) <= set(range(len(xy)))
 
@@ -265,9 +308,13 @@ def test_any_lights_are_told_apart_from_a_sky(
 ) -> None:
     lights = Centroids(xy_px, sigma_px, flux)
     found = [
-        answered(lambda n=n: eye.solve_centroids(lights, effort=n), ImageError) for n in (None, *range(eye.efforts))
+        answered(lambda n=n: eye.solve_centroids(lights, effort=n), ImageError)
+        for n in (None, *range(eye.efforts))
     ]  # type: ignore[misc]
-    usable = np.isfinite(xy_px).all() and ((sigma_px > 0) & (sigma_px <= 20) & (flux > 0) & (flux < np.inf)).all()
+    usable = (
+        np.isfinite(xy_px).all()
+        and ((sigma_px > 0) & (sigma_px <= 20) & (flux > 0) & (flux < np.inf)).all()
+    )
     assert all((one is not None) == usable for one in found)
     assert not any(one is not None and one.solved for one in found)
     sigma = eye.sigma_px(lights, 0.5, 0.01)
@@ -276,7 +323,11 @@ def test_any_lights_are_told_apart_from_a_sky(
 
 
 @law(StarTracker.solve, TrackingMode.solve, TrackingMode.window_centers_px)
-@given(rng=SEEDS, t_s=some.lists(ANY, min_size=3, max_size=3), image=arrays("u2", (48, 64), fill=some.just(0)))
+@given(
+    rng=SEEDS,
+    t_s=some.lists(ANY, min_size=3, max_size=3),
+    image=arrays("u2", (48, 64), fill=some.just(0)),
+)
 def test_no_picture_of_noise_has_an_attitude_at_any_time(
     eye: StarTracker, rng: np.random.Generator, t_s: list[float], image: NDArray
 ) -> None:
@@ -296,7 +347,9 @@ def test_no_picture_of_noise_has_an_attitude_at_any_time(
 
 @law(StarTracker.warm_up, StarTracker.rich_field, TrackingMode.warm_up, slow=True)
 @given(rng=SEEDS)
-def test_a_warm_up_changes_no_answer_and_no_memory(eye: StarTracker, rng: np.random.Generator) -> None:
+def test_a_warm_up_changes_no_answer_and_no_memory(
+    eye: StarTracker, rng: np.random.Generator
+) -> None:
     cam_from_ref, xy_px, light = eye.rich_field()
     assert CAMERA.contains(xy_px, -2.0).all()
     assert len(xy_px) == len(light) > 20
@@ -304,7 +357,8 @@ def test_a_warm_up_changes_no_answer_and_no_memory(eye: StarTracker, rng: np.ran
     seen = CAMERA.pixels(cam_from_ref.apply(eye.stars.vectors))
     assert set(map(tuple, xy_px)) <= set(map(tuple, seen))
     centroids, _ = seen_by(eye, rng, turn(rng))
-    before, follower = eye.solve_centroids(centroids), TrackingMode(eye)
+    before = eye.solve_centroids(centroids)
+    follower = TrackingMode(eye)
     follower.warm_up()
     after = eye.solve_centroids(centroids)
     assert follower.last is None
@@ -312,7 +366,11 @@ def test_a_warm_up_changes_no_answer_and_no_memory(eye: StarTracker, rng: np.ran
 
 
 @law(refinement.mutual_nearest)
-@given(rng=SEEDS, radius_px=some.floats(0, 50), counts=some.tuples(some.integers(0, 9), some.integers(0, 9)))
+@given(
+    rng=SEEDS,
+    radius_px=some.floats(0, 50),
+    counts=some.tuples(some.integers(0, 9), some.integers(0, 9)),
+)
 def test_mutual_neighbors_are_each_other_s_nearest(
     rng: np.random.Generator, radius_px: float, counts: tuple[int, int]
 ) -> None:
@@ -322,22 +380,28 @@ def test_mutual_neighbors_are_each_other_s_nearest(
     between = np.linalg.norm(seen[:, None] - there, axis=2)
     told = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
-    assert told == {(a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px}
+    assert told == {
+        (a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px
+    }
 
 
 @law(refinement.log10_chance)
 @given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
 def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
     chances = [
-        refinement.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000) for n in range(2, blobs + 1)
+        refinement.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000)
+        for n in range(2, blobs + 1)
     ]
     assert all(b <= a + 1e-9 for a, b in pairwise(chances))
 
 
 @law(refinement.fit_camera, slow=True)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03), off_rad=some.floats(0, 0.01))
-def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: float, off_rad: float) -> None:
-    true, truth = CAMERA.zoomed(1 + longer), turn(rng)
+def test_a_camera_is_fitted_to_exact_pixels(
+    rng: np.random.Generator, longer: float, off_rad: float
+) -> None:
+    true = CAMERA.zoomed(1 + longer)
+    truth = turn(rng)
     xy = rng.uniform(0, [639, 479], (20, 2))
     start = Rotation.from_rotvec(off_rad * units(rng, 1)[0]) * truth
     camera, found = refinement.fit_camera(CAMERA, start, xy, truth.inv().apply(true.rays(xy)))
@@ -348,7 +412,9 @@ def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: fl
 @law(StarTracker.solve)
 @given(
     settings_=some.builds(
-        Settings, identifier=some.sampled_from(["pyramid"]), solver=some.sampled_from(["triad", "svd"])
+        Settings,
+        identifier=some.sampled_from(["pyramid"]),
+        solver=some.sampled_from(["triad", "svd"]),
     )
 )
 def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
@@ -362,7 +428,9 @@ def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
 
 @law(StarTracker.for_sky, catalog.hipparcos)
 @given(limit_mag=some.floats(3, 6.5), year=some.integers(1950, 2049))
-def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(limit_mag: float, year: int) -> None:
+def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(
+    limit_mag: float, year: int
+) -> None:
     """No star is fainter than the limit (merged doubles are brighter); aberration is 20.5" at most."""
     tracker = StarTracker.for_sky(CAMERA, limit_mag, f"{year}-06-22")
     assert tracker.stars.v_mag.max() <= limit_mag + 1e-12  # a merged magnitude is rounded
@@ -374,9 +442,14 @@ def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(li
 
 def test_chance_matches_are_counted_over_the_circles_of_the_predicted_stars() -> None:
     """Binomial tail among the 15 brightest of 40 blobs, of 30 and of all; one stray in a circle at probability p."""
-    observed, radius_px, predicted = np.array([0, 2, 3, 5, 7, 11, 13, 35]), 3.0, 50
+    observed = np.array([0, 2, 3, 5, 7, 11, 13, 35])
+    radius_px = 3.0
+    predicted = 50
     area = predicted * np.pi * radius_px**2 / (CAMERA.width_px * CAMERA.height_px)
-    tails = [stats.binom.logsf(hits - 3, count - 2, -np.expm1(-area)) for count, hits in ((15, 7), (30, 7), (40, 8))]
+    tails = [
+        stats.binom.logsf(hits - 3, count - 2, -np.expm1(-area))
+        for count, hits in ((15, 7), (30, 7), (40, 8))
+    ]
     wanted = min(tails) / np.log(10) + np.log10(3 * 20)
     found = refinement.log10_chance(observed, 40, predicted, radius_px, CAMERA, 20)
     assert found == pytest.approx(wanted, abs=1e-9)

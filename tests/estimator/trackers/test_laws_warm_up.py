@@ -15,13 +15,16 @@ from estimator.trackers import warm_up
 
 
 @law(warm_up.loop_type)
-@given(array=some.sampled_from(["u1", "u2", ">u2", "?", "i1", "i2", ">i4", "i8", "f2", "f4", ">f8"]))
+@given(
+    array=some.sampled_from(["u1", "u2", ">u2", "?", "i1", "i2", ">i4", "i8", "f2", "f4", ">f8"])
+)
 def test_a_frame_of_a_type_is_looped_over_in_its_loop_type(array: str) -> None:
     assert to_native(np.ones((3, 3), array)).dtype == warm_up.loop_type(array)
 
 
 @pytest.mark.parametrize(
-    ("dtype", "loops"), [("u1", "u2"), (">u2", "u2"), ("?", "u2"), ("i2", "i4"), ("i8", "i4"), (">f4", "f8")]
+    ("dtype", "loops"),
+    [("u1", "u2"), (">u2", "u2"), ("?", "u2"), ("i2", "i4"), ("i8", "i4"), (">f4", "f8")],
 )
 def test_three_types_of_pixels_are_compiled(dtype: str, loops: str) -> None:
     assert warm_up.loop_type(dtype) == np.dtype(loops)
@@ -29,7 +32,9 @@ def test_three_types_of_pixels_are_compiled(dtype: str, loops: str) -> None:
 
 @pytest.mark.parametrize("dtype", ["c16", "U3", "no type", object])
 def test_pixels_that_are_no_numbers_are_refused(dtype: object) -> None:
-    with pytest.raises(ImageError, match=r"warm_up: dtype is .*; allowed: the type of the frames' pixels"):
+    with pytest.raises(
+        ImageError, match=r"warm_up: dtype is .*; allowed: the type of the frames' pixels"
+    ):
         warm_up.loop_type(dtype)  # type: ignore[arg-type]
 
 
@@ -37,7 +42,9 @@ def test_pixels_that_are_no_numbers_are_refused(dtype: object) -> None:
 @given(x_px=some.floats(12, 50), y_px=some.floats(12, 40))
 def test_spots_are_drawn_where_they_belong(x_px: float, y_px: float) -> None:
     camera = Camera.from_fov(64, 48, fov_deg=5)
-    image = warm_up.draw(camera, np.array([[x_px, y_px], [1.0, 47.0]]), np.array([1e7, 1e6]), np.dtype("f8"))
+    image = warm_up.draw(
+        camera, np.array([[x_px, y_px], [1.0, 47.0]]), np.array([1e7, 1e6]), np.dtype("f8")
+    )
     y, x = np.mgrid[:48, :64]
     light = np.where(np.hypot(x - x_px, y - y_px) < 6, image - warm_up.SKY, 0)
     assert [np.sum(light * x) / np.sum(light), np.sum(light * y) / np.sum(light)] == pytest.approx(
@@ -45,7 +52,13 @@ def test_spots_are_drawn_where_they_belong(x_px: float, y_px: float) -> None:
     )
     assert image[47, 1] == pytest.approx(1e6, rel=1e-3)
     kinds = []
-    warm_up.run(camera, np.array([[20.0, 30.0], [40.0, 9.0]]), np.ones(2), "u1", lambda *one: kinds.append(one))
+    warm_up.run(
+        camera,
+        np.array([[20.0, 30.0], [40.0, 9.0]]),
+        np.ones(2),
+        "u1",
+        lambda *one: kinds.append(one),
+    )
     assert {image.dtype for image, _ in kinds} == {np.dtype("u2")}
     assert max(image.max() for image, _ in kinds) > 4096 > min(image.max() for image, _ in kinds)
     assert {streak for _, streak in kinds} == {None, (0.0, 0.0), warm_up.STREAK_PX}

@@ -63,9 +63,12 @@ def apart_rad(answer: Attitude, truth: Rotation) -> float:
 def frame(lens: Camera, pixels: Floats, light_e: Floats, seed: int) -> np.ndarray:
     """A picture of Gaussian stars of sigma 0.8 px with photon and read noise, in electrons."""
     image = np.full((lens.height_px, lens.width_px), 20.0)
-    columns, rows = np.arange(lens.width_px + 1) - 0.5, np.arange(lens.height_px + 1) - 0.5
+    columns = np.arange(lens.width_px + 1) - 0.5
+    rows = np.arange(lens.height_px + 1) - 0.5
     for (x, y), light in zip(pixels, light_e, strict=True):
-        across, down = (np.diff(erf((e - at) / (0.8 * 2**0.5))) / 2 for e, at in ((columns, x), (rows, y)))
+        across, down = (
+            np.diff(erf((e - at) / (0.8 * 2**0.5))) / 2 for e, at in ((columns, x), (rows, y))
+        )
         image += light * np.outer(down, across)
     rng = np.random.default_rng(seed)
     return rng.poisson(image) + rng.normal(300, 12, image.shape)
@@ -86,7 +89,8 @@ def test_true_centroids_give_the_true_attitude(tracker: StarTracker) -> None:
 def test_the_answer_s_covariance_and_rms_are_true(tracker: StarTracker) -> None:
     # The settings' floor of 0.1 px and the centroids' own 0.1 add: sqrt(2) of it is the noise.
     rng = np.random.default_rng(81)
-    nees, rms = [], []
+    nees = []
+    rms = []
     for _ in range(250):
         truth, pixels, _ = starfield(tracker, rng, CAMERA)
         noisy = pixels + rng.normal(0, NOISE_PX * 2**0.5, pixels.shape)
@@ -113,7 +117,9 @@ def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
     for _ in range(25):
         truth, pixels, _ = starfield(tracker, rng, CAMERA)
         spots = rng.uniform(0, [658, 492], (len(pixels) // 4 + 2, 2))
-        seen = np.vstack([spots[:2], pixels, spots[2:]]) + rng.normal(0, NOISE_PX, (len(spots) + len(pixels), 2))
+        seen = np.vstack([spots[:2], pixels, spots[2:]]) + rng.normal(
+            0, NOISE_PX, (len(spots) + len(pixels), 2)
+        )
         answer = tracker.solve_centroids(centroids(seen))
         assert answer.solved
         # Roll of some stars at .1 px is 20"; 2e-3 rad is 400", a wrong attitude far more.
@@ -122,7 +128,9 @@ def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
-    answer = tracker.solve_centroids(centroids(np.random.default_rng(84).uniform(0, 400, (count, 2))))
+    answer = tracker.solve_centroids(
+        centroids(np.random.default_rng(84).uniform(0, 400, (count, 2)))
+    )
     assert answer.status == NO_STARS
     assert answer.cam_from_ref is answer.covariance_rad2 is answer.match is answer.camera is None
     assert np.isnan(answer.rms_px)
@@ -131,7 +139,9 @@ def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
 
 def test_spots_that_are_no_stars_are_a_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(85)
-    answers = [tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(10)]
+    answers = [
+        tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(10)
+    ]
     assert {answer.status for answer in answers} == {NO_MATCH}
     assert {answer.cam_from_ref for answer in answers} == {None}
 
@@ -147,7 +157,9 @@ def test_a_mirrored_field_is_a_status(tracker: StarTracker) -> None:
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
 def test_a_picture_gives_its_attitude(tracker: StarTracker, centroider: str) -> None:
     rng = np.random.default_rng(87)
-    tracker = replaced(tracker, replace(tracker.settings, centroider=centroider, centroid_sigma_px=0.05))
+    tracker = replaced(
+        tracker, replace(tracker.settings, centroider=centroider, centroid_sigma_px=0.05)
+    )
     for seed in range(3):
         truth, pixels, light = starfield(tracker, rng, CAMERA)
         report = tracker.solve(frame(CAMERA, pixels, 1e6 * light, seed))
@@ -214,8 +226,12 @@ def test_a_lamp_beside_a_faint_star_does_not_turn_the_field(uncertain: StarTrack
     rng = np.random.default_rng(96)
     for _ in range(5):
         truth, pixels, light = starfield(uncertain, rng, CAMERA)
-        alone = np.array([np.partition(np.linalg.norm(pixels - one, axis=1), 1)[1] > 12 for one in pixels])
-        outer = np.linalg.norm(pixels - CAMERA.center_px, axis=1) * alone * (light < np.median(light))
+        alone = np.array(
+            [np.partition(np.linalg.norm(pixels - one, axis=1), 1)[1] > 12 for one in pixels]
+        )
+        outer = (
+            np.linalg.norm(pixels - CAMERA.center_px, axis=1) * alone * (light < np.median(light))
+        )
         pixels[outer.argmax()] += 1.5
         light[outer.argmax()] = 10 * light.max()
         order = np.argsort(-light)
@@ -240,9 +256,14 @@ def test_a_radial_distortion_is_found_with_the_focal_length(uncertain: StarTrack
     assert np.median(found) == pytest.approx(-0.15, abs=0.01)
 
 
-def test_the_residual_is_the_rms_of_its_coordinates(tracker: StarTracker, uncertain: StarTracker) -> None:
+def test_the_residual_is_the_rms_of_its_coordinates(
+    tracker: StarTracker, uncertain: StarTracker
+) -> None:
     rng = np.random.default_rng(98)
-    for eye, noise_px in ((tracker, 0.1), (uncertain, 0.3)):  # 0.3 px: the lens is fitted to the stars
+    for eye, noise_px in (
+        (tracker, 0.1),
+        (uncertain, 0.3),
+    ):  # 0.3 px: the lens is fitted to the stars
         _, pixels, _ = starfield(eye, rng, CAMERA)
         lights = centroids(pixels + noise_px * rng.standard_normal(pixels.shape))
         answer = eye.solve_centroids(lights)
@@ -253,11 +274,15 @@ def test_the_residual_is_the_rms_of_its_coordinates(tracker: StarTracker, uncert
 
 def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
     """A rolling shutter shears the image of a turning camera: the stars of a part of the field fit an attitude."""
-    rng, solved = np.random.default_rng(97), 0
+    rng = np.random.default_rng(97)
+    solved = 0
     for _ in range(20):
         _truth, pixels, _ = starfield(tracker, rng, CAMERA, limit_mag=7.0)
         assert tracker.solve_centroids(centroids(pixels)).solved
-        sheared = pixels + 0.01 * (pixels[:, [1]] - CAMERA.center_px[1]) * [1, 0]  # 2.5 px at the edge
+        sheared = pixels + 0.01 * (pixels[:, [1]] - CAMERA.center_px[1]) * [
+            1,
+            0,
+        ]  # 2.5 px at the edge
         solved += tracker.solve_centroids(centroids(sheared)).solved
     assert solved == 0
 
@@ -304,11 +329,19 @@ def dome(shape: str, count: int = 2500) -> LedMap:
     leds = LedMap(np.arange(count), np.zeros((count, 3)), *SHAPES[shape])
     places = dome_map.on_surface(rays, np.array([0.0, 0.0, 0.0]), leds)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2) + 9 * np.eye(count)
-    return replace(leds, position_m=places[apart.min(axis=1) > 0.005], id=np.flatnonzero(apart.min(axis=1) > 0.005))
+    return replace(
+        leds,
+        position_m=places[apart.min(axis=1) > 0.005],
+        id=np.flatnonzero(apart.min(axis=1) > 0.005),
+    )
 
 
 def under_the_dome(
-    rng: np.random.Generator, leds: LedMap, lever: Lever, noise_px: float, camera: Camera = DOME_CAMERA
+    rng: np.random.Generator,
+    leds: LedMap,
+    lever: Lever,
+    noise_px: float,
+    camera: Camera = DOME_CAMERA,
 ) -> tuple[Rotation, Floats]:
     """A vehicle tilted by up to 15 degrees: cam_from_lab and the pixels of the LEDs on the sensor."""
     heading, about = rng.uniform(0, 2 * np.pi, 2)
@@ -339,11 +372,18 @@ def test_true_centroids_under_a_dome_give_the_true_attitude(lever: str, shape: s
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("camera", "count", "solver"),
-    [(DOME_CAMERA, 2500, "rotation_only"), (WIDE_CAMERA, 60, "rotation_only"), (WIDE_CAMERA, 60, "tappe")],
+    [
+        (DOME_CAMERA, 2500, "rotation_only"),
+        (WIDE_CAMERA, 60, "rotation_only"),
+        (WIDE_CAMERA, 60, "tappe"),
+    ],
 )
 def test_the_dome_tracker_s_covariance_is_true(camera: Camera, count: int, solver: str) -> None:
-    leds, lever = dome("ellipsoid", count), LEVERS["askew"]
-    tracker = DomeTracker(camera, leds, lever, replace(SETTINGS, solver=solver, centroid_sigma_px=0.0))
+    leds = dome("ellipsoid", count)
+    lever = LEVERS["askew"]
+    tracker = DomeTracker(
+        camera, leds, lever, replace(SETTINGS, solver=solver, centroid_sigma_px=0.0)
+    )
     rng = np.random.default_rng(96)
     nees = []
     for _ in range(150):
@@ -360,7 +400,9 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
     tracker = DomeTracker(DOME_CAMERA, dome("sphere"), LEVERS["axial"])
     rng = np.random.default_rng(97)
     assert tracker.solve_centroids(centroids(rng.uniform(0, 1000, (2, 2)))).status == NO_STARS
-    spots = [tracker.solve_centroids(centroids(rng.uniform(0, [1599, 1199], (12, 2)))) for _ in range(10)]
+    spots = [
+        tracker.solve_centroids(centroids(rng.uniform(0, [1599, 1199], (12, 2)))) for _ in range(10)
+    ]
     assert {answer.status for answer in spots} == {NO_MATCH}
 
 

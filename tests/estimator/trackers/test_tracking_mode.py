@@ -42,17 +42,23 @@ def light_of_stars(tracker: StarTracker, cam_from_ref: Rotation, light: float):
     """Gaussian stars, in electrons."""
     image = np.zeros((CAMERA.height_px, CAMERA.width_px))
     rows, pixels = tracker.field_matcher.in_field(CAMERA, cam_from_ref)
-    edges_x, edges_y = np.arange(CAMERA.width_px + 1) - 0.5, np.arange(CAMERA.height_px + 1) - 0.5
+    edges_x = np.arange(CAMERA.width_px + 1) - 0.5
+    edges_y = np.arange(CAMERA.height_px + 1) - 0.5
     for (x, y), mag in zip(pixels, tracker.stars.v_mag[rows], strict=True):
-        across, down = (np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y)))
+        across, down = (
+            np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y))
+        )
         image += light * 10 ** (-0.4 * mag) * np.outer(down, across)
     return image
 
 
 def photograph(tracker: StarTracker, cam_from_ref: Rotation, seed: int = 0, light: float = 3e5):
     """Stars over a sky of 20 electrons, photon and read noise; 16 bits."""
-    image, rng = 20 + light_of_stars(tracker, cam_from_ref, light), np.random.default_rng(seed)
-    return np.clip(rng.poisson(image) + rng.normal(300, 12, image.shape), 0, 65535).astype(np.uint16)
+    image = 20 + light_of_stars(tracker, cam_from_ref, light)
+    rng = np.random.default_rng(seed)
+    return np.clip(rng.poisson(image) + rng.normal(300, 12, image.shape), 0, 65535).astype(
+        np.uint16
+    )
 
 
 def off_rad(report, truth: Rotation) -> float:
@@ -61,7 +67,10 @@ def off_rad(report, truth: Rotation) -> float:
 
 def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
-    reports = [follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)]
+    reports = [
+        follower.solve(photograph(tracker, attitude(t), n), t)
+        for n, t in enumerate(np.arange(8) * STEP_S)
+    ]
     # Ten stars of a hundredth of a pixel: roll of 20".
     assert max(off_rad(r, attitude(n * STEP_S)) for n, r in enumerate(reports)) < 2e-4
     assert reports[0].expected == 0
@@ -70,7 +79,9 @@ def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     assert all(r.expected >= 8 and not r.health & Health.SEARCHED for r in reports[1:])
     assert all(r.log10_odds > 10 for r in reports)
     nees = [error(r, attitude(n * STEP_S)) for n, r in enumerate(reports)]
-    assert np.mean(nees) < 3 + 4 * np.sqrt(6 / 8)  # chi-square of three degrees, eight times: four deviations
+    assert np.mean(nees) < 3 + 4 * np.sqrt(
+        6 / 8
+    )  # chi-square of three degrees, eight times: four deviations
 
 
 def error(report, truth: Rotation) -> float:
@@ -80,8 +91,12 @@ def error(report, truth: Rotation) -> float:
 
 def test_the_last_rate_leads_to_the_next_frame(tracker: StarTracker) -> None:
     """At 5 deg/s the stars move 22 px a frame: a prediction without the rate, or with its inverse, misses them."""
-    follower, turns = TrackingMode(tracker), [Rotation.from_rotvec(n * STEP_S * 10 * RATE_RAD_S) for n in range(3)]
-    reports = [follower.solve(photograph(tracker, turn * START, n), n * STEP_S) for n, turn in enumerate(turns)]
+    follower = TrackingMode(tracker)
+    turns = [Rotation.from_rotvec(n * STEP_S * 10 * RATE_RAD_S) for n in range(3)]
+    reports = [
+        follower.solve(photograph(tracker, turn * START, n), n * STEP_S)
+        for n, turn in enumerate(turns)
+    ]
     assert [bool(r.health & Health.SEARCHED) for r in reports] == [True, True, False]
     assert off_rad(reports[2], turns[2] * START) < 2e-4
 
@@ -99,14 +114,17 @@ def test_a_prediction_adds_the_evidence_of_its_smaller_volume(tracker: StarTrack
     assert lost is not None
     volume = (16 / CAMERA.focal_px) ** 2 * 16 / 246.5
     gain = followed.log10_odds + lost.log10_chance
-    assert gain == pytest.approx(np.log10(8 * np.pi**2 / volume), abs=1e-3)  # the two fits differ by rounding
+    assert gain == pytest.approx(
+        np.log10(8 * np.pi**2 / volume), abs=1e-3
+    )  # the two fits differ by rounding
 
 
 def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker) -> None:
     """Three of the 2 N measured coordinates are spent on the attitude; two stars leave one degree of freedom."""
     rows, pixels = tracker.field_matcher.in_field(CAMERA, START)
     for count in (2, 4, 9):
-        xy, sigma = pixels[:count] + 0.1, np.full(count, 0.1)
+        xy = pixels[:count] + 0.1
+        sigma = np.full(count, 0.1)
         match = StarMatch(np.arange(count), rows[:count], START, -9.0)
         attitude = Attitude("solved", START, np.eye(3), match)
         centroids = Centroids(xy, sigma, np.ones(count))
@@ -124,7 +142,8 @@ def test_the_gyros_turn_is_followed_at_once(tracker: StarTracker) -> None:
 
 
 def test_a_jump_is_searched_and_never_answered_wrongly(tracker: StarTracker) -> None:
-    follower, jumped = TrackingMode(tracker), Rotation.from_rotvec([0.2, -0.1, 1.0]) * START
+    follower = TrackingMode(tracker)
+    jumped = Rotation.from_rotvec([0.2, -0.1, 1.0]) * START
     follower.solve(photograph(tracker, START), 0.0)
     report = follower.solve(photograph(tracker, jumped), STEP_S)
     assert report.health & Health.SEARCHED
@@ -147,7 +166,9 @@ def test_a_memory_that_is_stale_is_none(tracker: StarTracker) -> None:
     follower.solve(photograph(tracker, START), 0.0)
     assert follower.solve(photograph(tracker, START, 1), 1.5).health & Health.SEARCHED
     assert not follower.solve(photograph(tracker, START, 2), 2.0).health & Health.SEARCHED
-    assert follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED  # time ran backwards
+    assert (
+        follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED
+    )  # time ran backwards
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -156,17 +177,28 @@ def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
 
     Every frame with stars is solved, right; after a gap shorter than the memory the gyros' turn leads on.
     """
-    rng, follower, t_s, truth = np.random.default_rng(seed), TrackingMode(tracker), 0.0, START
-    then, solved, followed, lost = START, 0, 0, 0
+    rng = np.random.default_rng(seed)
+    follower = TrackingMode(tracker)
+    t_s = 0.0
+    truth = START
+    then = START
+    solved = 0
+    followed = 0
+    lost = 0
     for n in range(60):
-        gap = rng.choice(["none", "dark", "missing", "knock", "stale"], p=[0.5, 0.2, 0.15, 0.1, 0.05])
+        gap = rng.choice(
+            ["none", "dark", "missing", "knock", "stale"], p=[0.5, 0.2, 0.15, 0.1, 0.05]
+        )
         step_s = {"missing": rng.uniform(0.3, 3.0), "stale": 6.0}.get(gap, STEP_S)
-        t_s, turn = t_s + step_s, Rotation.from_rotvec(RATE_RAD_S * step_s)
+        t_s = t_s + step_s
+        turn = Rotation.from_rotvec(RATE_RAD_S * step_s)
         truth = turn * truth
         if gap == "knock":
             truth = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * truth
         told = truth * then.inv() if gap != "knock" else Rotation.identity()
-        report = follower.solve(photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, told)
+        report = follower.solve(
+            photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, told
+        )
         if gap == "dark":
             assert report.health == Health.LOST
             lost += 1
@@ -175,7 +207,9 @@ def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
         assert report.attitude.solved or not enough
         if report.attitude.solved:
             assert off_rad(report, truth) < 1e-3, (n, gap)
-            then, solved, followed = truth, solved + 1, followed + (report.expected > 0)
+            then = truth
+            solved = solved + 1
+            followed = followed + (report.expected > 0)
     assert solved >= 40
     assert followed >= 0.6 * solved
     assert lost >= 5
@@ -205,7 +239,9 @@ def test_saturated_and_smeared_stars_are_told(tracker: StarTracker) -> None:
     follower.solve(photograph(tracker, START), 0.0)
     bright = follower.solve(photograph(tracker, START, 1, light=2e7), STEP_S)
     assert bright.health & Health.SATURATED
-    smeared = np.mean([photograph(tracker, shifted(x), 2) for x in np.linspace(-4.5, 4.5, 19)], axis=0)
+    smeared = np.mean(
+        [photograph(tracker, shifted(x), 2) for x in np.linspace(-4.5, 4.5, 19)], axis=0
+    )
     quick = follower.solve(smeared.astype(np.uint16), 2 * STEP_S, streak_px=(9.0, 0.0))
     assert quick.health & Health.SMEARED
     assert off_rad(quick, START) < 1e-3
@@ -246,7 +282,9 @@ def test_most_stars_of_four_to_five_sigma_are_found_in_their_windows(tracker: St
     """In the filtered image; by a threshold of 4 sigma seven in ten are, by that of a frame, 5 sigma, three in ten."""
     found = []
     for light in np.geomspace(1.5e4, 6e4, 8):
-        filtered = ndimage.correlate(light_of_stars(tracker, START, light), np.outer([1, 2, 1], [1, 2, 1]) / 16)
+        filtered = ndimage.correlate(
+            light_of_stars(tracker, START, light), np.outer([1, 2, 1], [1, 2, 1]) / 16
+        )
         filtered = ndimage.maximum_filter(filtered, 5)
         follower = TrackingMode(tracker)
         centers_px = follower.window_centers_px(START)
@@ -256,6 +294,8 @@ def test_most_stars_of_four_to_five_sigma_are_found_in_their_windows(tracker: St
         for seed in range(3):
             follower.last = LastSolution(0.0, START, np.zeros(3))
             xy_px = follower.solve(photograph(tracker, START, seed, light), STEP_S).centroids.xy_px
-            found += (np.linalg.norm(xy_px[:, None] - faint, axis=2).min(axis=0, initial=np.inf) < 2).tolist()
+            found += (
+                np.linalg.norm(xy_px[:, None] - faint, axis=2).min(axis=0, initial=np.inf) < 2
+            ).tolist()
     assert len(found) > 30
     assert np.mean(found) > 0.55

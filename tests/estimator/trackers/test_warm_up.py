@@ -85,6 +85,8 @@ print(sorted(name for name, more in new.items() if more))
 @pytest.mark.parametrize("work", [STARS, DOME], ids=["stars", "dome"])
 def test_no_frame_compiles_anything_after_the_warm_up(work: str) -> None:
     """In a process of its own: other tests compile what a warm-up might leave out."""
-    done = subprocess.run([sys.executable, "-c", COUNT + work + TOLD], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COUNT + work + TOLD], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"

@@ -20,17 +20,27 @@ from skysim.experiments.characterize import checks, procedure
 from skysim.experiments.characterize.frames import Setting, read_frames, read_stack
 
 SIDE = 64
-SHAPE, BITS = (SIDE, SIDE), 12
+SHAPE = (SIDE, SIDE)
+BITS = 12
 CAMERA = {
-    **{"width_px": SIDE, "height_px": SIDE, "pixel": "5 um"},
+    "width_px": SIDE,
+    "height_px": SIDE,
+    "pixel": "5 um",
     "detector": {"quantum_efficiency": 0.6, "full_well_e": 10700, "gain_e_dn": 2.64, "bits": BITS},
 }
-GAIN, BLACK, READ, WELL = 2.64, 100.0, 3.0, 10_000.0
+GAIN = 2.64
+BLACK = 100.0
+READ = 3.0
+WELL = 10_000.0
 
 
-def frame(rng: np.random.Generator, light_e: Any, exposure_s: float, dark_e_s: float = 2.0) -> np.ndarray:
+def frame(
+    rng: np.random.Generator, light_e: Any, exposure_s: float, dark_e_s: float = 2.0
+) -> np.ndarray:
     """Poisson electrons in a well, Gaussian read noise, rounding: numpy's own, not the simulated detector."""
-    electrons = np.minimum(rng.poisson(np.broadcast_to(light_e + dark_e_s * exposure_s, SHAPE)), WELL)
+    electrons = np.minimum(
+        rng.poisson(np.broadcast_to(light_e + dark_e_s * exposure_s, SHAPE)), WELL
+    )
     numbers = np.rint((electrons + rng.normal(0, READ, SHAPE)) / GAIN + BLACK)
     return np.clip(numbers, 0, 2**BITS - 1).astype(np.uint16)
 
@@ -43,7 +53,8 @@ def write(path: Path, image: np.ndarray, **header: Any) -> None:
         assert cv2.imwrite(str(path), image)
 
 
-DARK_S, FLAT_S = (0.1, 100.0), (0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.1, 0.2)
+DARK_S = (0.1, 100.0)
+FLAT_S = (0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.1, 0.2)
 
 
 def lab(folder: Path, seed: int = 1, suffix: str = ".png", shift: int = 0) -> None:
@@ -51,7 +62,10 @@ def lab(folder: Path, seed: int = 1, suffix: str = ".png", shift: int = 0) -> No
     rng = np.random.default_rng(seed)
     for exposure_s in DARK_S:
         for n in range(4):
-            write(folder / f"darks/dark_{exposure_s:g}s_20C_{n}{suffix}", frame(rng, 0.0, exposure_s) << shift)
+            write(
+                folder / f"darks/dark_{exposure_s:g}s_20C_{n}{suffix}",
+                frame(rng, 0.0, exposure_s) << shift,
+            )
     for exposure_s in FLAT_S:
         for n in range(2):
             image = frame(rng, exposure_s * WELL / 0.08, exposure_s)
@@ -89,7 +103,9 @@ def test_exposure_and_temperature_of_names_and_headers(
 def test_a_table_beside_the_frames_comes_first(tmp_path: Path) -> None:
     write(tmp_path / "a_3s.png", np.full((8, 9), 100, np.uint16))
     write(tmp_path / "b_3s.png", np.full((8, 9), 100, np.uint16))
-    (tmp_path / "frames.csv").write_text("file,exposure_s,temperature_c,lens\na_3s.png,0.004,-3,none\n")
+    (tmp_path / "frames.csv").write_text(
+        "file,exposure_s,temperature_c,lens\na_3s.png,0.004,-3,none\n"
+    )
     settings = [setting for _, setting, _ in read_frames(tmp_path)]
     assert settings == [Setting(0.004, -3.0), Setting(3.0, None)]
 
@@ -105,7 +121,12 @@ def test_numbers_in_the_upper_bits_are_shifted_back(tmp_path: Path, good: Path) 
 def test_frames_of_an_independent_camera_come_back(good: Path) -> None:
     config, raw = procedure.read_camera(str(good / "camera.yaml"))
     found = procedure.measure_sensor(config, good / "darks", good / "flats").estimates
-    for key, truth in (("gain_e_dn", GAIN), ("read_noise_e", READ), ("full_well_e", WELL), ("offset_dn", BLACK)):
+    for key, truth in (
+        ("gain_e_dn", GAIN),
+        ("read_noise_e", READ),
+        ("full_well_e", WELL),
+        ("offset_dn", BLACK),
+    ):
         assert abs(found[key].value - truth) < 4 * found[key].sigma, key
     assert abs(found["dark_e_s"].value - 2.0) < 4 * found["dark_e_s"].sigma
     assert raw["pixel"] == "5 um"
@@ -145,8 +166,11 @@ def gradient(folder: Path) -> None:
 
 
 def stars(folder: Path) -> None:
-    rng, (y, x) = np.random.default_rng(5), np.mgrid[0:SIDE, 0:SIDE]
-    light_e = sum(1000 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2) for a, b in rng.uniform(5, 58, (6, 2)))
+    rng = np.random.default_rng(5)
+    (y, x) = np.mgrid[0:SIDE, 0:SIDE]
+    light_e = sum(
+        1000 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2) for a, b in rng.uniform(5, 58, (6, 2))
+    )
     for n in range(4):
         write(folder / f"darks/dark_100s_20C_{n}.png", frame(rng, light_e, 100.0))
 
@@ -164,13 +188,19 @@ def cut_off(folder: Path) -> None:
 
 
 def vignette(folder: Path) -> None:
-    rng, (y, x) = np.random.default_rng(5), np.mgrid[0:SIDE, 0:SIDE] / SIDE - 0.5
+    rng = np.random.default_rng(5)
+    (y, x) = np.mgrid[0:SIDE, 0:SIDE] / SIDE - 0.5
     for n in range(2):
-        write(folder / f"flats/flat_50000us_20C_{n}.png", frame(rng, 6000 * (1 - 1.5 * (x**2 + y**2)), 0.05))
+        write(
+            folder / f"flats/flat_50000us_20C_{n}.png",
+            frame(rng, 6000 * (1 - 1.5 * (x**2 + y**2)), 0.05),
+        )
 
 
 def lamp(folder: Path) -> None:
-    write(folder / "flats/flat_50000us_20C_1.png", frame(np.random.default_rng(5), 6250 * 1.1, 0.05))
+    write(
+        folder / "flats/flat_50000us_20C_1.png", frame(np.random.default_rng(5), 6250 * 1.1, 0.05)
+    )
 
 
 def small(folder: Path) -> None:
@@ -203,24 +233,60 @@ def beyond(folder: Path) -> None:
 
 
 BAD: list[tuple[Callable[[Path], None], str]] = [
-    (one_exposure, "darks of 100 s only; allowed: two exposures or more: add 4 of the shortest and 4 of 1000 s"),
-    (few_flats, "1 levels from 1 to 70 % of the brightest; allowed: 4 or more: add pairs at 3 exposures from 0.005"),
-    (single, "flat_60000us_20C_0.png: the only frame of 0.06 s at 20 °C; allowed: 2 or more, alike"),
-    (saturated, "all saturated, at 3888 DN; allowed: 4 levels or more below: exposures shorter than 0.1 s"),
-    (lit, "dark_100s_20C_2.png: not dark: median 198 DN, the other frames of 100 s at 20 °C 176 DN"),
+    (
+        one_exposure,
+        "darks of 100 s only; allowed: two exposures or more: add 4 of the shortest and 4 of 1000 s",
+    ),
+    (
+        few_flats,
+        "1 levels from 1 to 70 % of the brightest; allowed: 4 or more: add pairs at 3 exposures from 0.005",
+    ),
+    (
+        single,
+        "flat_60000us_20C_0.png: the only frame of 0.06 s at 20 °C; allowed: 2 or more, alike",
+    ),
+    (
+        saturated,
+        "all saturated, at 3888 DN; allowed: 4 levels or more below: exposures shorter than 0.1 s",
+    ),
+    (
+        lit,
+        "dark_100s_20C_2.png: not dark: median 198 DN, the other frames of 100 s at 20 °C 176 DN",
+    ),
     (gradient, "the darks of 100 s at 20 °C are not dark: 50.8"),
-    (gradient, "DN brighter at the middle right than at the top left; allowed: 11 DN: cap the lens, cover the window"),
+    (
+        gradient,
+        "DN brighter at the middle right than at the top left; allowed: 11 DN: cap the lens, cover the window",
+    ),
     (stars, "spots of 4 pixels or more, the largest at x "),
-    (copies, "the darks of 100 s at 20 °C are equal in every pixel; allowed: frames of their own, no copies"),
+    (
+        copies,
+        "the darks of 100 s at 20 °C are equal in every pixel; allowed: frames of their own, no copies",
+    ),
     (cut_off, "% of the pixels at 0 DN; allowed: a higher black level"),
     (vignette, "not flat: "),
-    (lamp, "the flats of 0.05 s at 20 °C differ by 9.5 % from frame to frame; allowed: 3 %: a steady lamp"),
+    (
+        lamp,
+        "the flats of 0.05 s at 20 °C differ by 9.5 % from frame to frame; allowed: 3 %: a steady lamp",
+    ),
     (small, "flat_50000us_20C_1.png: 64 x 32 pixels; allowed: 64 x 64, as the camera has them"),
-    (unnamed, "flat.png: no exposure time; allowed: EXPTIME in a FITS header, a row of frames.csv beside it"),
-    (no_temperature, "flat_50000us_0.png: no temperature, which other frames have; allowed: of all frames, or of none"),
+    (
+        unnamed,
+        "flat.png: no exposure time; allowed: EXPTIME in a FITS header, a row of frames.csv beside it",
+    ),
+    (
+        no_temperature,
+        "flat_50000us_0.png: no temperature, which other frames have; allowed: of all frames, or of none",
+    ),
     (color, "flat_50000us_20C_1.png: a color image; allowed: monochrome frames, raw"),
-    (jpeg, "flat_50000us_20C_9.jpg: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF"),
-    (average, "flat_50000us_20C_9.fits: numbers that are not whole, as of an average; allowed: raw frames"),
+    (
+        jpeg,
+        "flat_50000us_20C_9.jpg: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF",
+    ),
+    (
+        average,
+        "flat_50000us_20C_9.fits: numbers that are not whole, as of an average; allowed: raw frames",
+    ),
     (beyond, "flat_50000us_20C_9.png: 4097 DN; allowed: up to 4095, the 12 bits of the camera"),
 ]
 
@@ -249,7 +315,9 @@ def test_frames_that_do_not_tell_are_refused_in_one_line(
         ("file,exposure_s\na.png,-1\n", "an exposure below 0"),
     ],
 )
-def test_a_table_of_exposures_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_a_table_of_exposures_is_refused_in_one_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
     write(tmp_path / "a.png", np.full((8, 9), 100, np.uint16))
     (tmp_path / "frames.csv").write_text(text)
     with pytest.raises(InputError, match=message):
@@ -290,7 +358,14 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
 ) -> None:
     from skysim.scene import loader
 
-    folders = ("--camera", good / "camera.yaml", "--darks", good / "darks", "--flats", good / "flats")
+    folders = (
+        "--camera",
+        good / "camera.yaml",
+        "--darks",
+        good / "darks",
+        "--flats",
+        good / "flats",
+    )
     code, out, _ = command(capsys, monkeypatch, *folders, "--out", tmp_path, "--json")
     assert code == 0
     told = json.loads(out)
@@ -298,12 +373,17 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
     assert rows["gain_e_dn"]["file"] == 2.64
     assert told == json.loads((tmp_path / "characterize.json").read_text())
     preset = str(tmp_path / "camera.yaml")
-    scene = loader.load("shefex2", {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"})
+    scene = loader.load(
+        "shefex2", {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"}
+    )
     assert scene.camera.detector.gain_e_dn == pytest.approx(rows["gain_e_dn"]["value"], rel=1e-5)
     assert scene.camera.width_px == SIDE
     code, out, _ = command(capsys, monkeypatch, *folders, "--out", tmp_path)
     assert code == 0
-    assert "doubling temperature: darks at one temperature; allowed: two, 5 K apart or more" in " ".join(out.split())
+    assert (
+        "doubling temperature: darks at one temperature; allowed: two, 5 K apart or more"
+        in " ".join(out.split())
+    )
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,11 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import build_lab
 from skysim.tracking.onboard_model import calibration
 
-SIDE_PX, GAIN_DN_E, READ_DN = 700, 0.4, 2.0
-CENTER_PX, CORNER_PX = ((SIDE_PX - 1) / 2, (SIDE_PX - 1) / 2), SIDE_PX / np.sqrt(2)
+SIDE_PX = 700
+GAIN_DN_E = 0.4
+READ_DN = 2.0
+CENTER_PX = ((SIDE_PX - 1) / 2, (SIDE_PX - 1) / 2)
+CORNER_PX = SIDE_PX / np.sqrt(2)
 
 
 def gaussian(at: Floats, center: float, sigma: float) -> Floats:
@@ -38,16 +41,25 @@ def gaussian(at: Floats, center: float, sigma: float) -> Floats:
     return np.diff(special.erf(edge)) / 2
 
 
-def drawn(rng: np.random.Generator, sigma: float, corner: float, trail_px: float = 0.0) -> tuple[Floats, Floats]:
+def drawn(
+    rng: np.random.Generator, sigma: float, corner: float, trail_px: float = 0.0
+) -> tuple[Floats, Floats]:
     """A frame without black level of some 250 stars on a grid, and their places; a trail along the rows."""
-    places = np.stack(np.meshgrid(*(np.arange(22.0, SIDE_PX - 22, 42),) * 2), axis=-1).reshape(-1, 2)
+    places = np.stack(np.meshgrid(*(np.arange(22.0, SIDE_PX - 22, 42),) * 2), axis=-1).reshape(
+        -1, 2
+    )
     places += rng.uniform(-0.5, 0.5, places.shape)
     light = np.full((SIDE_PX, SIDE_PX), 20.0)
     for x, y in places:
         own = np.hypot(sigma, corner * np.hypot(x - CENTER_PX[0], y - CENTER_PX[1]) / CORNER_PX)
         columns, rows = (np.arange(int(at) - 12, int(at) + 14) for at in (x, y))
-        along = np.mean([gaussian(columns, x + trail_px * t, own) for t in (np.arange(9) + 0.5) / 9 - 0.5], axis=0)
-        light[rows[:, None], columns] += 5000 * 10 ** rng.uniform(-0.4, 0.4) * np.outer(gaussian(rows, y, own), along)
+        along = np.mean(
+            [gaussian(columns, x + trail_px * t, own) for t in (np.arange(9) + 0.5) / 9 - 0.5],
+            axis=0,
+        )
+        light[rows[:, None], columns] += (
+            5000 * 10 ** rng.uniform(-0.4, 0.4) * np.outer(gaussian(rows, y, own), along)
+        )
     return np.rint(GAIN_DN_E * rng.poisson(light) + rng.normal(0, READ_DN, light.shape)), places
 
 
@@ -78,7 +90,9 @@ def test_sizes_over_the_field_are_those_drawn_within_their_errors() -> None:
 def test_double_stars_are_left_out() -> None:
     rng = np.random.default_rng(9)
     image, places = drawn(rng, 0.8, 0.0)
-    image += np.roll(np.where(np.arange(SIDE_PX) < 120, image, 0.0), (1, 2), axis=(0, 1))  # companions at the left
+    image += np.roll(
+        np.where(np.arange(SIDE_PX) < 120, image, 0.0), (1, 2), axis=(0, 1)
+    )  # companions at the left
     stars = star_images.fit_images(image, places, GAIN_DN_E, READ_DN**2)
     size = star_images.image_size(stars, CENTER_PX, CORNER_PX)
     assert size is not None
@@ -94,7 +108,10 @@ def test_trails_are_measured_and_refused() -> None:
     assert along == pytest.approx(1.6**2 / 12, rel=0.1)
     assert abs(across) < 0.03
     frame = NightFrame(Path("night_1.fits"), None, stars, None)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"night_1.fits: stars trail by 1\.[5-8] px at -?[01]° from the rows; allowed"):
+    with pytest.raises(
+        InputError,
+        match=r"night_1.fits: stars trail by 1\.[5-8] px at -?[01]° from the rows; allowed",
+    ):
         lens.check_trails([frame])
     still, _ = fitted(np.random.default_rng(4), 0.8, 0.0)
     lens.check_trails([frame._replace(stars=still)])
@@ -109,8 +126,12 @@ def test_slopes_of_the_image_are_differences() -> None:
     for n in range(6):
         step = np.zeros(6)
         step[n] = 1e-5 * max(abs(p[0, n]), 1)
-        difference = (star_images.model(p + step)[0] - star_images.model(p - step)[0]) / (2 * step[n])
-        np.testing.assert_allclose(slopes[:, :, n], difference, rtol=1e-6, atol=1e-7 * np.abs(slopes[:, :, n]).max())
+        difference = (star_images.model(p + step)[0] - star_images.model(p - step)[0]) / (
+            2 * step[n]
+        )
+        np.testing.assert_allclose(
+            slopes[:, :, n], difference, rtol=1e-6, atol=1e-7 * np.abs(slopes[:, :, n]).max()
+        )
 
 
 def test_a_tilt_is_seen() -> None:
@@ -129,22 +150,49 @@ def test_a_tilt_is_seen() -> None:
 # Frames of the renderer
 
 CHIP = {
-    **{"quantum_efficiency": 0.6, "bits": 12, "gain_e_dn": 2.6, "offset_dn": 100, "full_well_e": 10_000},
-    **{"read_noise_e": 5.0, "prnu": 0.009, "dark_e_s": 4.0, "dsnu": 0.3},
+    "quantum_efficiency": 0.6,
+    "bits": 12,
+    "gain_e_dn": 2.6,
+    "offset_dn": 100,
+    "full_well_e": 10_000,
+    "read_noise_e": 5.0,
+    "prnu": 0.009,
+    "dark_e_s": 4.0,
+    "dsnu": 0.3,
 }
 TRUE = {
-    **{"width_px": 400, "height_px": 300, "pixel": "11.8 um", "focal_length": "16 mm", "f_number": 1.4},
-    **{"distortion": [-0.06, 0.02, 0, 0, 0], "psf": {"kind": "gaussian", "sigma_px": 0.8, "corner_sigma_px": 0.6}},
-    **{"detector": CHIP},
+    "width_px": 400,
+    "height_px": 300,
+    "pixel": "11.8 um",
+    "focal_length": "16 mm",
+    "f_number": 1.4,
+    "distortion": [-0.06, 0.02, 0, 0, 0],
+    "psf": {"kind": "gaussian", "sigma_px": 0.8, "corner_sigma_px": 0.6},
+    "detector": CHIP,
 }
-SHEET = TRUE | {"focal_length": "16.3 mm", "distortion": [0, 0, 0, 0, 0], "psf": {"kind": "gaussian"}}
-FRAMES, EXPOSURE_S, SATURATION_DN = 12, 0.1, 3946.0
+SHEET = TRUE | {
+    "focal_length": "16.3 mm",
+    "distortion": [0, 0, 0, 0, 0],
+    "psf": {"kind": "gaussian"},
+}
+FRAMES = 12
+EXPOSURE_S = 0.1
+SATURATION_DN = 3946.0
 
 
 def transfer() -> Transfer:
     """The photon transfer of this chip, exact."""
     gain = 1 / CHIP["gain_e_dn"]
-    values = np.array([gain, 0.0, (gain * CHIP["read_noise_e"]) ** 2, CHIP["offset_dn"], 1.0, gain * CHIP["dark_e_s"]])
+    values = np.array(
+        [
+            gain,
+            0.0,
+            (gain * CHIP["read_noise_e"]) ** 2,
+            CHIP["offset_dn"],
+            1.0,
+            gain * CHIP["dark_e_s"],
+        ]
+    )
     return Transfer(values, np.zeros((6, 6)), 0.0, 1.0, [])
 
 
@@ -152,13 +200,20 @@ def rendered(folder: Path, camera: dict[str, Any], seed: int) -> list[tuple[Fram
     """Frames at attitudes all over the sky, at rest; the camera's file is written into the folder."""
     path = folder / f"camera_{seed}.yaml"
     path.write_text(yaml.safe_dump({"camera": camera}), encoding="utf-8")
-    overrides = {"camera.preset": str(path), "exposure.time": f"{EXPOSURE_S} s", "seed": seed, "exposure.frames": 1}
+    overrides = {
+        "camera.preset": str(path),
+        "exposure.time": f"{EXPOSURE_S} s",
+        "seed": seed,
+        "exposure.frames": 1,
+    }
     lab = build_lab(loader.load_scene("shefex2", overrides))
     return list(render_stops(lab, Rotation.random(FRAMES, rng=np.random.default_rng(3))))
 
 
 @pytest.mark.slow
-def test_lens_and_star_images_come_back_and_frames_with_them_are_indistinguishable(tmp_path: Path) -> None:
+def test_lens_and_star_images_come_back_and_frames_with_them_are_indistinguishable(
+    tmp_path: Path,
+) -> None:
     truth = rendered(tmp_path, TRUE, 1)
     for n, (frame, _) in enumerate(truth):
         files.write_png16(files.make_folder(tmp_path / "night") / f"night_{n}.png", frame.image_dn)
@@ -173,12 +228,24 @@ def test_lens_and_star_images_come_back_and_frames_with_them_are_indistinguishab
     assert disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE))) < 0.1
     psf = {"kind": "gaussian", "sigma_px": night.size.sigma_px.value}
     psf["corner_sigma_px"] = night.size.corner_sigma_px.value
-    measured = {key: value for key, (value, _) in preset.measured_lens(config, night).items() if "." not in key}
-    ours = rendered(tmp_path, TRUE | measured | {"psf": psf, "detector": CHIP | {"hardware_seed": 5}}, 2)
-    wide = rendered(tmp_path, TRUE | {"psf": psf | {"sigma_px": 0.88}, "detector": CHIP | {"hardware_seed": 5}}, 2)
+    measured = {
+        key: value
+        for key, (value, _) in preset.measured_lens(config, night).items()
+        if "." not in key
+    }
+    ours = rendered(
+        tmp_path, TRUE | measured | {"psf": psf, "detector": CHIP | {"hardware_seed": 5}}, 2
+    )
+    wide = rendered(
+        tmp_path,
+        TRUE | {"psf": psf | {"sigma_px": 0.88}, "detector": CHIP | {"hardware_seed": 5}},
+        2,
+    )
     near = [star_pixels(one) for _, one in truth]
     first, same, other = (
-        np.concatenate([frame.image_dn[mask] for (frame, _), mask in zip(frames, near, strict=True)])
+        np.concatenate(
+            [frame.image_dn[mask] for (frame, _), mask in zip(frames, near, strict=True)]
+        )
         for frames in (truth, ours, wide)
     )
     assert histogram_p(first, same) > 0.01

@@ -22,18 +22,37 @@ from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
 CHIP = {
-    **{"quantum_efficiency": 0.6, "bits": 12, "gain_e_dn": 2.64, "offset_dn": 100, "full_well_e": 10700},
-    **{"read_noise_e": 6.0, "nonlinearity": 0.03, "prnu": 0.01, "column_offset_e": 2.0},
-    **{"dark_e_s": 5.0, "dsnu": 0.3, "hot_pixels": 2e-3, "hot_e_s": 100.0},
-    **{"dark_temperature_c": 20.0, "dark_doubling_c": 7.0},
+    "quantum_efficiency": 0.6,
+    "bits": 12,
+    "gain_e_dn": 2.64,
+    "offset_dn": 100,
+    "full_well_e": 10700,
+    "read_noise_e": 6.0,
+    "nonlinearity": 0.03,
+    "prnu": 0.01,
+    "column_offset_e": 2.0,
+    "dark_e_s": 5.0,
+    "dsnu": 0.3,
+    "hot_pixels": 2e-3,
+    "hot_e_s": 100.0,
+    "dark_temperature_c": 20.0,
+    "dark_doubling_c": 7.0,
 }
 FLAT_S = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.8, 1.3, 1.5)
 Z_95 = stats.norm.ppf(0.975)
 
 
 def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
-    lens = {"pixel": "5 um", "focal_length": "25 mm", "f_number": 2, "height_px": side_px, "width_px": side_px}
-    return CameraConfig.model_validate(lens | {"detector": CHIP | {"hardware_seed": seed} | changes})
+    lens = {
+        "pixel": "5 um",
+        "focal_length": "25 mm",
+        "f_number": 2,
+        "height_px": side_px,
+        "width_px": side_px,
+    }
+    return CameraConfig.model_validate(
+        lens | {"detector": CHIP | {"hardware_seed": seed} | changes}
+    )
 
 
 def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
@@ -41,26 +60,37 @@ def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
     rng = np.random.default_rng(1000 + seed)
 
     def frames(temperature_c: float, rate_e_s: float, exposure_s: float, count: int) -> Level:
-        made = Detector.from_camera(camera(side_px, seed, **(changes | {"temperature_c": temperature_c})))
+        made = Detector.from_camera(
+            camera(side_px, seed, **(changes | {"temperature_c": temperature_c}))
+        )
         light_e = np.full((side_px, side_px), rate_e_s * exposure_s, np.float32)
         shots = (detector.expose(light_e.copy(), exposure_s, made, rng) for _ in range(count))
         return level(exposure_s, temperature_c, shots)
 
     rate_e_s = float((CHIP | changes)["full_well_e"])
-    dark_levels = [frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)]
+    dark_levels = [
+        frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)
+    ]
     return sensor.characterize(dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S])
 
 
-def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_and_flicker() -> None:
+def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_and_flicker() -> (
+    None
+):
     rng = np.random.default_rng(1)
-    pattern, sigma = rng.uniform(200, 4000, (200, 300)), 7.0
-    frames = [np.rint(pattern * lamp + rng.normal(0, sigma, pattern.shape)) for lamp in (1, 1.0, 1, 1.0)]
+    pattern = rng.uniform(200, 4000, (200, 300))
+    sigma = 7.0
+    frames = [
+        np.rint(pattern * lamp + rng.normal(0, sigma, pattern.shape)) for lamp in (1, 1.0, 1, 1.0)
+    ]
     shifted = [frame.astype(np.uint16) + np.uint16(n) for n, frame in enumerate(frames)]
     found = level(0.1, 20.0, shifted)
     moments = found.moments(np.ones(pattern.shape, bool))
     assert found.count == 4
     assert abs(moments.variance_dn2 - sigma**2 - 1 / 12) < 4 * moments.variance_sigma_dn2
-    assert moments.variance_sigma_dn2 == pytest.approx(sigma**2 * np.sqrt(2 / 2 / pattern.size), rel=0.02)
+    assert moments.variance_sigma_dn2 == pytest.approx(
+        sigma**2 * np.sqrt(2 / 2 / pattern.size), rel=0.02
+    )
     assert abs(moments.mean_dn - pattern.mean() - 1.5) < 4 * sigma / np.sqrt(4 * pattern.size)
     assert found.difference_dn2 == pytest.approx(1.0, rel=0.2)
 
@@ -68,15 +98,21 @@ def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_a
 def test_an_odd_last_frame_is_left_out() -> None:
     rng = np.random.default_rng(2)
     frames = [rng.integers(90, 110, (20, 30)).astype(np.uint16) for _ in range(5)]
-    odd, even = level(1.0, None, frames), level(1.0, None, frames[:4])
+    odd = level(1.0, None, frames)
+    even = level(1.0, None, frames[:4])
     assert odd.count == 4
     np.testing.assert_array_equal(odd.variance_dn2, even.variance_dn2)
 
 
-def exact_points(gain_dn_e: float, curvature: float, read_dn: float, black_dn: float) -> list[Point]:
+def exact_points(
+    gain_dn_e: float, curvature: float, read_dn: float, black_dn: float
+) -> list[Point]:
     """Points of the law, from 10^7 numbers drawn for none: by the moments of a Poisson variable up to the fourth."""
     points = []
-    for lit, rate_e_s, times in ((0, 3.0, (0.1, 5.0, 20.0)), (1, 2003.0, (0.1, 0.4, 1.0, 2.0, 3.0))):
+    for lit, rate_e_s, times in (
+        (0, 3.0, (0.1, 5.0, 20.0)),
+        (1, 2003.0, (0.1, 0.4, 1.0, 2.0, 3.0)),
+    ):
         for t_s in times:
             n = rate_e_s * t_s
             # y = x - c x^2 of x = K N + r: exact variance with E[N^k] of Poisson and a Gaussian r.
@@ -84,15 +120,21 @@ def exact_points(gain_dn_e: float, curvature: float, read_dn: float, black_dn: f
             weight = stats.poisson.pmf(support, n)
             nodes, by = np.polynomial.hermite_e.hermegauss(9)
             x = gain_dn_e * support[:, None] + read_dn * nodes
-            y, w = x - curvature * x**2, weight[:, None] * by / by.sum()
+            y = x - curvature * x**2
+            w = weight[:, None] * by / by.sum()
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
-            points.append(Point(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance)))
+            points.append(
+                Point(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance))
+            )
     return points
 
 
 def test_the_fit_returns_the_law_of_its_points() -> None:
-    gain, curvature, read, black = 0.4, 4e-6, 2.5, 100.0
+    gain = 0.4
+    curvature = 4e-6
+    read = 2.5
+    black = 100.0
     found = photon_transfer.fit(exact_points(gain, curvature, read, black), 0.0)
     assert found.gain_e_dn.value == pytest.approx(1 / gain, rel=2e-3)
     assert found.read_noise_e.value == pytest.approx(read / gain, rel=2e-3)
@@ -105,21 +147,32 @@ def test_the_fit_returns_the_law_of_its_points() -> None:
 def test_linear_signal_is_the_inverse_of_the_amplifier() -> None:
     x = np.linspace(0, 4000, 9)
     for curvature in (0.0, 1e-5, -1e-5):
-        np.testing.assert_allclose(photon_transfer.linear_dn(x - curvature * x**2, curvature), x, rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(
+            photon_transfer.linear_dn(x - curvature * x**2, curvature), x, rtol=1e-12, atol=1e-9
+        )
 
 
 def test_the_lamp_s_flicker_is_what_noise_does_not_explain() -> None:
-    rng, pixels, flicker = np.random.default_rng(3), 4000, 0.004
-    points, changes = [], []
+    rng = np.random.default_rng(3)
+    pixels = 4000
+    flicker = 0.004
+    points = []
+    changes = []
     for mean in np.linspace(500, 3000, 400):
         points.append(Point(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
         change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
         changes.append(change**2)
-    assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(flicker, rel=0.1)
+    assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(
+        flicker, rel=0.1
+    )
 
 
-def drawn_rates(rng: np.random.Generator, pixels: int, noise: RateNoise, hot: float = 0.004) -> Floats:
-    mean, dsnu, excess = 2.0, 0.4, 30.0
+def drawn_rates(
+    rng: np.random.Generator, pixels: int, noise: RateNoise, hot: float = 0.004
+) -> Floats:
+    mean = 2.0
+    dsnu = 0.4
+    excess = 30.0
     s2 = np.log1p(dsnu**2)
     rates = mean * rng.lognormal(-s2 / 2, np.sqrt(s2), pixels)
     rates += np.where(rng.random(pixels) < hot, rng.exponential(excess, pixels), 0.0)
@@ -128,7 +181,8 @@ def drawn_rates(rng: np.random.Generator, pixels: int, noise: RateNoise, hot: fl
 
 @pytest.mark.parametrize("reading", [0.001, 0.3])
 def test_the_law_of_the_dark_current_is_that_of_drawn_pixels(reading: float) -> None:
-    rng, noise = np.random.default_rng(4), RateNoise(reading, 0.01)
+    rng = np.random.default_rng(4)
+    noise = RateNoise(reading, 0.01)
     rates = drawn_rates(rng, 400_000, noise)
     theta = np.array([np.log(2.0), np.log(0.4), np.log(0.004 / 0.996), np.log(30.0)])
     edges = np.quantile(rates, np.linspace(0.002, 0.998, 60))
@@ -145,11 +199,14 @@ def test_dark_current_of_drawn_pixels_is_found_within_its_interval() -> None:
     pulls = []
     for seed in range(20):
         noise = RateNoise(0.3, 0.01)
-        found = dark_current.fit(drawn_rates(np.random.default_rng(seed), 60_000, noise), noise, np.inf)
+        found = dark_current.fit(
+            drawn_rates(np.random.default_rng(seed), 60_000, noise), noise, np.inf
+        )
         assert found.hot is not None
         pairs = ((found.mean, 2.0), (found.dsnu, 0.4), (found.hot_pixels, 0.004), (found.hot, 30.0))
         pulls.append([(one.value - truth) / one.sigma for one, truth in pairs])
-    mean, spread = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)
+    mean = np.mean(pulls, axis=0)
+    spread = np.std(pulls, axis=0, ddof=1)
     assert np.all(np.abs(mean) < 4 / np.sqrt(20))
     assert np.all((spread > 0.5) & (spread < 1.6))
 
@@ -162,11 +219,14 @@ def test_few_hot_pixels_are_counted() -> None:
     assert found.hot is None
     assert found.hot_pixels.value == pytest.approx(3 / 60_000)
     exact = stats.binomtest(3, 60_000).proportion_ci()
-    assert (found.hot_pixels.low, found.hot_pixels.high) == pytest.approx((exact.low, exact.high), rel=1e-6)
+    assert (found.hot_pixels.low, found.hot_pixels.high) == pytest.approx(
+        (exact.low, exact.high), rel=1e-6
+    )
 
 
 def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
-    rng, noise = np.random.default_rng(8), RateNoise(4.0, 0.01)
+    rng = np.random.default_rng(8)
+    noise = RateNoise(4.0, 0.01)
     assert not dark_current.is_resolved(rng.normal(0.3, 2.0, 50_000), noise)
     assert dark_current.is_resolved(drawn_rates(rng, 50_000, noise), noise)
 
@@ -189,7 +249,9 @@ def test_propagation_of_errors_is_that_of_a_product() -> None:
 
 def test_intervals_are_those_of_their_laws() -> None:
     assert Estimate.normal(3.0, 0.5)[2:] == pytest.approx((3 - 0.5 * Z_95, 3 + 0.5 * Z_95))
-    assert Estimate.lognormal(3.0, 0.3)[2:] == pytest.approx((3 * np.exp(-0.1 * Z_95), 3 * np.exp(0.1 * Z_95)))
+    assert Estimate.lognormal(3.0, 0.3)[2:] == pytest.approx(
+        (3 * np.exp(-0.1 * Z_95), 3 * np.exp(0.1 * Z_95))
+    )
     root = Estimate.root(9.0, 0.6)
     assert root == pytest.approx((3.0, 0.1, np.sqrt(9 - 0.6 * Z_95), np.sqrt(9 + 0.6 * Z_95)))
     assert Estimate.root(-1.0, 0.1).low == Estimate.root(-1.0, 0.1).high == 0
@@ -250,16 +312,23 @@ def test_intervals_cover_the_truth_in_95_percent_of_400_cameras() -> None:
 
 
 @pytest.mark.slow
-def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wrong_one_are_not() -> None:
+def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wrong_one_are_not() -> (
+    None
+):
     """Another chip of the same preset: darks, warm darks and flats. Columns are the same along a column, so without."""
-    side, changes = 256, {"column_offset_e": 0.0}
+    side = 256
+    changes = {"column_offset_e": 0.0}
     found = measured(side, 11, darks=16, **changes).estimates
     values = {key: max(one.value, 0.0) for key, one in found.items()} | changes
-    light = found["gain_e_dn"].value / CHIP["gain_e_dn"]  # the lamp as the flats measured it, not as it is
+    light = (
+        found["gain_e_dn"].value / CHIP["gain_e_dn"]
+    )  # the lamp as the flats measured it, not as it is
 
     def numbers(config: DetectorConfig, shot: rendered.Shot, seed: int) -> Floats:
         one = camera(side).model_copy(update={"detector": config})
-        return np.concatenate([frame.ravel() for frame in rendered.frames_of(one, shot, seed)]).astype(float)
+        return np.concatenate(
+            [frame.ravel() for frame in rendered.frames_of(one, shot, seed)]
+        ).astype(float)
 
     true = DetectorConfig.model_validate(CHIP | changes | {"hardware_seed": 21})
     ours = DetectorConfig.model_validate(CHIP | values | {"hardware_seed": 22})
@@ -278,8 +347,12 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
 
 def test_tracks_of_particles_are_neither_noise_nor_hot_pixels() -> None:
     """Twelve tracks of six pixels in one dark of eight: as many pixels as would be hot, with a fivefold variance."""
-    rng, shape = np.random.default_rng(12), (96, 96)
-    frames = [np.rint(100 + rng.normal(0, 3, shape) + rng.poisson(20, shape)).astype(np.uint16) for _ in range(8)]
+    rng = np.random.default_rng(12)
+    shape = (96, 96)
+    frames = [
+        np.rint(100 + rng.normal(0, 3, shape) + rng.poisson(20, shape)).astype(np.uint16)
+        for _ in range(8)
+    ]
     for x, y in rng.integers(0, 90, (12, 2)):
         frames[3][y, x : x + 6] += 400
     hit = level(10.0, None, frames)

@@ -8,10 +8,15 @@ from typing import Any
 
 from skysim.experiments.dataset import plan
 
-WIDTH, HEIGHT = 240, 180
+WIDTH = 240
+HEIGHT = 180
 SMALL = {
-    **{"camera.width_px": f"{WIDTH}", "camera.height_px": f"{HEIGHT}", "camera.focal_length": "12 mm"},
-    **{"exposure.time": "200 ms", "exposure.rate_hz": "4", "light.limit_mag": "7.0"},
+    "camera.width_px": f"{WIDTH}",
+    "camera.height_px": f"{HEIGHT}",
+    "camera.focal_length": "12 mm",
+    "exposure.time": "200 ms",
+    "exposure.rate_hz": "4",
+    "light.limit_mag": "7.0",
 }
 VARY = """
 schema: 1
@@ -32,4 +37,7 @@ def small(vary: Path | None = None, frames: int = 5, **more: Any) -> plan.Datase
 def contents(folder: Path) -> dict[str, str]:
     """The hash of every file of a folder by its name."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }

@@ -21,12 +21,18 @@ from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
 from skysim.tracking.onboard_model import assumed_camera
 
-PARTICLE = {"camera.detector.particles": [{"per_cm2_s": 2000, "depth": "20 um", "electrons_um": 80}]}
+PARTICLE = {
+    "camera.detector.particles": [{"per_cm2_s": 2000, "depth": "20 um", "electrons_um": 80}]
+}
 
 
-def setup_with(settings: dict[str, object] | None = None, trial: dict[str, object] | None = None) -> Setup:
+def setup_with(
+    settings: dict[str, object] | None = None, trial: dict[str, object] | None = None
+) -> Setup:
     base = {key: parse_yaml(value)[1] for key, value in SMALL.items()}
-    spec = TrialSpec("shefex2", ".", 1, {**base, **(settings or {})}, {"kind": "frames", **(trial or {})}, True)
+    spec = TrialSpec(
+        "shefex2", ".", 1, {**base, **(settings or {})}, {"kind": "frames", **(trial or {})}, True
+    )
     return prepared_setup(spec, {})
 
 
@@ -47,10 +53,13 @@ def test_run_lengths_are_those_of_the_columns() -> None:
         np.testing.assert_array_equal(decoded(counts, mask.shape), mask)
 
 
-@pytest.mark.parametrize(("sigma_px", "streak_px"), [(0.8, 0.0), (1.0, 1.5), (1.0, 3.0), (1.0, 6.0), (0.8, 25.0)])
+@pytest.mark.parametrize(
+    ("sigma_px", "streak_px"), [(0.8, 0.0), (1.0, 1.5), (1.0, 3.0), (1.0, 6.0), (0.8, 25.0)]
+)
 def test_the_width_of_a_streak_is_that_of_its_blur(sigma_px: float, streak_px: float) -> None:
     """Drawn five times finer: a line of light, blurred."""
-    fine, shape = 5, (150, 400)
+    fine = 5
+    shape = (150, 400)
     light = np.zeros(shape)
     light[75, 200 - round(fine * streak_px / 2) : 201 + round(fine * streak_px / 2)] = 1
     light = gaussian_filter(light, fine * sigma_px)
@@ -64,11 +73,15 @@ def test_streak_vectors_are_those_of_the_turning_camera() -> None:
     setup = setup_with(trial={"rate_deg_s": 3.0})
     one = labels.label_frame(setup, 5)
     camera: Camera = assumed_camera(setup.lab.scene)
-    rows, rate, half_s = one.sources, one.truth.rate_cam_rad_s, one.frame.exposure_s / 2
+    rows = one.sources
+    rate = one.truth.rate_cam_rad_s
+    half_s = one.frame.exposure_s / 2
     assert len(rows) > 5
     middle = camera.rays(np.column_stack([rows["x_px"], rows["y_px"]]))
     # Directions at rest turn against the camera: v(t) = exp(-w t) v.
-    begin, end = (camera.pixels(Rotation.from_rotvec(-rate * t).apply(middle)) for t in (-half_s, half_s))
+    begin, end = (
+        camera.pixels(Rotation.from_rotvec(-rate * t).apply(middle)) for t in (-half_s, half_s)
+    )
     found = np.column_stack([rows["streak_x_px"], rows["streak_y_px"]])
     np.testing.assert_allclose(found, end - begin, atol=2e-3)
     assert np.linalg.norm(found, axis=1).min() > 1
@@ -76,7 +89,8 @@ def test_streak_vectors_are_those_of_the_turning_camera() -> None:
 
 def test_bright_sources_are_detected_where_their_light_is() -> None:
     """Alone within 12 px and 6 px from the border: a tracker may take two images that touch for one."""
-    setup, checked = setup_with(), 0
+    setup = setup_with()
+    checked = 0
     for seed in (5, 6, 9):
         rows = labels.label_frame(setup, seed).sources
         xy = np.column_stack([rows["flux_x_px"], rows["flux_y_px"]])
@@ -95,27 +109,39 @@ def test_bright_sources_are_detected_where_their_light_is() -> None:
 def test_a_still_star_has_a_square_about_it() -> None:
     """Also where rounding gives it a streak of 1e-14 pixels."""
     rows = np.zeros(3, labels.SOURCE)
-    rows["flux_x_px"], rows["flux_y_px"] = 10, 20
+    rows["flux_x_px"] = 10
+    rows["flux_y_px"] = 20
     rows["streak_x_px"] = [0, 1e-14, -1e-14]
     rows["sigma_px"] = 0.7
-    for box, outline in zip(*shards.outlines(labels.image_extents(rows, Window(0, 1), 100)), strict=True):
+    for box, outline in zip(
+        *shards.outlines(labels.image_extents(rows, Window(0, 1), 100)), strict=True
+    ):
         assert box == pytest.approx([10.5 - 2.1, 20.5 - 2.1, 4.2, 4.2])
         assert sorted(outline) == pytest.approx([8.4, 8.4, 12.6, 12.6, 18.4, 18.4, 22.6, 22.6])
 
 
 MOON: dict[str, object] = {
-    **{"light.bodies": {}, "start_time": "2012-06-27T03:30:00", "camera.focal_length": "60 mm"},
-    **{"camera.detector.anti_blooming": 1.0, "camera.detector.full_well_e": 1000, "exposure.time": "20 ms"},
+    "light.bodies": {},
+    "start_time": "2012-06-27T03:30:00",
+    "camera.focal_length": "60 mm",
+    "camera.detector.anti_blooming": 1.0,
+    "camera.detector.full_well_e": 1000,
+    "exposure.time": "20 ms",
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shutter", "slack_px"), [({}, 4.5), ({"camera.shutter": {"kind": "rolling", "row_time": "0.1 ms"}}, 9)]
+    ("shutter", "slack_px"),
+    [({}, 4.5), ({"camera.shutter": {"kind": "rolling", "row_time": "0.1 ms"}}, 9)],
 )
-def test_the_outline_of_the_moon_is_about_its_saturated_disc(shutter: dict[str, object], slack_px: float) -> None:
+def test_the_outline_of_the_moon_is_about_its_saturated_disc(
+    shutter: dict[str, object], slack_px: float
+) -> None:
     """Half of it is lit. The lit limb is close to the outline, and no light of it is beyond."""
-    setup = setup_with(MOON | shutter, {"near": {"body": "moon", "off_deg": [0, 0.3]}, "rate_deg_s": 10})
+    setup = setup_with(
+        MOON | shutter, {"near": {"body": "moon", "off_deg": [0, 0.3]}, "rate_deg_s": 10}
+    )
     for seed in (1, 2, 5):  # both limbs, far from the middle row
         one = labels.label_frame(setup, seed)
         moon = one.sources["radius_px"] > labels.DISC_PX
@@ -133,7 +159,8 @@ def test_the_outline_of_the_moon_is_about_its_saturated_disc(shutter: dict[str, 
 
 
 def test_a_detection_is_that_of_the_brightest_source_near_it_and_of_one_alone() -> None:
-    xy, one = np.array([[10.0, 10], [11, 10], [50, 50]]), np.ones(3)
+    xy = np.array([[10.0, 10], [11, 10], [50, 50]])
+    one = np.ones(3)
     truth = SourceTruth(
         np.arange(3), xy, xy, np.array([1.0, 9, 4]), one, 0 * one, one, np.rint(xy).astype(int), one > 2, one,
         np.zeros((3, 2)),
@@ -154,8 +181,12 @@ def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     free = with_.frame.image_dn < with_.frame.saturation_dn
     assert 20 < mask.sum() < 4000
     loss_e = 2 + 0.02 * np.abs(added_e)  # transfer loss moves a little charge to the next pixels
-    assert (added_e[mask & free] > config.read_noise_e - config.gain_e_dn - loss_e[mask & free]).all()
-    assert (added_e[~mask & free] < config.read_noise_e + config.gain_e_dn + loss_e[~mask & free]).all()
+    assert (
+        added_e[mask & free] > config.read_noise_e - config.gain_e_dn - loss_e[mask & free]
+    ).all()
+    assert (
+        added_e[~mask & free] < config.read_noise_e + config.gain_e_dn + loss_e[~mask & free]
+    ).all()
 
 
 def test_a_frame_with_labels_is_that_of_the_trial() -> None:
@@ -174,8 +205,11 @@ def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:
     well_e = 1500
     shallow = labels.label_frame(setup_with(base | {"camera.detector.full_well_e": well_e}), 5)
     deep = setup_with(base)
-    mask, config = decoded(shallow.masks[labels.SATURATED], (HEIGHT, WIDTH)), deep.lab.scene.camera.detector
-    charge_e = (labels.label_frame(deep, 5).frame.image_dn.astype(float) - config.offset_dn) * config.gain_e_dn
+    mask = decoded(shallow.masks[labels.SATURATED], (HEIGHT, WIDTH))
+    config = deep.lab.scene.camera.detector
+    charge_e = (
+        labels.label_frame(deep, 5).frame.image_dn.astype(float) - config.offset_dn
+    ) * config.gain_e_dn
     noise_e = config.read_noise_e
     assert mask.sum() > 3
     # The least saturated value is 3 sigma of the read-out noise below the well.
@@ -187,7 +221,9 @@ def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:
 def test_smear_is_masked_in_the_columns_that_get_more_than_the_threshold() -> None:
     """A pixel gets leak row_time / exposure of the light of all others of its column."""
     light = np.zeros((40, 6), np.float32)
-    light[20, 1], light[20, 3], light[5, 5] = 1000, 3000, 9000
+    light[20, 1] = 1000
+    light[20, 3] = 3000
+    light[5, 5] = 9000
     added = AddedCharge(1.5)
     shutter = InterlineConfig(kind="interline", row_time="1 ms", leak=1.0)
     detector.smear(light.copy(), 1.0, shutter, added)

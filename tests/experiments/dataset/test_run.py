@@ -64,7 +64,8 @@ def samples(folder: Path) -> dict[str, dict[str, Any]]:
 
 def test_every_format_has_the_same_frames(whole: Path) -> None:
     zarr = pytest.importorskip("zarr")
-    rows, made = index(whole), samples(whole)
+    rows = index(whole)
+    made = samples(whole)
     images = zarr.open_group(whole / "images.zarr", mode="r")["images"]
     assert images.metadata.zarr_format == 3
     assert [row["frame"] for row in rows] == list(range(5))
@@ -82,14 +83,25 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
         assert 0.1 <= one["frame.json"]["levels"]["rate"] <= 0.5
         assert len(one["sources.npy"]) == row["sources"] > 0
     assert len({row["ra_deg"] for row in rows}) == 5
-    rate = [np.degrees(np.linalg.norm([row[f"rate_cam_{end}_rad_s"] for end in "xyz"])) for row in rows]
+    rate = [
+        np.degrees(np.linalg.norm([row[f"rate_cam_{end}_rad_s"] for end in "xyz"])) for row in rows
+    ]
     np.testing.assert_allclose(rate, [json.loads(row["levels"])["rate"] for row in rows], rtol=1e-9)
 
 
 def test_the_table_of_sources_has_those_of_the_frames(whole: Path) -> None:
-    made, found = samples(whole), [pyarrow.read_table(path) for path in sorted((whole / "sources").glob("*.parquet"))]
-    ids = [pair for table in found for pair in zip(*(table[name].to_pylist() for name in ("frame", "id")), strict=True)]
-    assert ids == [(int(key), n) for key, one in sorted(made.items()) for n in one["sources.npy"]["id"].tolist()]
+    made = samples(whole)
+    found = [pyarrow.read_table(path) for path in sorted((whole / "sources").glob("*.parquet"))]
+    ids = [
+        pair
+        for table in found
+        for pair in zip(*(table[name].to_pylist() for name in ("frame", "id")), strict=True)
+    ]
+    assert ids == [
+        (int(key), n)
+        for key, one in sorted(made.items())
+        for n in one["sources.npy"]["id"].tolist()
+    ]
 
 
 def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
@@ -97,28 +109,47 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
 
     A count is 10 electrons. The error has four standard deviations of the noise, and 2 % for light beside the box.
     """
-    made, checked = samples(whole), 0
+    made = samples(whole)
+    checked = 0
     ids = []
     for path in sorted((whole / "coco").glob("*.json")):
         coco = json.loads(path.read_text())
         ids += [one["id"] for one in coco["annotations"]]
-        assert [one["name"] for one in coco["categories"]] == ["source", "saturated", "cosmic_ray", "smear"]
+        assert [one["name"] for one in coco["categories"]] == [
+            "source",
+            "saturated",
+            "cosmic_ray",
+            "smear",
+        ]
         names = {one["id"]: one["file_name"] for one in coco["images"]}
         for one in coco["annotations"]:
             assert names[one["image_id"]].endswith(f"{shards.key_of(one['image_id'])}.image.npy")
             if one["category_id"] != 1:
                 continue
             sample = made[shards.key_of(one["image_id"])]
-            image, rows = sample["image.npy"].astype(float), sample["sources.npy"]
+            image = sample["image.npy"].astype(float)
+            rows = sample["sources.npy"]
             row = rows[rows["id"] == one["source"]][0]
             x, y, width, height = one["bbox"]
             assert x < row["flux_x_px"] + 0.5 < x + width
             assert y < row["flux_y_px"] + 0.5 < y + height
-            x0, y0, x1, y1 = int(x), int(y), int(np.ceil(x + width)), int(np.ceil(y + height))
+            x0 = int(x)
+            y0 = int(y)
+            x1 = int(np.ceil(x + width))
+            y1 = int(np.ceil(y + height))
             alone = np.hypot(rows["x_px"] - row["x_px"], rows["y_px"] - row["y_px"]) < 15
-            if row["snr"] > 15 and alone.sum() == 1 and x0 > 3 and y0 > 3 and x1 < WIDTH - 3 and y1 < HEIGHT - 3:
+            if (
+                row["snr"] > 15
+                and alone.sum() == 1
+                and x0 > 3
+                and y0 > 3
+                and x1 < WIDTH - 3
+                and y1 < HEIGHT - 3
+            ):
                 light_e = (image[y0:y1, x0:x1] - np.median(image)).sum() * 10
-                noise_e = np.sqrt((y1 - y0) * (x1 - x0) * np.var(image[:, :20]) * 100 + row["electrons"])
+                noise_e = np.sqrt(
+                    (y1 - y0) * (x1 - x0) * np.var(image[:, :20]) * 100 + row["electrons"]
+                )
                 assert abs(light_e - row["electrons"]) < 4 * noise_e + 0.02 * row["electrons"]
                 checked += 1
     assert checked >= 4
@@ -129,7 +160,9 @@ def test_numbers_with_two_decimals_are_written_as_json_writes_them() -> None:
     rng = np.random.default_rng(3)
     numbers = np.round(rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2)
     numbers[0] = [0.0, -0.0, 100.0, -0.05]
-    assert [f"[{row}]" for row in shards.hundredths(numbers)] == [json.dumps(row) for row in numbers.tolist()]
+    assert [f"[{row}]" for row in shards.hundredths(numbers)] == [
+        json.dumps(row) for row in numbers.tolist()
+    ]
     assert shards.hundredths(np.empty((0, 4))) == []
 
 
@@ -143,7 +176,10 @@ def test_the_box_of_a_mask_is_about_its_pixels() -> None:
         box = [x.min(), y.min(), np.ptp(x) + 1, np.ptp(y) + 1]
         assert shards.mask_box(run_lengths(mask), 20) == box
     mask[:, :] = False
-    mask[3:5, 2], mask[18:, 7], mask[:2, 8] = True, True, True  # one run from column 7 to column 8
+    # one run from column 7 to column 8
+    mask[3:5, 2] = True
+    mask[18:, 7] = True
+    mask[:2, 8] = True
     assert shards.mask_box(run_lengths(mask), 20) == [2, 0, 7, 20]
 
 
@@ -156,14 +192,17 @@ def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
     whole: Path, vary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before and after each file; a temporary file that was half written stays behind."""
-    original, left = storage.Storage.write, 0
+    original = storage.Storage.write
+    left = 0
 
     def stopping(self: storage.Storage, name: str, data: bytes) -> None:
         nonlocal left
         left -= 1
         if left == 0:
             torn = Path(self.path(name))
-            torn.with_name(f".{torn.stem}.skysim-{storage_host()}-999999999{torn.suffix}").write_bytes(b"half")
+            torn.with_name(
+                f".{torn.stem}.skysim-{storage_host()}-999999999{torn.suffix}"
+            ).write_bytes(b"half")
             raise Stopped
         original(self, name, data)
         if left == 1:
@@ -172,13 +211,15 @@ def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
     monkeypatch.setattr(storage.Storage, "write", stopping)
     stops = 0
     for first in range(1, 11):
-        folder, left = tmp_path / f"{first}", first
+        folder = tmp_path / f"{first}"
+        left = first
         for _ in range(30):
             try:
                 run.run(small(vary), str(folder), engines.Serial())
                 break
             except Stopped:
-                stops, left = stops + 1, first + 3
+                stops = stops + 1
+                left = first + 3
         assert contents(folder) == contents(whole)
     assert stops > 12
 
@@ -203,14 +244,19 @@ if __name__ == "__main__":
 
 
 @pytest.mark.long
-def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(vary: Path, tmp_path: Path) -> None:
+def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(
+    vary: Path, tmp_path: Path
+) -> None:
     """Twice by kill -9 in the middle of a shard, on two workers; then one process makes the rest."""
     run.run(small(vary, 40), str(tmp_path / "whole"), engines.Serial())
-    driver, folder = tmp_path / "driver.py", tmp_path / "killed"
+    driver = tmp_path / "driver.py"
+    folder = tmp_path / "killed"
     driver.write_text(DRIVER)
     words = [sys.executable, driver, Path(__file__).parent, vary, folder]
     for most in (4, 16):
-        environment = os.environ | dict.fromkeys(workers.ONE_THREAD, "1") | {"PYTHONPATH": str(ROOT)}
+        environment = (
+            os.environ | dict.fromkeys(workers.ONE_THREAD, "1") | {"PYTHONPATH": str(ROOT)}
+        )
         with subprocess.Popen(
             words, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
         ) as made:
@@ -236,7 +282,9 @@ def test_dask_makes_the_same_bytes(whole: Path, vary: Path, tmp_path: Path) -> N
     distributed = pytest.importorskip("distributed")
     from skysim.experiments.study.execution.runner import ENGINES
 
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
         engine = ENGINES["dask"](None, cluster.scheduler_address)
         assert run.run(small(vary), str(tmp_path / "dask"), engine).done == 5
         engine.close()
@@ -244,9 +292,12 @@ def test_dask_makes_the_same_bytes(whole: Path, vary: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_an_object_store_holds_the_same_bytes(whole: Path, vary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_object_store_holds_the_same_bytes(
+    whole: Path, vary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("s3fs")
-    boto3, moto = pytest.importorskip("boto3"), pytest.importorskip("moto.server")
+    boto3 = pytest.importorskip("boto3")
+    moto = pytest.importorskip("moto.server")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
         monkeypatch.setenv(name, "us-east-1")
     server = moto.ThreadedMotoServer(port=0, verbose=False)
@@ -259,7 +310,10 @@ def test_an_object_store_holds_the_same_bytes(whole: Path, vary: Path, monkeypat
         url = "s3://frames/night"
         assert run.run(small(vary), url, engines.Serial()).done == 5
         listed = client.list_objects_v2(Bucket="frames")["Contents"]
-        made = {one["Key"]: client.get_object(Bucket="frames", Key=one["Key"])["Body"].read() for one in listed}
+        made = {
+            one["Key"]: client.get_object(Bucket="frames", Key=one["Key"])["Body"].read()
+            for one in listed
+        }
         assert {name.removeprefix("night/") for name in made} == set(contents(whole))
         for name, data in made.items():
             assert data == (whole / name.removeprefix("night/")).read_bytes(), name
@@ -290,10 +344,19 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (changed("digest", "0"), "contains another dataset or an earlier version of this one; allowed: another folder"),
-        (changed("code", "0123"), r"made by skysim 0\.\d+\.\d+, code 0123; allowed: [0-9a-f]{16}, the version here"),
+        (
+            changed("digest", "0"),
+            "contains another dataset or an earlier version of this one; allowed: another folder",
+        ),
+        (
+            changed("code", "0123"),
+            r"made by skysim 0\.\d+\.\d+, code 0123; allowed: [0-9a-f]{16}, the version here",
+        ),
         (changed("format", 7), "a dataset of format 7; allowed: 1"),
-        (lambda folder: (folder / run.MANIFEST).write_text("[" * 10_000), "is not that of a dataset"),
+        (
+            lambda folder: (folder / run.MANIFEST).write_text("[" * 10_000),
+            "is not that of a dataset",
+        ),
         (lambda folder: (folder / run.MANIFEST).write_text("[]"), "is not that of a dataset"),
         (lambda folder: (folder / run.MANIFEST).write_text("{}"), "is not that of a dataset"),
         (
@@ -328,11 +391,14 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
 
 def test_frames_of_several_sizes_fit_no_zarr_array(tmp_path: Path) -> None:
     vary = tmp_path / "sizes.yaml"
-    vary.write_text("schema: 1\nfactors: {width: {key: camera.width_px, values: [240, 230, 220, 210]}}\n")
+    vary.write_text(
+        "schema: 1\nfactors: {width: {key: camera.width_px, values: [240, 230, 220, 210]}}\n"
+    )
     made = small(vary, 16, formats=("zarr",))
     assert len({made.draw(n // 2, n)[0]["width"] for n in range(16)}) > 1
     with pytest.raises(
-        InputError, match=r"dataset.formats: zarr: frame \d+ of shard \d+ is \d+x180 uint16, the first one \d+x180"
+        InputError,
+        match=r"dataset.formats: zarr: frame \d+ of shard \d+ is \d+x180 uint16, the first one \d+x180",
     ):
         run.run(made, str(tmp_path / "frames"), engines.Serial())
 

@@ -7,7 +7,14 @@ from collections import Counter
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet.cells import FULL, QUICK, Designer, check_scene, states_c, unit_seeds
+from skysim.experiments.datasheet.cells import (
+    FULL,
+    QUICK,
+    Designer,
+    check_scene,
+    states_c,
+    unit_seeds,
+)
 from skysim.scene.loader import load
 
 
@@ -18,15 +25,25 @@ def test_every_cell_is_another(scene):
     assert len({cell.name for cell in cells}) == len(cells)
     noise = Counter(cell.settings["trial.noise_seed"] for cell in cells)
     shared = {seed for seed, count in noise.items() if count > 1}
-    paired = {cell.settings["trial.noise_seed"] for cell in cells if cell.experiment in ("cause", "disturbance")}
-    assert shared == paired & {cell.settings["trial.noise_seed"] for cell in cells if cell.experiment == "total"}
+    paired = {
+        cell.settings["trial.noise_seed"]
+        for cell in cells
+        if cell.experiment in ("cause", "disturbance")
+    }
+    assert shared == paired & {
+        cell.settings["trial.noise_seed"] for cell in cells if cell.experiment == "total"
+    }
 
 
 def test_the_total_has_the_units_of_the_terms_in_turn():
     """As often each, so that terms and total can agree with few units; the probabilities' frames are of others."""
     designer = Designer(load("afit_simsat", {}), FULL)
     cells = list(designer.cells())
-    assert designer.seeds == ["camera.detector.hardware_seed", "tracker.survey.seed", "light.layout.hardware_seed"]
+    assert designer.seeds == [
+        "camera.detector.hardware_seed",
+        "tracker.survey.seed",
+        "light.layout.hardware_seed",
+    ]
     seeds = {
         name: [one.settings["tracker.survey.seed"] for one in cells if one.experiment == name]
         for name in ("terms", "total", "sky")
@@ -42,7 +59,8 @@ def test_units_and_thermal_states_are_combined_as_often_each():
     designer = Designer(load("thermal_drift", {}), QUICK)
     draws = [cell.settings for cell in designer.cells() if cell.experiment == "total"]
     combined = Counter(
-        (one["camera.detector.hardware_seed"], one["thermal.temperature"]["temperature_c"]) for one in draws
+        (one["camera.detector.hardware_seed"], one["thermal.temperature"]["temperature_c"])
+        for one in draws
     )
     assert len(combined) == designer.units * designer.states
     assert set(combined.values()) == {1}
@@ -50,7 +68,11 @@ def test_units_and_thermal_states_are_combined_as_often_each():
 
 def test_only_a_tracker_with_a_tracking_mode_has_its_limits():
     rolling = {"camera.shutter": "{kind: rolling, row_time: 20 us}"}
-    for scene, overrides, has in (("shefex2", {}, True), ("shefex2", rolling, False), ("afit_simsat", {}, False)):
+    for scene, overrides, has in (
+        ("shefex2", {}, True),
+        ("shefex2", rolling, False),
+        ("afit_simsat", {}, False),
+    ):
         cells = Designer(load(scene, overrides), QUICK).cells()
         assert any(cell.experiment.startswith("tracked") for cell in cells) == has
 

@@ -29,16 +29,30 @@ def generated(rng, shape, bias=0.0, **sigma):
 def test_injected_terms_come_back_to_five_percent():
     """Over many experiments, whose mean is the expectation; only the units' own draws are few."""
     rng = np.random.default_rng(1)
-    sizes = {"u": 0.5, "f": 2.0, "fu": 1.0, "s": 0.8, "fs": 0.6, "us": 0.3, "fusp": 0.7, "fuspt": 3.0}
-    found = np.mean([components(generated(rng, (60, 6, 4, 2, 2), 1.5, **sizes)) for _ in range(900)], axis=0)
-    expected = Components(1.5**2 + 0.5**2, 0.8**2 + 0.6**2 + 0.3**2, 2.0**2 + 1.0**2, 0.7**2, 3.0**2)
+    sizes = {
+        "u": 0.5,
+        "f": 2.0,
+        "fu": 1.0,
+        "s": 0.8,
+        "fs": 0.6,
+        "us": 0.3,
+        "fusp": 0.7,
+        "fuspt": 3.0,
+    }
+    found = np.mean(
+        [components(generated(rng, (60, 6, 4, 2, 2), 1.5, **sizes)) for _ in range(900)], axis=0
+    )
+    expected = Components(
+        1.5**2 + 0.5**2, 0.8**2 + 0.6**2 + 0.3**2, 2.0**2 + 1.0**2, 0.7**2, 3.0**2
+    )
     assert found == pytest.approx(np.array(expected), rel=0.05)
 
 
 @pytest.mark.parametrize("name", ["bias", *Components._fields[2:]])
 def test_a_term_alone_comes_back_alone(name):
     """One large experiment for each: to 5 %, and nothing of it in the others."""
-    rng, shape = np.random.default_rng(2), (2000, 2, 1, 4, 2)
+    rng = np.random.default_rng(2)
+    shape = (2000, 2, 1, 4, 2)
     drawn = {"bias": {}, "field": {"f": 2.0}, "pixel": {"fusp": 2.0}, "temporal": {"fuspt": 2.0}}
     found = components(generated(rng, shape, 2.0 if name == "bias" else 0.0, **drawn[name]))
     assert getattr(found, name) == pytest.approx(4.0, rel=0.05)
@@ -68,11 +82,15 @@ def test_a_factor_with_one_level_is_left_out(units, states):
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Over 60 experiments 95 % hold each variance: or a little fewer: the bootstrap of 60 fields is short."""
-    rng, held = np.random.default_rng(5), []
+    rng = np.random.default_rng(5)
+    held = []
     for _ in range(60):
         found = with_intervals(generated(rng, (60, 2, 1, 2, 2), f=1.0, fuspt=1.5)[None])
         held.append(
-            [found[name].low <= truth <= found[name].high for name, truth in (("field", 1), ("temporal", 2.25))]
+            [
+                found[name].low <= truth <= found[name].high
+                for name, truth in (("field", 1), ("temporal", 2.25))
+            ]
         )
     assert (np.mean(held, axis=0) > 0.85).all()
 
@@ -90,7 +108,9 @@ def test_a_ratio_is_sharp_where_both_have_the_same_fields():
 def experiment(rng, fields):
     """Errors of the design, and independent frames with new units, attitudes and noise in the same fields."""
     field = 2 * rng.standard_normal((1, fields, 1))
-    errors = field[..., None, None, None] + generated(rng, (fields, 3, 1, 3, 2), fu=0.5, fusp=0.8, fuspt=1.5)
+    errors = field[..., None, None, None] + generated(
+        rng, (fields, 3, 1, 3, 2), fu=0.5, fusp=0.8, fuspt=1.5
+    )
     return errors, field + np.hypot(np.hypot(0.5, 0.8), 1.5) * rng.standard_normal((1, fields, 20))
 
 
@@ -98,7 +118,8 @@ def test_terms_add_up_to_what_independent_frames_have():
     """Within 3 %: the mean of 40 experiments, and the interval of one."""
     rng = np.random.default_rng(7)
     ratios = [
-        of_axes(errors).total / np.mean(at_once**2) for errors, at_once in (experiment(rng, 400) for _ in range(40))
+        of_axes(errors).total / np.mean(at_once**2)
+        for errors, at_once in (experiment(rng, 400) for _ in range(40))
     ]
     assert np.mean(ratios) == pytest.approx(1, abs=0.01)
     assert np.std(ratios) < 0.03

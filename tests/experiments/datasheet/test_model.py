@@ -42,7 +42,8 @@ def test_a_process_follows_its_recursion():
     """Beside the loop over the times, with steps that change: the same numbers from the same draws."""
     steps = np.random.default_rng(1).uniform(0, 0.5, 300)
     found = correlated(steps, np.array([0.7, -1.2]), np.random.default_rng(2))
-    normal, left = np.random.default_rng(2).standard_normal((300, 2)), np.exp(-steps)
+    normal = np.random.default_rng(2).standard_normal((300, 2))
+    left = np.exp(-steps)
     value = np.array([0.7, -1.2])
     for k in range(1, 300):
         value = left[k] * value + np.sqrt(1 - left[k] ** 2) * normal[k]
@@ -59,7 +60,9 @@ def test_a_process_is_stationary_and_forgets_exponentially():
 
 def test_all_is_constant_at_rest_but_the_noise(model):
     """Of one state: the mean is the slow part, the deviation the noise at the field's scale."""
-    state = State(np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]), 1.0)
+    state = State(
+        np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]), 1.0
+    )
     errors = model.draw(np.zeros(40_000), 0.1, np.random.default_rng(5), state)
     scales = np.exp(0.5 * (0.8 * model.scale - model.scale**2 / 2))
     slow = state.bias + scales * (model.field * state.field + model.pixel * state.pixel)
@@ -77,16 +80,21 @@ def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
 
 def test_steps_have_the_statistics_of_draws(model):
     """Mean square and correlation from one step to the next at 2 degrees per second."""
-    rng, pairs = np.random.default_rng(7), []
+    rng = np.random.default_rng(7)
+    pairs = []
     for _ in range(3000):
         state = model.start(rng, unit=False)
         state, first = model.step(state, 2.0, 0.1, rng)
         pairs.append((first, model.step(state, 2.0, 0.1, rng)[1]))
     stepped = np.array(pairs) - model.mean
-    drawn = np.array([model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(3000)])
+    drawn = np.array(
+        [model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(3000)]
+    )
     drawn -= model.mean
     for one, other in ((0, 0), (0, 1)):
-        found, expected = (np.mean(each[:, one] * each[:, other], axis=0) for each in (stepped, drawn))
+        found, expected = (
+            np.mean(each[:, one] * each[:, other], axis=0) for each in (stepped, drawn)
+        )
         spread = np.sqrt(np.mean(stepped[:, 0] ** 2, axis=0) * np.mean(drawn[:, 0] ** 2, axis=0))
         assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.12)
 
@@ -104,15 +112,18 @@ def test_noise_is_larger_about_the_axis_of_the_rate(model):
 @pytest.mark.parametrize("turned_deg", [0.0, 0.05, 3.0])
 def test_correlations_are_those_of_draws(model, turned_deg):
     """Of pairs of errors that the boresight's turn separates, at rest and at a rate: each pair in another field."""
-    rate_deg_s, count = 2.0, 150_000
+    rate_deg_s = 2.0
+    count = 150_000
     rng = np.random.default_rng(11)
     normal = {
-        name: rng.standard_normal((2, count, width)) for name, width in (("field", 3), ("pixel", 3), ("scale", 1))
+        name: rng.standard_normal((2, count, width))
+        for name, width in (("field", 3), ("pixel", 3), ("scale", 1))
     }
     for name, one in normal.items():
         left = np.exp(-turned_deg / model.constants[f"{name}_deg"])
         one[1] = left * one[0] + np.sqrt(1 - left**2) * one[1]
-    rates, axis_rad = np.full(count, rate_deg_s), rng.uniform(0, 2 * np.pi, count)
+    rates = np.full(count, rate_deg_s)
+    axis_rad = rng.uniform(0, 2 * np.pi, count)
     noise = np.stack([model.drawn_noise(rates, axis_rad, rng) for _ in range(2)])
     slow = model.field * normal["field"] + model.pixel * normal["pixel"]
     errors = np.stack([model.scales(scale[:, 0]) for scale in normal["scale"]]) * (slow + noise)
@@ -122,7 +133,8 @@ def test_correlations_are_those_of_draws(model, turned_deg):
 
 def test_more_than_a_hundred_thousand_errors_a_second(model):
     """A million in the best of three runs: ten times what is asked, even on a busy machine."""
-    rng, rates = np.random.default_rng(8), np.full(100_000, 1.0)
+    rng = np.random.default_rng(8)
+    rates = np.full(100_000, 1.0)
     seconds = []
     for _ in range(3):
         begun = time.process_time()
@@ -140,13 +152,20 @@ def test_the_module_stands_alone(tmp_path: Path) -> None:
         " [name for name in sys.modules if name.startswith(('skysim', 'estimator', 'scipy'))])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env={"PATH": ""}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PATH": ""},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.split("\n")[0] == "(5, 3) []"
 
 
 @pytest.mark.slow
-def test_the_unit_runs_in_another_tool_with_the_same_errors(tmp_path: Path, model: ErrorModel) -> None:
+def test_the_unit_runs_in_another_tool_with_the_same_errors(
+    tmp_path: Path, model: ErrorModel
+) -> None:
     """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu3")
@@ -155,10 +174,15 @@ def test_the_unit_runs_in_another_tool_with_the_same_errors(tmp_path: Path, mode
     assert fmpy.read_model_description(str(path)).fmiVersion == "3.0"
     outputs = ["x_arcsec", "y_arcsec", "roll_arcsec"]
     result = fmpy.simulate_fmu(
-        str(path), stop_time=2.0, output_interval=0.1, start_values={"seed": 5, "rate_deg_s": 1.5}, output=outputs
+        str(path),
+        stop_time=2.0,
+        output_interval=0.1,
+        start_values={"seed": 5, "rate_deg_s": 1.5},
+        output=outputs,
     )
     rng = np.random.default_rng(5)
-    state, expected = model.start(rng), []
+    state = model.start(rng)
+    expected = []
     for _ in range(len(result) - 1):
         state, errors = model.step(state, 1.5, 0.1, rng)
         expected.append(errors)
@@ -179,7 +203,8 @@ def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
 
 def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
     """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
-    scene, size = load("shefex2", {}), replace(QUICK, fields=fields)
+    scene = load("shefex2", {})
+    size = replace(QUICK, fields=fields)
     designer = Designer(scene, size)
     cells = list(designer.cells())
     rng = np.random.default_rng(12)
@@ -187,7 +212,8 @@ def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
     rates = np.array([cell.settings.get("trial.rate_deg_s", 0.0) for cell in cells])
     order = np.argsort(turns)
     steps = np.diff(turns[order], prepend=turns[order][0])
-    errors, axis_rad = np.empty((3, len(cells), fields)), np.empty(fields)
+    errors = np.empty((3, len(cells), fields))
+    axis_rad = np.empty(fields)
     for field in range(fields):
         state = model.start(rng, unit=False)
         axis_rad[field] = state.axis_rad
@@ -195,9 +221,15 @@ def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
             state = turned(model, state, step_deg, rng)
             noise = model.drawn_noise(rates[[row]], state.axis_rad, rng)[0]
             slow = model.field * state.field + model.pixel * state.pixel
-            errors[:, row, field] = state.bias + model.scales(np.array([state.scale]))[0] * (slow + noise)
+            errors[:, row, field] = state.bias + model.scales(np.array([state.scale]))[0] * (
+                slow + noise
+            )
     ones = np.ones((len(cells), fields))
-    columns = dict(zip(AXES, errors, strict=True)) | {"solved": ones, "wrong": 0 * ones, "axis_rad": axis_rad * ones}
+    columns = dict(zip(AXES, errors, strict=True)) | {
+        "solved": ones,
+        "wrong": 0 * ones,
+        "axis_rad": axis_rad * ones,
+    }
     return Sheet(scene, "shefex2", {}, size, designer, cells, columns, None)
 
 
@@ -212,7 +244,9 @@ def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Gene
 
 
 @pytest.mark.slow
-def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(monkeypatch: pytest.MonkeyPatch):
+def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(
+    monkeypatch: pytest.MonkeyPatch,
+):
     """Fitted to half of 300 fields that a model drew; wrong noise and wrong memory are noticed in the other half.
 
     More than 5 % of the p-values are below 0.05, because the fit to 150 fields has errors of its own.
@@ -224,10 +258,14 @@ def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(
     found = check.agreements(sheet)
     assert [one.fitted for one in found] == ["even"] * 5 + ["odd"] * 5
     assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.7
-    assert [one.correlation for one in found] == pytest.approx([one.expected_correlation for one in found], abs=0.06)
+    assert [one.correlation for one in found] == pytest.approx(
+        [one.expected_correlation for one in found], abs=0.06
+    )
     constants = fit.constants(sheet)
     assert constants["along"][:5] == pytest.approx(truth.along, abs=0.4)
     noisy = truth.constants | {"noise": [[2.0, 2.0, 20.0]] * 5}
     assert max(check.agreement(ErrorModel(noisy), sheet, 0.0, "even").p_values) < 0.01
-    fleeting = check.agreement(ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 0.57, "even")
+    fleeting = check.agreement(
+        ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 0.57, "even"
+    )
     assert fleeting.correlation - fleeting.expected_correlation > 0.1

@@ -12,7 +12,13 @@ import scipy
 
 from skysim.experiments.datasheet import performance, run
 from skysim.experiments.datasheet.cells import Cell
-from skysim.experiments.datasheet.performance import Counts, bracket, claims, noise_equivalent_angle, runs_needed
+from skysim.experiments.datasheet.performance import (
+    Counts,
+    bracket,
+    claims,
+    noise_equivalent_angle,
+    runs_needed,
+)
 
 
 def test_runs_without_a_failure_are_those_of_the_formula():
@@ -60,7 +66,8 @@ def test_noise_is_told_from_all_that_two_frames_share():
 
 def test_a_limit_lies_between_what_is_shown_above_and_below():
     rows = [
-        {"rate": n, "counts": Counts(200, right, 200 - right, 0)} for n, right in enumerate([200, 199, 190, 150, 3])
+        {"rate": n, "counts": Counts(200, right, 200 - right, 0)}
+        for n, right in enumerate([200, 199, 190, 150, 3])
     ]
     assert bracket(rows, "rate") == (0.95, 1, 3, 200)
     assert bracket(rows[:1], "rate") == (0.95, 0, math.inf, 200)
@@ -77,7 +84,9 @@ def test_a_limit_is_of_the_highest_share_that_so_many_frames_can_show():
 def test_frames_of_one_field_count_once():
     """Four fields with two frames each: right, refused in the second, false in the first, refused and false."""
     outcome = {"right": [[1, 1, 0, 0], [1, 0, 1, 0]], "false": [[0, 0, 1, 0], [0, 0, 0, 1]]}
-    sheet = SimpleNamespace(**{name: lambda rows, name=name: np.array(outcome[name], bool)[rows] for name in outcome})
+    sheet = SimpleNamespace(
+        **{name: lambda rows, name=name: np.array(outcome[name], bool)[rows] for name in outcome}
+    )
     assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)
 
 

@@ -36,9 +36,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(performance, "TIMED", 3)
 
 
-def measured(folder: Path, watch: Callable[[int], Any] | None = None, fields: int | None = None) -> run.Sheet:
+def measured(
+    folder: Path, watch: Callable[[int], Any] | None = None, fields: int | None = None
+) -> run.Sheet:
     scene = load("shefex2", {})
-    return run.measure("shefex2", scene, {}, folder, quick=True, fields=fields, workers=1, watch=watch)
+    return run.measure(
+        "shefex2", scene, {}, folder, quick=True, fields=fields, workers=1, watch=watch
+    )
 
 
 def stop_after(batches: int) -> Callable[[int], Any]:
@@ -76,11 +80,20 @@ def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path
     assert report.markdown().count("\n## ") == len(sections(whole))
     assert len(list((tmp_path / "whole").glob("*.png"))) == 5
     with pytest.raises(InputError, match="contains another study"):
-        run.measure("shefex2", load("shefex2", {}), {"camera.f_number": "2"}, tmp_path / "whole", quick=True, workers=1)
+        run.measure(
+            "shefex2",
+            load("shefex2", {}),
+            {"camera.f_number": "2"},
+            tmp_path / "whole",
+            quick=True,
+            workers=1,
+        )
 
 
 def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more"):
+    with pytest.raises(
+        InputError, match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more"
+    ):
         state(measured(tmp_path, fields=4))
 
 
@@ -89,7 +102,8 @@ def test_a_bias_and_a_thermal_drift_that_were_put_in_come_back() -> None:
 
     The states' effects are 0, 20 and 70" about x; about y there is nothing but what the tracker has.
     """
-    per_k, temperatures_c = np.array([10.0, 0.0, 40.0]), np.array([20.0, 22.0, 27.0])
+    per_k = np.array([10.0, 0.0, 40.0])
+    temperatures_c = np.array([20.0, 22.0, 27.0])
     thermal = {
         "thermal.temperature": "{kind: table, hours: [0, 1, 2], temperature_c: [20, 22, 27]}",
         "thermal.mount_arcsec_k": f"{per_k.tolist()}",
@@ -102,7 +116,9 @@ def test_a_bias_and_a_thermal_drift_that_were_put_in_come_back() -> None:
     for cell in designer.terms():
         rows = trials.run_segments(spec, (trials.Segment(0, cell.settings, 0, range(12)),))
         assert all(row.outcome.solved and not row.error for row in rows)
-        errors.append([[row.outcome.x_arcsec, row.outcome.y_arcsec, row.outcome.roll_arcsec] for row in rows])
+        errors.append(
+            [[row.outcome.x_arcsec, row.outcome.y_arcsec, row.outcome.roll_arcsec] for row in rows]
+        )
     shape = (1, designer.states, 2, 2, 12, 3)
     by_axis = np.moveaxis(np.array(errors).reshape(shape), (4, 5), (1, 0))
     for axis, slope in enumerate(per_k):

@@ -26,10 +26,14 @@ from skysim.experiments.dome_survey.folder import images, watch
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab
 
-DEAD, FAR, SWAPPED = 44, 20, (31, 57)
+DEAD = 44
+FAR = 20
+SWAPPED = (31, 57)
 FAR_M = 0.03
-FOCAL_RATIO, LEVER_M = 1.004, (0.003, -0.002, 0.378)
-STOPS, TILT_DEG = 30, 12.0
+FOCAL_RATIO = 1.004
+LEVER_M = (0.003, -0.002, 0.378)
+STOPS = 30
+TILT_DEG = 12.0
 SCENE = """
 schema: 1
 base: afit_simsat_ideal
@@ -44,10 +48,16 @@ tracker: {{min_area_px: 9{lever}}}
 
 def command(*words: object) -> tuple[int, str, str]:
     """Exit code, what was printed, and what was complained of."""
-    out, err, argv = std_io.StringIO(), std_io.StringIO(), sys.argv
+    out = std_io.StringIO()
+    err = std_io.StringIO()
+    argv = sys.argv
     sys.argv = ["skysim", *map(str, words)]
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as left:
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+            pytest.raises(SystemExit) as left,
+        ):
             main.main()
     finally:
         sys.argv = argv
@@ -55,7 +65,10 @@ def command(*words: object) -> tuple[int, str, str]:
 
 
 def write_leds(path: Path, ids: list[int], place_m: Floats, level: Floats) -> None:
-    rows = [f"{n},{x:.6f},{y:.6f},{z:.6f},{one:.3f}" for n, (x, y, z), one in zip(ids, place_m, level, strict=True)]
+    rows = [
+        f"{n},{x:.6f},{y:.6f},{z:.6f},{one:.3f}"
+        for n, (x, y, z), one in zip(ids, place_m, level, strict=True)
+    ]
     path.write_text("\n".join(["id,x_m,y_m,z_m,level", *rows, ""]))
 
 
@@ -69,7 +82,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     (made / "places.yaml").write_text(text)
     place_m = build_lab(loader.load(made / "places.yaml")).camera.sources.place[:, :3]
-    rng, count = np.random.default_rng(1), len(place_m)
+    rng = np.random.default_rng(1)
+    count = len(place_m)
     level = np.array([1.0, 0.6, 0.36])[rng.integers(0, 3, count)]
     level[list(SWAPPED)] = [1.0, 0.36]
     write_leds(made / "design.csv", list(range(count)), place_m, level)
@@ -81,7 +95,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_leds(made / "built.csv", left, built_m[left], level[left])
     lever = ", assumed_camera_body: [3 mm, -2 mm, 378 mm]"
     (made / "design.yaml").write_text(SCENE.format(leds="design.csv", focal_mm=18.0, lever=lever))
-    (made / "built.yaml").write_text(SCENE.format(leds="built.csv", focal_mm=18.0 * FOCAL_RATIO, lever=""))
+    (made / "built.yaml").write_text(
+        SCENE.format(leds="built.csv", focal_mm=18.0 * FOCAL_RATIO, lever="")
+    )
     return made
 
 
@@ -95,7 +111,9 @@ def frames(folder: Path, built: Lab) -> Path:
     """The images of a survey of the built dome, and the attitudes of its IMU."""
     uncertainty = prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
     lab = build_lab(prior.as_listed(loader.load(folder / "design.yaml")))
-    assumed = prior.prior_of(lab, prior.calibration_prior(lab).camera, prior.calibration_prior(lab).leds)
+    assumed = prior.prior_of(
+        lab, prior.calibration_prior(lab).camera, prior.calibration_prior(lab).leds
+    )
     model = prior.survey_model(assumed, uncertainty, 0.02)
     held = stops.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
     for _ in procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
@@ -104,7 +122,15 @@ def frames(folder: Path, built: Lab) -> Path:
 
 
 def surveyed(folder: Path, frames: Path, out: str) -> dict[str, Any]:
-    words = ["survey", folder / "design.yaml", "--images", frames, "--camera", folder / "design.yaml", "--led-sigma"]
+    words = [
+        "survey",
+        folder / "design.yaml",
+        "--images",
+        frames,
+        "--camera",
+        folder / "design.yaml",
+        "--led-sigma",
+    ]
     words += ["1 mm", "--imu-sigma", "0.3 deg", "--tilt", TILT_DEG, "--out", folder / out, "--json"]
     code, printed, err = command(*words)
     assert (code, err) == (0, "")
@@ -117,18 +143,27 @@ def result(folder: Path, frames: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_the_folder_alone_gives_the_dome_as_built(result: dict[str, Any], folder: Path, built: Lab) -> None:
+def test_the_folder_alone_gives_the_dome_as_built(
+    result: dict[str, Any], folder: Path, built: Lab
+) -> None:
     """Only here is the truth known: places, focal length and lever within their errors, and better than the list."""
     found = Table.read(folder / "by_imu" / "leds.ecsv", format="ascii.ecsv")
     assert len(found) > 0.7 * len(built.camera.sources)
     row = np.searchsorted(built.camera.sources.id, found["id"])
-    error_m = np.column_stack([found[f"{axis}_m"] for axis in "xyz"]) - built.camera.sources.place[row, :3]
-    rms_m, claimed_m = np.sqrt(np.mean(error_m**2)), np.sqrt(np.mean(np.array(found["sigma_m"]) ** 2))
+    error_m = (
+        np.column_stack([found[f"{axis}_m"] for axis in "xyz"])
+        - built.camera.sources.place[row, :3]
+    )
+    rms_m = np.sqrt(np.mean(error_m**2))
+    claimed_m = np.sqrt(np.mean(np.array(found["sigma_m"]) ** 2))
     assert rms_m < 0.0005  # the list: 1 mm
     assert claimed_m / 2 < rms_m < 2 * claimed_m  # errors that all LEDs share do not average out
     values = {line["what"]: line for line in result["values"]}
     truth = {"focal length px": built.scene.camera.focal_px}
-    truth |= {f"lever {axis} mm": 1e3 * one for axis, one in zip("xyz", built.camera.mount.camera_body_m, strict=True)}
+    truth |= {
+        f"lever {axis} mm": 1e3 * one
+        for axis, one in zip("xyz", built.camera.mount.camera_body_m, strict=True)
+    }
     for what, value in truth.items():
         line = values[what]
         assert abs(line["found"] - value) < 4.5 * line["sigma"], line
@@ -140,16 +175,24 @@ def test_each_fault_is_named_and_no_other(result: dict[str, Any]) -> None:
     faults = result["faults"]
     assert faults["dark"] == [DEAD]
     assert list(faults["displaced"]) == [str(FAR)]
-    assert faults["displaced"][str(FAR)] == pytest.approx(FAR_M, abs=0.005)  # and its error of 1 mm about each axis
+    assert faults["displaced"][str(FAR)] == pytest.approx(
+        FAR_M, abs=0.005
+    )  # and its error of 1 mm about each axis
     assert {(led, shows) for led, shows, _ in faults["exchanged"]} == {SWAPPED, SWAPPED[::-1]}
     assert faults["unlisted"] == []
     assert faults["list_sigma_m"] == pytest.approx(0.001, rel=0.3)
 
 
 @pytest.mark.slow
-def test_coverage_and_next_attitudes_are_in_the_result(result: dict[str, Any], folder: Path) -> None:
+def test_coverage_and_next_attitudes_are_in_the_result(
+    result: dict[str, Any], folder: Path
+) -> None:
     coverage = result["coverage"]
-    assert coverage["measured"] == result["surveyed"] == sum(one["measured"] for one in coverage["by_led"])
+    assert (
+        coverage["measured"]
+        == result["surveyed"]
+        == sum(one["measured"] for one in coverage["by_led"])
+    )
     assert len(result["next"]) == 12
     assert result["next_reaches"]["measured"] >= result["surveyed"]
     assert max(one["tilt_deg"] for one in result["next"]) <= TILT_DEG
@@ -158,7 +201,9 @@ def test_coverage_and_next_attitudes_are_in_the_result(result: dict[str, Any], f
 
 
 @pytest.mark.slow
-def test_the_report_has_the_numbers_and_the_faults_with_places(result: dict[str, Any], folder: Path) -> None:
+def test_the_report_has_the_numbers_and_the_faults_with_places(
+    result: dict[str, Any], folder: Path
+) -> None:
     page = (folder / "by_imu" / "report.html").read_text()
     assert result["report"] == str(folder / "by_imu" / "report.html")
     assert f"{result['surveyed']} of {result['leds']} LEDs measured" in page
@@ -173,7 +218,9 @@ def test_the_report_has_the_numbers_and_the_faults_with_places(result: dict[str,
 
 
 @pytest.mark.slow
-def test_without_an_imu_the_tracker_identifies_the_images(folder: Path, frames: Path, result: dict[str, Any]) -> None:
+def test_without_an_imu_the_tracker_identifies_the_images(
+    folder: Path, frames: Path, result: dict[str, Any]
+) -> None:
     """LEDs that differ in place alone, to a millimeter: nearly all images, and the same dome."""
     alone = folder / "alone"
     shutil.copytree(frames, alone)
@@ -182,7 +229,9 @@ def test_without_an_imu_the_tracker_identifies_the_images(folder: Path, frames: 
     assert found["tied"] > 0.8 * STOPS
     assert found["surveyed"] > 0.8 * result["surveyed"]
     assert found["faults"]["dark"] == [DEAD]
-    by_imu, lost = ({line["what"]: line["found"] for line in one["values"]} for one in (result, found))
+    by_imu, lost = (
+        {line["what"]: line["found"] for line in one["values"]} for one in (result, found)
+    )
     assert lost["focal length px"] == pytest.approx(by_imu["focal length px"], rel=2e-3)
 
 
@@ -191,7 +240,11 @@ def test_without_an_imu_the_tracker_identifies_the_images(folder: Path, frames: 
 
 @pytest.mark.slow
 def test_a_watch_ends_with_the_survey_of_what_is_there(
-    folder: Path, frames: Path, result: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    frames: Path,
+    result: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A thread drops the images in; Ctrl-C comes when all are read. The survey is that of the folder at rest."""
     arriving = tmp_path / "arriving"
@@ -214,8 +267,25 @@ def test_a_watch_ends_with_the_survey_of_what_is_there(
     rested: list[bool] = []
     monkeypatch.setattr(watch.time, "sleep", wait)
     dropping.start()
-    words = ["survey", folder / "design.yaml", "--images", arriving, "--camera", folder / "design.yaml", "--watch"]
-    words += ["--led-sigma", "1 mm", "--imu-sigma", "0.3 deg", "--tilt", TILT_DEG, "--out", tmp_path / "out"]
+    words = [
+        "survey",
+        folder / "design.yaml",
+        "--images",
+        arriving,
+        "--camera",
+        folder / "design.yaml",
+        "--watch",
+    ]
+    words += [
+        "--led-sigma",
+        "1 mm",
+        "--imu-sigma",
+        "0.3 deg",
+        "--tilt",
+        TILT_DEG,
+        "--out",
+        tmp_path / "out",
+    ]
     code, printed, err = command(*words)
     dropping.join()
     assert code == 0
@@ -247,13 +317,28 @@ def write_images(folder: Path, count: int, size: tuple[int, int] = (480, 640)) -
             lambda path: write_images(path, 4, (100, 120)),
             "120 x 100 pixels; allowed: 640 x 480, as the camera has them",
         ),
-        (lambda path: (write_images(path, 3), (path / "003.png").write_bytes(b"PNG?")), "003.png: cannot be decoded"),
-        (lambda path: write_images(path, 3), "0 of 3 images identified; allowed: 2 or more: give their attitudes"),
+        (
+            lambda path: (write_images(path, 3), (path / "003.png").write_bytes(b"PNG?")),
+            "003.png: cannot be decoded",
+        ),
+        (
+            lambda path: write_images(path, 3),
+            "0 of 3 images identified; allowed: 2 or more: give their attitudes",
+        ),
     ],
 )
-def test_images_that_cannot_be_surveyed_are_one_line(folder: Path, tmp_path: Path, prepare: Any, says: str) -> None:
+def test_images_that_cannot_be_surveyed_are_one_line(
+    folder: Path, tmp_path: Path, prepare: Any, says: str
+) -> None:
     prepare(tmp_path / "in")
-    words = ("survey", folder / "design.yaml", "--images", tmp_path / "in", "--camera", folder / "design.yaml")
+    words = (
+        "survey",
+        folder / "design.yaml",
+        "--images",
+        tmp_path / "in",
+        "--camera",
+        folder / "design.yaml",
+    )
     code, _, err = command(*words, "--out", tmp_path / "out")
     assert (code, err.count("\n")) == (2, 1)
     assert says in err
@@ -267,7 +352,10 @@ def test_images_that_cannot_be_surveyed_are_one_line(folder: Path, tmp_path: Pat
         (["--plan", "--checks", "3"], "--checks: has no effect with --plan"),
         (["--repeat", "3", "--frames-to", "x"], "--frames-to: has no effect with --repeat"),
         (["--watch"], "--watch: has no effect without --images; allowed: with --images FOLDER"),
-        (["--images", ".", "--camera", "x.yaml", "--watch", "--checks", "3"], "--checks: has no effect with --watch"),
+        (
+            ["--images", ".", "--camera", "x.yaml", "--watch", "--checks", "3"],
+            "--checks: has no effect with --watch",
+        ),
         (["--plan", "--repeat", "3"], "--repeat: has no effect with --plan; allowed: one of them"),
     ],
 )
@@ -285,7 +373,9 @@ def test_attitudes_are_read_as_they_were_written(tmp_path: Path) -> None:
     images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
     read = images.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
-    assert (Rotation.concatenate(list(read.values())) * held.inv()).magnitude().max() < 2e-6  # four decimals
+    assert (
+        Rotation.concatenate(list(read.values())) * held.inv()
+    ).magnitude().max() < 2e-6  # four decimals
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,13 @@ from skysim.experiments.dome_survey.procedure import Errors
 
 def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of three fails; the rms of the others is that of their mean squares."""
-    found = iter([InputError("survey", "too few"), Errors(1e-8, 4e-8, 1.0, 90, 0), Errors(3e-8, 4e-8, 9.0, 92, 1)])
+    found = iter(
+        [
+            InputError("survey", "too few"),
+            Errors(1e-8, 4e-8, 1.0, 90, 0),
+            Errors(3e-8, 4e-8, 9.0, 92, 1),
+        ]
+    )
 
     def run_survey(*_: object) -> Errors:
         one = next(found)
@@ -37,11 +43,16 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
     assert result["rows"][0]["simulated"] == pytest.approx(1e3 * 2e-8**0.5)
 
 
-@pytest.mark.parametrize(("parameter", "refused"), [("focal px", True), ("lever z mm", True), ("focal px", False)])
-def test_a_survey_that_contradicts_what_was_assumed_is_refused(parameter: str, refused: bool) -> None:
+@pytest.mark.parametrize(
+    ("parameter", "refused"), [("focal px", True), ("lever z mm", True), ("focal px", False)]
+)
+def test_a_survey_that_contradicts_what_was_assumed_is_refused(
+    parameter: str, refused: bool
+) -> None:
     """The frames alone give a value of sigma s, before that one of sigma p was assumed: they differ by hypot(s, p), and
     the weighted mean of both moves from the assumed one by p^2 / (s^2 + p^2) of this."""
-    assumed, focal_px = prior.survey_uncertainty(), 9222.6
+    assumed = prior.survey_uncertainty()
+    focal_px = 9222.6
     share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
 
     def moved(frames_sigma: float, before_sigma: float) -> tuple[float, float]:
@@ -51,7 +62,8 @@ def test_a_survey_that_contradicts_what_was_assumed_is_refused(parameter: str, r
 
     off_px, sigma_px = moved(180.0, assumed.focal_error * focal_px)
     off_m, sigma_m = moved(0.001, assumed.lever_sigma_m)
-    off_px, off_m = off_px * (parameter == "focal px"), off_m * (parameter == "lever z mm")
+    off_px = off_px * (parameter == "focal px")
+    off_m = off_m * (parameter == "lever z mm")
     before, found = (
         SimpleNamespace(
             camera=SimpleNamespace(focal_px=focal_px - focal),

@@ -49,7 +49,9 @@ UNCERTAINTY = survey_prior.survey_uncertainty("0.5 deg", "2 mm", "5 mm", "1%")
 
 def command(*words: object) -> tuple[int, str, str]:
     """Exit code, what was printed, and what was complained of."""
-    out, err, argv = std_io.StringIO(), std_io.StringIO(), sys.argv
+    out = std_io.StringIO()
+    err = std_io.StringIO()
+    argv = sys.argv
     sys.argv = ["skysim", *map(str, words)]
     try:
         with (
@@ -80,7 +82,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def statistics(folder: Path) -> dict[str, Any]:
     """The figures of a survey of the small dome: 40 stops within 18 deg."""
-    words = ["survey", folder / "small.yaml", "--frames", 40, "--tilt", 18, "--checks", 8, "--out", folder]
+    words = [
+        "survey",
+        folder / "small.yaml",
+        "--frames",
+        40,
+        "--tilt",
+        18,
+        "--checks",
+        8,
+        "--out",
+        folder,
+    ]
     code, out, err = command(*words, "--json")
     assert (code, err) == (0, "")
     return json.loads(out)
@@ -89,7 +102,9 @@ def statistics(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def lab(folder: Path) -> Lab:
     """The small dome as it is believed before the survey."""
-    return build_lab(survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY))
+    return build_lab(
+        survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY)
+    )
 
 
 # --- end to end ---------------------------------------------------------------------------------------------
@@ -100,7 +115,8 @@ def test_the_survey_makes_the_tracker_s_error_smaller_by_much(statistics: dict[s
     """1000″ before. After: what one frame's lights are off, 0.2 mm at 0.8 m over the root of some twenty, and the
     turn of the lab, which the map of 2 mm before holds to 2 mm / (0.3 m sqrt(240)) = 90″.
     """
-    before, after = statistics["before"], statistics["after"]
+    before = statistics["before"]
+    after = statistics["after"]
     assert after["solved"] == after["stops"] == 8
     assert before["solved"] > 4  # the comparison is of something
     assert before["cross_arcsec_median"] > 360
@@ -115,23 +131,35 @@ def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_be
 ) -> None:
     fitted = [row for row in statistics["values"] if row["sigma"]]
     assert [row["what"] for row in fitted] == [
-        *("focal length px", "center x px", "center y px", "lever x mm", "lever y mm", "lever z mm"),
+        "focal length px",
+        "center x px",
+        "center y px",
+        "lever x mm",
+        "lever y mm",
+        "lever z mm",
     ]
     truth = statistics["truth"]
     for row in fitted:
         assert abs(row["found"] - truth[row["what"]]) < 4.5 * row["sigma"], row
     for row in fitted[:1] + fitted[3:5]:
-        assert abs(row["found"] - truth[row["what"]]) < abs(row["believed"] - truth[row["what"]]) / 2, row
+        assert (
+            abs(row["found"] - truth[row["what"]]) < abs(row["believed"] - truth[row["what"]]) / 2
+        ), row
     # The assumed height happens to err by as little as the one sigma to which it is measured.
-    assert abs(fitted[5]["found"] - truth["lever z mm"]) < abs(fitted[5]["believed"] - truth["lever z mm"])
+    assert abs(fitted[5]["found"] - truth["lever z mm"]) < abs(
+        fitted[5]["believed"] - truth["lever z mm"]
+    )
     found, before = (
-        np.linalg.norm([row[by] - truth[row["what"]] for row in fitted[3:]]) for by in ("found", "believed")
+        np.linalg.norm([row[by] - truth[row["what"]] for row in fitted[3:]])
+        for by in ("found", "believed")
     )
     assert found < before / 2
 
 
 @pytest.mark.slow
-def test_the_leds_are_off_by_what_their_sigmas_say(statistics: dict[str, Any], folder: Path) -> None:
+def test_the_leds_are_off_by_what_their_sigmas_say(
+    statistics: dict[str, Any], folder: Path
+) -> None:
     """The moves that all LEDs share keep the mean square from settling at 1: a factor of 2 either way."""
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
     assert len(table) == statistics["surveyed"] < statistics["leds"]
@@ -158,7 +186,9 @@ def test_a_scene_beside_the_file_believes_it(statistics: dict[str, Any], folder:
     assert tracker.lever.sigma_m == measured.lever_sigma_m
     found = {row["what"]: row["found"] for row in statistics["values"]}
     assert tracker.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
-    ((frame, truth),) = survey_frames.render_stops(lab, survey_stops.stop_attitudes(lab.scene, "checks", 1, 10.0))
+    ((frame, truth),) = survey_frames.render_stops(
+        lab, survey_stops.stop_attitudes(lab.scene, "checks", 1, 10.0)
+    )
     answer = factory.solve_frame(tracker, frame).attitude
     assert answer.cam_from_ref is not None
     assert np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()) < 0.1
@@ -191,7 +221,10 @@ def test_stops_lean_evenly_over_the_cap_and_turn_any_way(lab: Lab) -> None:
     height = (up[:, 2] - least) / (1 - least)
     assert height.min() > 0
     heading = stops.apply([1.0, 0.0, 0.0])
-    for uniform in (height, *(np.arctan2(v[:, 1], v[:, 0]) / (2 * np.pi) + 0.5 for v in (up, heading))):
+    for uniform in (
+        height,
+        *(np.arctan2(v[:, 1], v[:, 0]) / (2 * np.pi) + 0.5 for v in (up, heading)),
+    ):
         assert np.mean(uniform) == pytest.approx(0.5, abs=5 / np.sqrt(12 * 2000))
         assert np.mean(uniform**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / 2000))
 
@@ -220,8 +253,12 @@ def test_an_imu_error_shifts_a_frame_by_what_is_predicted(lab: Lab) -> None:
     sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
     predicted_px, _ = matching.prediction_sigmas_px(prior, sigmas)
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
-    center = np.argsort(np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1))[:5]
-    shifted_px = np.array([prior.pixels(error)[center].mean(axis=0) for error in Rotation.from_rotvec(errors_rad)])
+    center = np.argsort(
+        np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1)
+    )[:5]
+    shifted_px = np.array(
+        [prior.pixels(error)[center].mean(axis=0) for error in Rotation.from_rotvec(errors_rad)]
+    )
     assert shifted_px.std(axis=0) == pytest.approx(predicted_px, rel=0.05)
     assert predicted_px > 1.4 * sigmas.imu_sigma_rad * prior.camera.focal_px
 
@@ -234,7 +271,9 @@ def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     named = right = lights = 0
     for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):
         names = matching.match_by_imu(survey_frame, prior, UNCERTAINTY)
-        apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(survey_frame.lights.xy_px[names.light])
+        apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(
+            survey_frame.lights.xy_px[names.light]
+        )
         true = np.where(apart_px < 2, truth.sources.id[nearest], -1)
         right += int(np.sum(prior.leds.id[names.led] == true))
         named += len(true)
@@ -259,10 +298,13 @@ def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) 
 @pytest.mark.slow
 def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
     """Two thirds of a field are known to 25 px, so that many of them lie near any light; the others to 7 px."""
-    rng, missed = np.random.default_rng(1), 0
+    rng = np.random.default_rng(1)
+    missed = 0
     for _ in range(40):
         across, down = np.meshgrid(75.0 * np.arange(25), 75.0 * np.arange(25))
-        predicted = np.column_stack([across.ravel(), down.ravel()]) + rng.normal(0, 22, (625, 2)) - 550
+        predicted = (
+            np.column_stack([across.ravel(), down.ravel()]) + rng.normal(0, 22, (625, 2)) - 550
+        )
         sigma_px = np.where(predicted[:, 0] < 250, 7.0, 25.0)
         shift = rng.normal(0, 90, 2)
         seen = predicted + shift + sigma_px[:, None] * rng.normal(size=(625, 2))
@@ -276,20 +318,26 @@ def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
     """Five neighboring LEDs 40 mm off: frames that show all of them match two thirds of their lights."""
-    rng, dome = np.random.default_rng(seed), model(120)
-    listed_m, held = dome.leds.position_m, attitudes(rng, 40)
+    rng = np.random.default_rng(seed)
+    dome = model(120)
+    listed_m = dome.leds.position_m
+    held = attitudes(rng, 40)
     board = np.argsort(np.linalg.norm(listed_m - listed_m[20], axis=1))[:5]
     along = np.cross(listed_m[20], [1.0, 0.0, 0.0])
     place_m = listed_m + rng.normal(0, 0.002, listed_m.shape)
     place_m[board] += 0.04 * along / np.linalg.norm(along)
     lever = replace(dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3))
-    prior = survey_prior.CalibrationPrior(dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120))
+    prior = survey_prior.CalibrationPrior(
+        dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120)
+    )
     frames = []
     for index, attitude in enumerate(held):
         xy_px = pixels(dome, place_m, attitude)
         xy_px = xy_px[dome.camera.contains(xy_px)]
         lights = Centroids(
-            xy_px + rng.normal(0, NOISE_PX, xy_px.shape), np.full(len(xy_px), NOISE_PX), np.ones(len(xy_px))
+            xy_px + rng.normal(0, NOISE_PX, xy_px.shape),
+            np.full(len(xy_px), NOISE_PX),
+            np.ones(len(xy_px)),
         )
         by_imu = Rotation.from_rotvec(UNCERTAINTY.imu_sigma_rad * rng.normal(size=3)) * attitude
         frames.append(SurveyFrame(lights, by_imu, index))
@@ -304,7 +352,9 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
 def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
-        seen, predicted, gate = rng.uniform(0, 10, (4, 2)), rng.uniform(0, 10, (5, 2)), rng.uniform(1, 5, 5)
+        seen = rng.uniform(0, 10, (4, 2))
+        predicted = rng.uniform(0, 10, (5, 2))
+        gate = rng.uniform(1, 5, 5)
         cost = np.minimum(np.linalg.norm(seen[:, None] - predicted, axis=2) / gate, 1) ** 2
         best = min(itertools.permutations(range(5), 4), key=lambda p: cost[range(4), p].sum())
         expected = [(i, j) for i, j in enumerate(best) if cost[i, j] < 1]
@@ -333,7 +383,9 @@ def test_frames_that_hang_on_no_others_are_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Path, tmp_path: Path) -> None:
+def test_a_map_is_read_as_it_was_written(
+    statistics: dict[str, Any], folder: Path, tmp_path: Path
+) -> None:
     first = dome_map_file.read_dome_map(folder / "leds.ecsv")
     dome_map_file.write_dome_map(tmp_path / "again.ecsv", first)
     assert (tmp_path / "again.ecsv").read_bytes() == (folder / "leds.ecsv").read_bytes()
@@ -347,7 +399,11 @@ def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Pat
     [
         ("z_m", "zz", "no column z_m; allowed: a map written by a survey"),
         ("focal_px: 17", "focal_px: -17", "focal_px in the header is -17"),
-        ("focal_px: 17", "focal: 17", "focal_px in the header is None; allowed: 1 finite number above 0"),
+        (
+            "focal_px: 17",
+            "focal: 17",
+            "focal_px in the header is None; allowed: 1 finite number above 0",
+        ),
         (
             "size_px: [640",
             "size_px: [641",
@@ -375,7 +431,12 @@ def test_a_map_with_a_slip_is_one_line(
     ],
 )
 def test_a_map_with_a_wrong_led_is_one_line(
-    statistics: dict[str, Any], folder: Path, tmp_path: Path, column: str, value: float | None, says: str
+    statistics: dict[str, Any],
+    folder: Path,
+    tmp_path: Path,
+    column: str,
+    value: float | None,
+    says: str,
 ) -> None:
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
     table[column][2] = table[column][3] if value is None else value
@@ -419,7 +480,9 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
     folder: Path, tmp_path: Path, changes: dict[str, str], says: str
 ) -> None:
     (tmp_path / "leds.ecsv").write_text("")
-    statistics = {key: value.replace("FILE", str(tmp_path / "leds.ecsv")) for key, value in changes.items()}
+    statistics = {
+        key: value.replace("FILE", str(tmp_path / "leds.ecsv")) for key, value in changes.items()
+    }
     with pytest.raises(InputError, match=says) as refused:
         loader.load(folder / "small.yaml", statistics)
     assert "\n" not in str(refused.value)

@@ -50,7 +50,9 @@ def dropping(tmp_path: Path) -> threading.Thread:
     return threading.Thread(target=drop)
 
 
-def test_every_image_is_read_once_and_bad_ones_are_a_line_each(tmp_path: Path, dropping: threading.Thread) -> None:
+def test_every_image_is_read_once_and_bad_ones_are_a_line_each(
+    tmp_path: Path, dropping: threading.Thread
+) -> None:
     folder = watched(tmp_path)
     dropping.start()
     news = list(folder.arrivals(12, poll_s=0.005))
@@ -72,7 +74,8 @@ def test_a_file_is_read_when_it_no_longer_grows(tmp_path: Path) -> None:
     write(tmp_path / "whole.png")
     data = (tmp_path / "whole.png").read_bytes()
     (tmp_path / "whole.png").unlink()
-    folder, growing = watched(tmp_path), tmp_path / "a.png"
+    folder = watched(tmp_path)
+    growing = tmp_path / "a.png"
     for end in (len(data) // 3, len(data) // 2, len(data)):
         growing.write_bytes(data[:end])
         assert folder.look() == ([], [])
@@ -81,7 +84,8 @@ def test_a_file_is_read_when_it_no_longer_grows(tmp_path: Path) -> None:
 
 
 def test_an_image_that_is_mended_is_read_again(tmp_path: Path) -> None:
-    folder, path = watched(tmp_path), tmp_path / "a.png"
+    folder = watched(tmp_path)
+    path = tmp_path / "a.png"
     path.write_bytes(b"no image")
     folder.look()
     assert len(folder.look().complaints) == 1
@@ -92,7 +96,9 @@ def test_an_image_that_is_mended_is_read_again(tmp_path: Path) -> None:
     assert [picture.name for picture in folder.pictures] == ["a.png"]
 
 
-def test_an_image_that_is_removed_or_replaced_by_a_better_format_is_not_counted_twice(tmp_path: Path) -> None:
+def test_an_image_that_is_removed_or_replaced_by_a_better_format_is_not_counted_twice(
+    tmp_path: Path,
+) -> None:
     folder = watched(tmp_path)
     for name in ("a.bmp", "b.png"):
         write(tmp_path / name)
@@ -112,7 +118,9 @@ def test_attitudes_with_a_slip_are_a_line_and_the_watch_goes_on(tmp_path: Path) 
     folder.look()
     read, complaints = folder.look()
     assert read == ["a.png"]
-    assert [(error.problem, error.allowed) for error in complaints] == [("3 values", "4, as the first line has")]
+    assert [(error.problem, error.allowed) for error in complaints] == [
+        ("3 values", "4, as the first line has")
+    ]
     (tmp_path / ATTITUDES).write_text(HEAD + "a.png,1,2,3\n")
     folder.look()
     assert folder.look().read == [ATTITUDES]

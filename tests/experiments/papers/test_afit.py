@@ -21,7 +21,8 @@ from skysim.experiments.papers.intervals import confidence_interval
 from skysim.scene.loader import load
 from skysim.simulation.lab import Lab
 
-R_M, M_M = 48 * INCH_M, 15 * INCH_M
+R_M = 48 * INCH_M
+M_M = 15 * INCH_M
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +34,16 @@ def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Lab) -> None:
     """y is half the pair, x the root of (R - M)^2 - y^2; the camera's M is added: an angle about the bearing."""
     y = PAIR_M / 2
     angle = 2 * np.arctan(y / (np.sqrt((R_M - M_M) ** 2 - y**2) + M_M))
-    assert geometric_angle_arcsec(pair, Place(0.0)) == pytest.approx(np.degrees(angle) * 3600, abs=1e-3)
+    assert geometric_angle_arcsec(pair, Place(0.0)) == pytest.approx(
+        np.degrees(angle) * 3600, abs=1e-3
+    )
 
 
 def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
     """One LED comes nearer and the other farther, which cancels but for the square of half the pair's angle."""
-    share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(pair, Place(28.0))
+    share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(
+        pair, Place(28.0)
+    )
     # The dome's own normal leans there by a little, so that five degrees are added to it.
     normal = test2.place_pair(pair, Place(28.0)).camera.sources.normal[0]
     crop_board = np.array([-np.sin(np.radians(28)), 0, -np.cos(np.radians(28))])
@@ -77,7 +82,9 @@ def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() ->
 
 def test_an_led_that_is_not_seen_is_in_no_order() -> None:
     """Of three images one has all LEDs, falling; one lacks the last; one has two in the wrong order."""
-    told = led_tests.fraction_in_order(np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]]))
+    told = led_tests.fraction_in_order(
+        np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]])
+    )
     assert told.value == pytest.approx(1 / 3)
 
 
@@ -95,7 +102,10 @@ def test_a_threshold_parts_leds_glare_and_noise() -> None:
     image[195:206, 195:206] = 100  # an LED of 121 px
     image[200, 225:228] = 6  # glare beside it
     image[10, 10] = image[390, 390] = 6  # noise far away
-    at = [led_tests.count_above(image, np.array([[200.0, 200.0]]), share) for share in (0.02, 0.10, 0.5)]
+    at = [
+        led_tests.count_above(image, np.array([[200.0, 200.0]]), share)
+        for share in (0.02, 0.10, 0.5)
+    ]
     assert [(one.area_px.tolist(), one.glare_px, one.dark_px) for one in at] == [
         ([121.0], 3, 2),
         ([121.0], 0, 0),
@@ -105,9 +115,15 @@ def test_a_threshold_parts_leds_glare_and_noise() -> None:
 
 def test_one_led_of_nine_is_lit_at_any_time() -> None:
     """Whatever the phase: the nine share 100 ms, and each has eleven pulses of 1 ms or a twelfth or a part of it."""
-    rng, level = np.random.default_rng(2), Rotation.identity()
-    exact = with_config(test1.scene_with_exposure(0.1), "light.led.clock", offset_ppm=0.0, drift_ppm_h=0.0)
-    whole, frame = (build_test_stand(with_config(exact, "exposure", time_s=time_s)) for time_s in (36e-3, 100e-3))
+    rng = np.random.default_rng(2)
+    level = Rotation.identity()
+    exact = with_config(
+        test1.scene_with_exposure(0.1), "light.led.clock", offset_ppm=0.0, drift_ppm_h=0.0
+    )
+    whole, frame = (
+        build_test_stand(with_config(exact, "exposure", time_s=time_s))
+        for time_s in (36e-3, 100e-3)
+    )
     each_e = render_at_attitude(whole, level, rng)[1].sources.electrons  # of four pulses, 4 ms
     for _ in range(3):
         lit_ms = 4 * render_at_attitude(frame, level, rng)[1].sources.electrons / each_e
@@ -118,6 +134,9 @@ def test_one_led_of_nine_is_lit_at_any_time() -> None:
 
 def test_a_relative_decrease_has_the_interval_of_the_mean_the_other_way_round() -> None:
     angles = np.array([96.0, 92.0, 94.0, 95.0, 93.0])
-    fall, mean = test2.relative_decrease(100.0, angles), confidence_interval(angles)
-    assert (fall.value, fall.low, fall.high) == pytest.approx((6.0, 100 - mean.high, 100 - mean.low))
+    fall = test2.relative_decrease(100.0, angles)
+    mean = confidence_interval(angles)
+    assert (fall.value, fall.low, fall.high) == pytest.approx(
+        (6.0, 100 - mean.high, 100 - mean.low)
+    )
     assert (mean.value, fall.trials) == (pytest.approx(94.0), 5)

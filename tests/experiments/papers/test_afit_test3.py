@@ -37,7 +37,9 @@ def test_every_position_shows_all_five(sightings: list[Sighting]) -> None:
     assert [one.stop for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
-def test_the_epsilons_are_those_of_the_thesis_s_calibration(lab: Lab, sightings: list[Sighting]) -> None:
+def test_the_epsilons_are_those_of_the_thesis_s_calibration(
+    lab: Lab, sightings: list[Sighting]
+) -> None:
     measurements = measure(lab, sightings)
     believed = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)  # type: ignore[arg-type]
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
@@ -52,7 +54,9 @@ def test_the_epsilons_are_those_of_the_thesis_s_calibration(lab: Lab, sightings:
     np.testing.assert_allclose(found, theirs * np.sqrt(1 - 1 / len(sightings)), rtol=1e-9)
 
 
-def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(lab: Lab, sightings: list[Sighting]) -> None:
+def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
+    lab: Lab, sightings: list[Sighting]
+) -> None:
     """A shift d of one in five: sd = d sqrt(1/5 4/5), 48 in times the IMU's .239 deg (Table 14); n - 1 aside."""
     shift_mm = 48 * 25.4 * np.radians(0.239)
     expected = shift_mm * np.sqrt(0.2 * 0.8) * np.sqrt(10 / 9)
@@ -72,7 +76,9 @@ def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(lab: Lab
     assert np.abs(arms_mm - 8).max() < 0.25  # set by hand
 
 
-def test_intervals_draw_the_images_of_a_position_and_not_the_positions(lab: Lab, sightings: list[Sighting]) -> None:
+def test_intervals_draw_the_images_of_a_position_and_not_the_positions(
+    lab: Lab, sightings: list[Sighting]
+) -> None:
     """What differs between positions alone has no interval."""
     measurements = measure(lab, sightings)
     values = measurements.position[:, None].astype(float)
@@ -109,13 +115,17 @@ def test_an_imu_drifts_by_the_earth_s_rate() -> None:
     expected = 15.041 * np.outer(hours, [np.cos(latitude), 0, np.sin(latitude)])
     # The way between positions takes some seconds more, a twentieth; the lean of 3 deg mixes axes by as much.
     error = off.std(axis=0, ddof=1)[1:] / np.sqrt(units)
-    assert np.all(np.abs(off.mean(axis=0)[1:] - expected) < 4 * error + 0.1 * np.abs(expected).max(axis=1)[:, None])
+    assert np.all(
+        np.abs(off.mean(axis=0)[1:] - expected)
+        < 4 * error + 0.1 * np.abs(expected).max(axis=1)[:, None]
+    )
     assert np.abs(off[:, 0]).max() < 1e-12
 
 
 @pytest.mark.long
 def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
-    calm, knocked = bump.simulate_bump(None, 74), bump.simulate_bump(bump.FITTED_BUMP, 74)
+    calm = bump.simulate_bump(None, 74)
+    knocked = bump.simulate_bump(bump.FITTED_BUMP, 74)
     assert calm.saturated_s == 0
     assert 0.15 < knocked.saturated_s < 0.25  # caught after 0.2 s
     lost = np.abs(knocked.imu_deg[-1] - calm.imu_deg[-1])
@@ -135,6 +145,7 @@ def test_the_vehicle_stands_where_the_tables_say() -> None:
 
 def test_images_are_the_same_by_the_same_seed(lab: Lab) -> None:
     first, again = (
-        photograph(lab, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px for _ in range(2)
+        photograph(lab, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px
+        for _ in range(2)
     )
     np.testing.assert_array_equal(first, again)

@@ -43,7 +43,8 @@ def test_a_camera_in_the_center_sees_no_shell() -> None:
     lab = build_lab(scene)
     poses = apl.random_attitudes(8, np.random.default_rng(1))
     worst = [
-        apl.largest_discrepancies_arcsec(scene, lab, offset_m, True, poses).max() for offset_m in (0.0, 0.001, 0.01)
+        apl.largest_discrepancies_arcsec(scene, lab, offset_m, True, poses).max()
+        for offset_m in (0.0, 0.001, 0.01)
     ]
     assert worst[0] < 1e-6
     assert worst[2] == pytest.approx(10 * worst[1], rel=0.02)
@@ -60,6 +61,8 @@ def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> N
 @pytest.mark.long
 def test_noise_falls_with_the_root_of_the_lights() -> None:
     """Twice the lights, 1 / sqrt(2) of the noise, to four sigmas of 150 trials."""
-    few, many = (oled.solve_random_attitudes(oled.build_setup(lights), range(150)) for lights in (20, 40))
+    few, many = (
+        oled.solve_random_attitudes(oled.build_setup(lights), range(150)) for lights in (20, 40)
+    )
     ratio = few.error_arcsec.std(axis=0) / many.error_arcsec.std(axis=0)
     assert np.abs(ratio / np.sqrt(2) - 1).max() < 4 / np.sqrt(150)

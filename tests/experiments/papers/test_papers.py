@@ -17,7 +17,13 @@ from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import ROOT
 from skysim.experiments.papers import compare, intervals, papers_report, published
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.published import Experiment, Row
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
 from skysim.results import metrics, plots
@@ -43,8 +49,12 @@ def interval(low: float, high: float) -> Summary:
         (1, 20, True),
     ],
 )
-def test_ours_agrees_where_its_interval_and_the_tolerance_meet(low: float, high: float, agrees: bool) -> None:
-    assert compare.verdict(TEN, RowResult(interval(low, high))) == ("agrees" if agrees else "disagrees")
+def test_ours_agrees_where_its_interval_and_the_tolerance_meet(
+    low: float, high: float, agrees: bool
+) -> None:
+    assert compare.verdict(TEN, RowResult(interval(low, high))) == (
+        "agrees" if agrees else "disagrees"
+    )
 
 
 def test_a_number_without_an_interval_is_held_by_itself() -> None:
@@ -54,7 +64,8 @@ def test_a_number_without_an_interval_is_held_by_itself() -> None:
 
 
 def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_there() -> None:
-    off, near = exact(12.0), exact(10.1)
+    off = exact(12.0)
+    near = exact(10.1)
     assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", near))) == "explained"
     assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", exact(11.0)))) == "disagrees"
     assert compare.verdict(TEN, RowResult(near, cause=Cause("tilt", off))) == "agrees"
@@ -85,7 +96,16 @@ def test_machines_get_the_keys_that_were_promised() -> None:
     bound = Row(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
     told = line.as_dict()
-    assert list(told) == ["id", "quantity", "published", "ours", "interval", "tolerance", "verdict", "note"]
+    assert list(told) == [
+        "id",
+        "quantity",
+        "published",
+        "ours",
+        "interval",
+        "tolerance",
+        "verdict",
+        "note",
+    ]
     assert told["published"] == [0.9, None]
     assert told["ours"] == 0.95
     assert told["interval"][0] < 0.95 < told["interval"][1]
@@ -100,7 +120,9 @@ def test_an_answer_to_every_row_and_no_other() -> None:
 # Intervals of few values.
 
 
-def covered(interval: Callable[[np.ndarray], Summary], target: Callable[[np.random.Generator], float]) -> float:
+def covered(
+    interval: Callable[[np.ndarray], Summary], target: Callable[[np.random.Generator], float]
+) -> float:
     """How often the interval of four normal draws, of mean 3 and deviation 2, holds what it is of."""
     hits = 0
     for n in range(TRIED):
@@ -116,7 +138,9 @@ TRIED = 1500
 def test_intervals_of_four_hold_what_they_promise() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
     assert abs(covered(intervals.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
-    assert abs(covered(intervals.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
+    assert (
+        abs(covered(intervals.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
+    )
 
 
 @pytest.mark.slow
@@ -137,14 +161,20 @@ def both(values: np.ndarray) -> tuple[Summary, Summary]:
 
 
 def test_a_row_says_a_number_or_bounds() -> None:
-    for wrong in ({"quantity": "x"}, {"quantity": "x", "published": 1, "at_most": 2}, {"published": 1}):
+    for wrong in (
+        {"quantity": "x"},
+        {"quantity": "x", "published": 1, "at_most": 2},
+        {"published": 1},
+    ):
         with pytest.raises(ValidationError):
             Row.model_validate(wrong)
 
 
 def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
-    path.write_text("paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n")
+    path.write_text(
+        "paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n"
+    )
     with pytest.raises(InputError, match=r"experiments\.a\.rows\.r\.quantity: missing .*line 7"):
         published.read(path)
 
@@ -169,7 +199,9 @@ def test_without_an_id_it_lists_them() -> None:
 
 
 def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
-    with pytest.raises(InputError, match=r"unknown experiment 'afit-table-99'; allowed: all, .*afit-table-1"):
+    with pytest.raises(
+        InputError, match=r"unknown experiment 'afit-table-99'; allowed: all, .*afit-table-1"
+    ):
         check_ids(["afit-table-99"])
     assert check_ids(["all"]) == list(published.experiments())
     assert check_ids(["afit-table-1", "afit-table-1"]) == ["afit-table-1"]
@@ -179,12 +211,16 @@ def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
 def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None:
     markdown = tmp_path / "papers.md"
     words = ["afit-table-1", "--report", "--out", str(tmp_path), "--markdown", str(markdown)]
-    shown, rows = asked(*words), json.loads(asked("afit-table-1", "--json"))
-    html, text = (tmp_path / "report.html").read_text("utf-8"), markdown.read_text("utf-8")
+    shown = asked(*words)
+    rows = json.loads(asked("afit-table-1", "--json"))
+    html = (tmp_path / "report.html").read_text("utf-8")
+    text = markdown.read_text("utf-8")
     for row in rows:
         assert row["quantity"] in shown
         assert row["quantity"] in html
-        assert re.search(rf"\| {re.escape(row['quantity'])} \| .* \| \**{row['verdict']}\** \|", text)
+        assert re.search(
+            rf"\| {re.escape(row['quantity'])} \| .* \| \**{row['verdict']}\** \|", text
+        )
     assert (tmp_path / "papers/afit-table-1_1.png").stat().st_size > 1000
     assert html.count("data:image/png") == 1
 
@@ -192,15 +228,21 @@ def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None
 def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
-        {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))}, (Drawing("<empty>", lambda fig: None),)
+        {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
+        (Drawing("<empty>", lambda fig: None),),
     )
     report = papers_report.papers_report([compare.compare("x", one, found, 0.0)], ("x",), True, 3)
-    html, text = report.html(), report.markdown()
+    html = report.html()
+    text = report.markdown()
     assert re.findall(r'<td class="text (\w+)">(agrees|disagrees)</td>', html) == [
         ("bad", "disagrees"),
         ("good", "agrees"),
     ]
-    assert html.count("skysim reproduce x --quick --seed 3") == text.count("skysim reproduce x --quick --seed 3") == 1
+    assert (
+        html.count("skysim reproduce x --quick --seed 3")
+        == text.count("skysim reproduce x --quick --seed 3")
+        == 1
+    )
     assert "&lt;empty&gt;" in html
     assert "Of 2 published numbers 1 agree, 0 are explained and 1 disagree" in report.verdict
     assert "| **disagrees** |" in text
@@ -261,7 +303,9 @@ def test_the_page_has_every_published_row_as_it_is_published() -> None:
 def test_the_page_s_verdicts_follow_from_its_numbers() -> None:
     slack = 1e-3
     for id, row, cells in rows():
-        ours, verdict, where = told(cells[2]), cells[3].strip("*"), f"{id}: {row.quantity}"
+        ours = told(cells[2])
+        verdict = cells[3].strip("*")
+        where = f"{id}: {row.quantity}"
         cause = re.match(rf"with .*?: ({NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?)(?=;|$)", cells[4])
         explains = bool(cause) and compare.intervals_overlap(row, eased(told(cause[1]), slack))
         allowed = {
@@ -275,7 +319,9 @@ def test_the_page_s_verdicts_follow_from_its_numbers() -> None:
 def test_the_page_s_pictures_are_there() -> None:
     named = re.findall(r"^!\[.+\]\((papers/.+\.png)\)$", PAGE.read_text("utf-8"), re.MULTILINE)
     assert len(named) >= len(published.experiments())
-    assert {str(path.relative_to(PAGE.parent)) for path in PAGE.with_suffix("").glob("*.png")} == set(named)
+    assert {
+        str(path.relative_to(PAGE.parent)) for path in PAGE.with_suffix("").glob("*.png")
+    } == set(named)
 
 
 @pytest.mark.long
@@ -285,7 +331,9 @@ def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
     def still(text: str) -> list[str]:
         head, tail = text.split("\n## ", 1)
         timed = re.compile(r"^### shefex-fig-3$.*?(?=^### )", re.MULTILINE | re.DOTALL)
-        return [re.sub(r"\d+ \|$", "|", line) for line in head.splitlines()] + timed.sub("", tail).splitlines()
+        return [re.sub(r"\d+ \|$", "|", line) for line in head.splitlines()] + timed.sub(
+            "", tail
+        ).splitlines()
 
     asked("all", "--markdown", str(tmp_path / "papers.md"))
     again = (tmp_path / "papers.md").read_text("utf-8")
@@ -300,7 +348,11 @@ QUICK = ("afit-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second ea
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "id", [pytest.param(id, marks=() if id in QUICK else pytest.mark.long) for id in published.experiments()]
+    "id",
+    [
+        pytest.param(id, marks=() if id in QUICK else pytest.mark.long)
+        for id in published.experiments()
+    ],
 )
 def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     """Each inside its interval; the whole experiment's, on the page, within the two intervals' widths of it; and what
@@ -308,7 +360,8 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     done = reproduce(id, ExperimentOptions(quick=True))
     lines = list(zip(done.comparisons, parts()[id], strict=True))
     for line, cells in lines:
-        ours, whole = line.result.ours, told(cells[2])
+        ours = line.result.ours
+        whole = told(cells[2])
         assert not ours.low > ours.value + 1e-12, line.row.quantity
         assert not ours.high < ours.value - 1e-12, line.row.quantity
         assert ours.trials > 0, line.row.quantity
@@ -317,7 +370,11 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
         share = 1.0 if id in TIMED else 0.35 if worst_of_few else 0.02
         reach = share * abs(whole.value) + (0.0 if worst_of_few else 1.5 * sum(widths))
         assert abs(ours.value - whole.value) <= reach + line.row.tolerance + 1e-9, line.row.quantity
-    turned = [line.row.quantity for line, cells in lines if cells[3] == "agrees" and line.verdict == "disagrees"]
+    turned = [
+        line.row.quantity
+        for line, cells in lines
+        if cells[3] == "agrees" and line.verdict == "disagrees"
+    ]
     assert turned == [] or id in TIMED
     for drawing in done.drawings:
         assert len(plots.png(drawing.draw, drawing.size_in)) > 1000
@@ -327,5 +384,7 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
 @pytest.mark.parametrize("id", ["afit-table-1", "shefex-figs-4-5", "apl"])
 def test_the_same_seed_gives_the_same_numbers(id: str) -> None:
     first, again = (reproduce(id, ExperimentOptions(quick=True, seed=5)) for _ in range(2))
-    said = [files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)]  # NaN is not NaN
+    said = [
+        files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)
+    ]  # NaN is not NaN
     assert said[0] == said[1]

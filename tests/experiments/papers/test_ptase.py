@@ -30,7 +30,8 @@ def test_the_paper_s_attitude_error_is_the_root_of_two_times_the_angle() -> None
 
 def test_near_a_pole_an_error_of_the_axis_turns_north() -> None:
     """d(roll) = tan(dec) times the error along right ascension: eq. 9 counts it as roll."""
-    east_arcsec, dec_rad = 2.0, np.radians(80)
+    east_arcsec = 2.0
+    dec_rad = np.radians(80)
     z = np.array([np.cos(dec_rad), 0, np.sin(dec_rad)])
     truth = np.array([[0, 1, 0], np.cross(z, [0, 1, 0]), z])
     # About the sensor's y axis, which points north: the boresight goes east, and nothing turns about it.
@@ -56,9 +57,12 @@ def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
     # Of a square field of half-width a the mean of x^2 + y^2 is 2 a^2 / 3 (tangents), a little less of sines.
     a2 = 2 * monte_carlo.HALF_FIELD_TAN**2 / 3
     across, about = (
-        1 / 2 * one / (3 * ARCSEC_RAD) * np.sqrt(n) for one in (np.concatenate([x, y]).reshape(2, -1), roll)
+        1 / 2 * one / (3 * ARCSEC_RAD) * np.sqrt(n)
+        for one in (np.concatenate([x, y]).reshape(2, -1), roll)
     )
-    assert rms(across.ravel()) == pytest.approx(1, abs=0.12)  # the roll's part through a lopsided field comes on top
+    assert rms(across.ravel()) == pytest.approx(
+        1, abs=0.12
+    )  # the roll's part through a lopsided field comes on top
     assert rms(about * np.sqrt(a2)) == pytest.approx(1, rel=0.2)
 
 

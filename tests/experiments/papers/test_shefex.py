@@ -99,10 +99,13 @@ def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
 
 def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:
     rng = np.random.default_rng(5)
-    poisson, even = rng.poisson(8, (20_000, 2)), np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
+    poisson = rng.poisson(8, (20_000, 2))
+    even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
     for counts, expected in ((poisson, 1.0), (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8)):
         columns = np.hstack([counts, counts**2.0])
-        assert catalog.relative_dispersion(columns.mean(axis=0)) == pytest.approx(expected, rel=0.05)
+        assert catalog.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
+            expected, rel=0.05
+        )
 
 
 def test_the_two_scans_have_the_same_objects() -> None:
@@ -124,7 +127,8 @@ def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
 
 def test_a_planet_s_light_is_pogson_s() -> None:
     loop = camera.ExposureLoop({}, camera.random_attitudes(1, 1)[0], 40)
-    before, after = loop.lab.camera.sources, camera.with_planets(loop.lab.camera, loop.rest, 3)
+    before = loop.lab.camera.sources
+    after = camera.with_planets(loop.lab.camera, loop.rest, 3)
     changed = after.strength != before.strength
     assert changed.sum() == 3
     gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])
@@ -133,7 +137,9 @@ def test_a_planet_s_light_is_pogson_s() -> None:
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_numbers() -> None:
-    first, again = (camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results for _ in range(2))
+    first, again = (
+        camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results for _ in range(2)
+    )
     assert first == again
 
 

@@ -32,8 +32,13 @@ STUDY: dict[str, Any] = {
     "responses": ["identified", "roll_arcsec_p95", "misidentified"],
 }
 NEVER = {
-    **{"misidentified": 0, "roll_noise": 0, "misled": 0, "wrong": 0, "ambiguous": 0, "refused": 0},
-    **{"identified": 0},
+    "misidentified": 0,
+    "roll_noise": 0,
+    "misled": 0,
+    "wrong": 0,
+    "ambiguous": 0,
+    "refused": 0,
+    "identified": 0,
 }
 
 
@@ -60,7 +65,9 @@ def test_nowhere_ambiguous_has_a_confidence() -> None:
         "Is it ambiguous anywhere? No. Ambiguous or misled: none in 10,000 (less than 0.03 % at 95 % confidence)."
     )
     assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
-    assert [one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one] == []
+    assert [
+        one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one
+    ] == []
 
 
 def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
@@ -92,33 +99,52 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
 
 def test_misidentification_and_roll_noise_are_kept_apart() -> None:
     texts = answer.headline(study(), [line(0, 500, 1000, roll_noise=50)], True)
-    assert said(texts, "Misidentified").endswith("none in 1,000 (less than 0.3 % at 95 % confidence).")
-    assert said(texts, "Roll noise").endswith("covariance allows): 5 % of the frames (3.81 to 6.53 %).")
-    assert said(texts, "Wrong attitudes").endswith("none in 1,000 (less than 0.3 % at 95 % confidence).")
+    assert said(texts, "Misidentified").endswith(
+        "none in 1,000 (less than 0.3 % at 95 % confidence)."
+    )
+    assert said(texts, "Roll noise").endswith(
+        "covariance allows): 5 % of the frames (3.81 to 6.53 %)."
+    )
+    assert said(texts, "Wrong attitudes").endswith(
+        "none in 1,000 (less than 0.3 % at 95 % confidence)."
+    )
 
 
 def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
     texts = answer.headline(study(), [line(0, 500, 100), line(1, 900, 1000)], False)
-    assert said(texts, "Misidentified").endswith("none in 100 a point (less than 3 % at 95 % confidence).")
+    assert said(texts, "Misidentified").endswith(
+        "none in 100 a point (less than 3 % at 95 % confidence)."
+    )
 
 
 def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
     """One of 90 matches is wrong in 25 of 200 frames: not an alarm if the errors are as claimed."""
-    one, other = line(0, 500, 200, misidentified=25), line(1, 900, 200)
+    one = line(0, 500, 200, misidentified=25)
+    other = line(1, 900, 200)
     for point, share in ((one, 25 / 18_000), (other, 0.0)):
         point.responses["mismatched"] = Summary(share, math.nan, math.nan, 18_000)
     texts = answer.headline(study(), [one, other], True)
-    assert "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed." in texts
+    assert (
+        "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed."
+        in texts
+    )
     assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
     one.responses["misled"] = metrics.proportion(10, 200)
-    (text,) = [text for text in answer.headline(study(), [one, other], True) if text.startswith("There 25")]
-    assert "the attitude errs more than claimed at 1 of 2 points, most at leds = 500: 5 % of the frames (2.74" in text
+    (text,) = [
+        text for text in answer.headline(study(), [one, other], True) if text.startswith("There 25")
+    ]
+    assert (
+        "the attitude errs more than claimed at 1 of 2 points, most at leds = 500: 5 % of the frames (2.74"
+        in text
+    )
 
 
 def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
     unknown = line(0, 500, 100)
     unknown.responses["misidentified"] = metrics.NO_VALUE
-    assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith("does not name its lights.")
+    assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith(
+        "does not name its lights."
+    )
 
 
 def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_values() -> None:
@@ -167,7 +193,9 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
         ),
     ],
 )
-def test_claimed_errors_that_are_false_are_called_so(nees: list[tuple[float, float, float]], expected: str) -> None:
+def test_claimed_errors_that_are_false_are_called_so(
+    nees: list[tuple[float, float, float]], expected: str
+) -> None:
     """The factor is sqrt(NEES / 3): 1.3 at 5.07, and 2 too large at 0.75."""
     lines = [line(n, leds, 500) for n, leds in enumerate((500, 900))]
     for one, values in zip(lines, nees, strict=True):
@@ -202,7 +230,10 @@ def loaded(folder: Path, **keys: Any) -> Any:
 @pytest.mark.slow
 def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     rows = dict(overview.overview(loaded(tmp_path, hardware=["light.layout.hardware_seed"])).rows)
-    assert rows["light"] == "dome (ellipsoid, 1.219 m above the bearing) with 500 LEDs (random) within 40°"
+    assert (
+        rows["light"]
+        == "dome (ellipsoid, 1.219 m above the bearing) with 500 LEDs (random) within 40°"
+    )
     assert rows["camera"].endswith("f/8, field 10° × 7.52°, 22.6″ a pixel")
     assert rows["trial"] == "kind: centroids, noise_px: 0.2"
     assert rows["varied: leds"] == "500, 900 (light.layout.count)"
@@ -212,8 +243,17 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None:
-    station = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
-    survey = {"tracker.survey": {"instrument": station | {"distance_sigma": "1 mm"}, "led_sigma": "0.1 mm"}}
+    station = {
+        "kind": "total_station",
+        "position": ["1 m", "0 m", "-0.5 m"],
+        "angle_sigma_arcsec": 2,
+    }
+    survey = {
+        "tracker.survey": {
+            "instrument": station | {"distance_sigma": "1 mm"},
+            "led_sigma": "0.1 mm",
+        }
+    }
     plan = loaded(tmp_path, set=STUDY["set"] | survey)
     scene, _ = resolve_point(plan.spec, plan.points[0].settings)
     (fact,) = [one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"]
@@ -225,7 +265,8 @@ def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_intervals_of_one_dome_say_which_hardware_is_fixed(tmp_path: Path) -> None:
-    survey, layout = "tracker.survey.seed", "light.layout.hardware_seed"
+    survey = "tracker.survey.seed"
+    layout = "light.layout.hardware_seed"
     (said_,) = answer.one_unit(overview.overview(loaded(tmp_path)).fixed)
     assert said_ == (
         "Intervals cover other attitudes, with one survey and one draw of the LEDs:"
@@ -234,7 +275,9 @@ def test_intervals_of_one_dome_say_which_hardware_is_fixed(tmp_path: Path) -> No
     )
     (said_,) = answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey])).fixed)
     assert f"with one draw of the LEDs: `hardware: [{layout}]`" in said_
-    assert answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed) == []
+    assert (
+        answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed) == []
+    )
     units = {"unit": {"levels": {"a": {survey: 1}, "b": {survey: 2}}}}
     assert overview.overview(loaded(tmp_path, factors=units)).fixed == (layout,)
 
@@ -255,10 +298,14 @@ def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(tmp_path: Path) -> None:
+def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(
+    tmp_path: Path,
+) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}
-    told = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors={"disk": {"levels": levels}}))
+    told = overview.overview(
+        loaded(tmp_path, trial={"kind": "frames"}, factors={"disk": {"levels": levels}})
+    )
     wide = [one for one in told.findings if "px wide; local treats" in one]
     assert len(wide) == 1
     assert wide[0].endswith("[disk = large]")
@@ -270,7 +317,10 @@ def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(t
     ("texts", "told"),
     [
         (["12 px of 3"] * 3, "12 px of 3"),
-        (["12 px of 3", "13 px of 3", "12 px of 3"], "12 px of 3 [a = 1; with other numbers at all others]"),
+        (
+            ["12 px of 3", "13 px of 3", "12 px of 3"],
+            "12 px of 3 [a = 1; with other numbers at all others]",
+        ),
         (["12 px of 3", "13 px of 3"], "12 px of 3 [a = 1; a = 2]"),
     ],
 )
@@ -280,9 +330,16 @@ def test_a_finding_that_differs_in_its_numbers_is_told_once(texts: list[str], to
 
 
 def test_a_place_has_its_unit() -> None:
-    rates = study(factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}}, trial={"kind": "frames"})
-    lines = [line(0, 500, 100)._replace(levels={"rate": 0}), line(1, 500, 100, wrong=3)._replace(levels={"rate": 8})]
-    assert "most at rate = 8 deg/s: 3 %" in said(answer.headline(rates, lines, True), "Wrong attitudes")
+    rates = study(
+        factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}}, trial={"kind": "frames"}
+    )
+    lines = [
+        line(0, 500, 100)._replace(levels={"rate": 0}),
+        line(1, 500, 100, wrong=3)._replace(levels={"rate": 8}),
+    ]
+    assert "most at rate = 8 deg/s: 3 %" in said(
+        answer.headline(rates, lines, True), "Wrong attitudes"
+    )
 
 
 def test_a_rounding_error_of_zero_is_zero() -> None:
@@ -294,7 +351,9 @@ def test_a_rounding_error_of_zero_is_zero() -> None:
 def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
     """Three widths of LEDs, all of them too wide: one warning, not three that differ in their numbers."""
     sizes = {"key": "light.led.disk_diameter", "values": ["20 mm", "25 mm", "30 mm"]}
-    found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors={"size": sizes})).findings
+    found = overview.overview(
+        loaded(tmp_path, trial={"kind": "frames"}, factors={"size": sizes})
+    ).findings
     (wide,) = [one for one in found if "px wide; local treats" in one]
     assert wide.endswith("[first levels; with other numbers at all others]")
 
@@ -314,14 +373,22 @@ def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: 
 @pytest.mark.slow
 def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path) -> None:
     """The scene turns by 0.5 deg/s and its trials by up to 20: the warning is of 20, and none is given at rest."""
-    shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}, "tracker.assumed_row_time": "0 s"}
+    shutter = {
+        "camera.shutter": {"kind": "rolling", "row_time": "80 us"},
+        "tracker.assumed_row_time": "0 s",
+    }
     rates = {"key": "trial.rate_deg_s", "values": [0, 20, 5]}
     keys: dict[str, Any] = {"scene": "shefex2", "set": shutter, "trial": {"kind": "frames"}}
     found = overview.overview(loaded(tmp_path, factors={"rate": rates}, **keys)).findings
     (text,) = [one for one in found if one.startswith("tracker.assumed_row_time: ")]
-    assert "at up to 20 deg/s; leave it out, so that the tracker corrects the rows for 80 us each, or turn " in text
+    assert (
+        "at up to 20 deg/s; leave it out, so that the tracker corrects the rows for 80 us each, or turn "
+        in text
+    )
     assert text.endswith("[rate = 20]")
-    still = overview.overview(loaded(tmp_path, factors={"rate": rates | {"values": [0]}}, **keys)).findings
+    still = overview.overview(
+        loaded(tmp_path, factors={"rate": rates | {"values": [0]}}, **keys)
+    ).findings
     assert [one for one in still if one.startswith("tracker.assumed_row_time: ")] == []
     keys["set"] = {"camera.shutter": shutter["camera.shutter"]}
     known = overview.overview(loaded(tmp_path, factors={"rate": rates}, **keys)).findings
@@ -335,8 +402,17 @@ def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None
     with store.open_store(tmp_path / "study.sqlite") as kept:
         report = study_report.study_report(plan, kept, "again")
     text = report.save(tmp_path / "r.html").read_text(encoding="utf-8")
-    parts = ("trials, 0 failed", "<b>Answer</b>", "<figure>", "<h2>Scene", "<h2>Checks of the scene", "<h2>Points")
+    parts = (
+        "trials, 0 failed",
+        "<b>Answer</b>",
+        "<figure>",
+        "<h2>Scene",
+        "<h2>Checks of the scene",
+        "<h2>Points",
+    )
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert "Is it ambiguous anywhere?" in text
-    assert text.count("<code>skysim study replay again ") == 2  # the worst trials of a map of two attitudes
+    assert (
+        text.count("<code>skysim study replay again ") == 2
+    )  # the worst trials of a map of two attitudes

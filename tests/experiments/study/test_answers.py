@@ -59,12 +59,27 @@ def test_responses_are_of_what_their_names_say():
         centroid_px=[1, 1, 7, np.nan, np.nan],
     )
     said = {
-        **{"ambiguous": 1 / 4, "misidentified": 1 / 4, "misled": 1 / 4, "roll_noise": 1 / 4},
+        "ambiguous": 1 / 4,
+        "misidentified": 1 / 4,
+        "misled": 1 / 4,
+        "roll_noise": 1 / 4,
         "mismatched": 3 / 30,
-        **{"streak_px": 2.5, "centroid_px": math.sqrt(17), "nees": 33335.333333333336, "streak_px_worst": 6},
-        **{"identified": 2 / 4, "wrong": 1 / 4, "refused": 1 / 4, "failed": 1 / 5, "overconfident": 1 / 3},
-        **{"coverage": 2 / 4, "coverage_3": 3 / 4, "stars_least": 2, "stars_mean": 4.5},
-        **{"cross_arcsec_median": 5, "roll_arcsec_worst": 12, "angle_arcsec_least": 1},
+        "streak_px": 2.5,
+        "centroid_px": math.sqrt(17),
+        "nees": 33335.333333333336,
+        "streak_px_worst": 6,
+        "identified": 2 / 4,
+        "wrong": 1 / 4,
+        "refused": 1 / 4,
+        "failed": 1 / 5,
+        "overconfident": 1 / 3,
+        "coverage": 2 / 4,
+        "coverage_3": 3 / 4,
+        "stars_least": 2,
+        "stars_mean": 4.5,
+        "cross_arcsec_median": 5,
+        "roll_arcsec_worst": 12,
+        "angle_arcsec_least": 1,
     }
     for name, value in said.items():
         assert metrics.response(name)(c).value == pytest.approx(value, rel=1e-12), name
@@ -75,19 +90,26 @@ def test_honest_answers_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
     told = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
     assert told.value == 0
-    assert stats.chi2.sf(stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3) == pytest.approx(1e-8, rel=1e-6)
+    assert stats.chi2.sf(stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3) == pytest.approx(
+        1e-8, rel=1e-6
+    )
 
 
-@pytest.mark.parametrize("name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""])
+@pytest.mark.parametrize(
+    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
+)
 def test_a_response_that_is_none_is_refused_with_those_that_are(name):
-    with pytest.raises(InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"):
+    with pytest.raises(
+        InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"
+    ):
         metrics.response(name, "responses.2")
 
 
 def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
     """f = (2 x + y, 3 z + x y) over the unit cube: V = 175/144; x: 51/175, y: 15/175, z: 108/175, x with y: 1/175."""
     shares = qmc.Sobol(6, rng=1).random(4096)
-    a, b = shares[:, :3], shares[:, 3:]
+    a = shares[:, :3]
+    b = shares[:, 3:]
 
     def f(u):
         return np.stack([2 * u[:, 0] + u[:, 1], 3 * u[:, 2] + u[:, 0] * u[:, 1]])
@@ -128,7 +150,10 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     assert found["roll_arcsec", "turn_z"].total.value > 0.9
     assert found["cross_arcsec", "turn_z"].total.value < 0.05
     assert found["roll_arcsec", "turn_x"].total.value < 0.1
-    assert found["cross_arcsec", "turn_x"].total.value + found["cross_arcsec", "lever_x"].total.value > 0.9
+    assert (
+        found["cross_arcsec", "turn_x"].total.value + found["cross_arcsec", "lever_x"].total.value
+        > 0.9
+    )
     drawn = np.degrees(1) * 3600 * 0.2 / (48 * 25.4)
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
 
@@ -161,7 +186,11 @@ def loaded_with_a_fault(path):
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
     told = loader.load(good)
     bad = [
-        point._replace(settings={key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()})
+        point._replace(
+            settings={
+                key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()
+            }
+        )
         for point in told.points
     ]
     told.points[:] = bad
@@ -170,14 +199,18 @@ def loaded_with_a_fault(path):
 
 @pytest.mark.long
 def test_exports_say_what_the_store_says(tmp_path):
-    pandas, pyarrow = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
+    pandas = pytest.importorskip("pandas")
+    pyarrow = pytest.importorskip("pyarrow.parquet")
     xarray = pytest.importorskip("xarray")
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
         for suffix in ("csv", "parquet", "zarr"):
             export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
-        columns, lines = rows.columns(), table.table(rows, told.study.responses)
-        with pytest.raises(InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"):
+        columns = rows.columns()
+        lines = table.table(rows, told.study.responses)
+        with pytest.raises(
+            InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"
+        ):
             export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
     with (tmp_path / "trials.csv").open() as file:
         written = list(csv.DictReader(file))
@@ -191,7 +224,10 @@ def test_exports_say_what_the_store_says(tmp_path):
     assert pyarrow.read_schema(tmp_path / "trials.parquet").metadata[b"title"] == b"a question"
     cube = xarray.open_zarr(tmp_path / "trials.zarr", consolidated=False)
     assert dict(cube.sizes) == {"strays": 2, "focal": 2}
-    assert float(cube.identified.sel(strays=5, focal="20 mm")) == lines[2].responses["identified"].value
+    assert (
+        float(cube.identified.sel(strays=5, focal="20 mm"))
+        == lines[2].responses["identified"].value
+    )
     assert not list(tmp_path.glob(".*"))
 
 
@@ -256,7 +292,9 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 
 def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
-    told, _ = done(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"'))
+    told, _ = done(
+        tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
+    )
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.prepare_store(told, kept, resume=True)
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ncamera: {f_number: 2.0}\n")
@@ -292,6 +330,11 @@ def test_a_table_is_of_every_point(tmp_path):
         lines = table.table(rows, told.study.responses)
     heads, cells = table.cells(lines)
     assert heads == ["point", "strays", "focal", "identified", "cross_arcsec_p95"]
-    assert [line[1:3] for line in cells] == [["0", "20 mm"], ["0", "30 mm"], ["5", "20 mm"], ["5", "30 mm"]]
+    assert [line[1:3] for line in cells] == [
+        ["0", "20 mm"],
+        ["0", "30 mm"],
+        ["5", "20 mm"],
+        ["5", "30 mm"],
+    ]
     assert cells[1][3:] == ["-", "-"]  # its scene cannot be
     assert lines[0].responses["identified"].trials == 4

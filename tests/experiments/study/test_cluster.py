@@ -51,14 +51,20 @@ def serial_contents(plan_: plan.Plan, tmp_path_factory: pytest.TempPathFactory) 
 @contextmanager
 def processes(*commands: list[str], **options: Any) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Commands that run meanwhile, in an environment without this one's numbers of threads."""
-    environment = {key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD}
+    environment = {
+        key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD
+    }
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), environment["PATH"]])
     started = [subprocess.Popen(one, **{"env": environment, **options}) for one in commands]
     try:
         yield started
     finally:
         for process in started:
-            for one in psutil.Process(process.pid).children(recursive=True) if process.poll() is None else ():
+            for one in (
+                psutil.Process(process.pid).children(recursive=True)
+                if process.poll() is None
+                else ()
+            ):
                 one.kill()
             process.kill()
             process.wait(10)
@@ -82,11 +88,16 @@ def test_a_slurm_job_runs_a_study(plan_: plan.Plan, serial_contents: str, tmp_pa
             assert f"#SBATCH {expected}" in directives
         assert "--nworkers 16" in script
         assert "--nthreads 1" in script
-        here = script.replace("--nworkers 16", "--nworkers 2").replace("source .venv/bin/activate", "true")
+        here = script.replace("--nworkers 16", "--nworkers 2").replace(
+            "source .venv/bin/activate", "true"
+        )
         (tmp_path / "job.sh").write_text(here)
         with processes(["bash", "job.sh"], cwd=tmp_path):
             engine = on_dask(Cluster(slurm.scheduler_address, []), 2)
-            assert list(engine.client.run(threads_of_worker).values()) == [dict.fromkeys(workers.ONE_THREAD, "1")] * 2
+            assert (
+                list(engine.client.run(threads_of_worker).values())
+                == [dict.fromkeys(workers.ONE_THREAD, "1")] * 2
+            )
             done(plan_, tmp_path / "slurm.sqlite", engine)
     finally:
         slurm.close()
@@ -105,7 +116,11 @@ def test_pods_find_each_other() -> None:
     service = every["Service", "skysim-scheduler"]["spec"]
     for name in ("skysim-scheduler", "skysim-worker"):
         deployment = every["Deployment", name]["spec"]
-        assert deployment["selector"]["matchLabels"] == deployment["template"]["metadata"]["labels"] == {"app": name}
+        assert (
+            deployment["selector"]["matchLabels"]
+            == deployment["template"]["metadata"]["labels"]
+            == {"app": name}
+        )
     scheduler, worker = (
         every["Deployment", f"skysim-{name}"]["spec"]["template"]["spec"]["containers"][0]
         for name in ("scheduler", "worker")
@@ -123,25 +138,34 @@ def test_pods_find_each_other() -> None:
 
 
 @pytest.mark.long
-def test_the_commands_of_the_pods_run_a_study(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
+def test_the_commands_of_the_pods_run_a_study(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path
+) -> None:
     pytest.importorskip("distributed")
-    every, port = manifests(), "18788"
+    every = manifests()
+    port = "18788"
     commands = [
         every["Deployment", name]["spec"]["template"]["spec"]["containers"][0]["args"]
         for name in ("skysim-scheduler", "skysim-worker", "skysim-worker")
     ]
-    here = [[word.replace("skysim-scheduler", "127.0.0.1").replace("8786", port) for word in one] for one in commands]
+    here = [
+        [word.replace("skysim-scheduler", "127.0.0.1").replace("8786", port) for word in one]
+        for one in commands
+    ]
     with processes(*here, cwd=tmp_path):
         done(plan_, tmp_path / "pods.sqlite", on_dask(Cluster(f"tcp://127.0.0.1:{port}", []), 2))
     assert contents(tmp_path / "pods.sqlite") == serial_contents
 
 
 @pytest.mark.long
-def test_a_worker_that_hangs_is_given_up(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
+def test_a_worker_that_hangs_is_given_up(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path
+) -> None:
     """Stopped by a signal it answers no more; its trials are repeated by the other one, and none is stored twice."""
     patience = {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "3s"}
     for cluster in cluster_of(tmp_path, "--no-nanny", count=2, environment=patience):
-        engine, hung = on_dask(cluster, 2), cluster.workers[:1]
+        engine = on_dask(cluster, 2)
+        hung = cluster.workers[:1]
 
         def hang(progress: runner.Progress, hung: list[subprocess.Popen[bytes]] = hung) -> None:
             if progress.now >= 5 and hung:
@@ -172,11 +196,14 @@ def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
 
     from skysim.experiments.study.execution import dask_engine as engine
 
-    lost, version = CommClosedError("Stream is closed"), code_version()
+    lost = CommClosedError("Stream is closed")
+    version = code_version()
     engine.check_workers(Replies({"first": lost, "second": version}), "tcp://here:1")
     with pytest.raises(InputError, match="no worker of tcp://here:1 replies"):
         engine.check_workers(Replies({"first": lost}), "tcp://here:1")
     with pytest.raises(InputError, match="worker second cannot run trials: no file"):
-        engine.check_workers(Replies({"first": version, "second": FileNotFoundError("no file")}), "tcp://here:1")
+        engine.check_workers(
+            Replies({"first": version, "second": FileNotFoundError("no file")}), "tcp://here:1"
+        )
     with pytest.raises(InputError, match=f"worker second has skysim 0; allowed: {version}"):
         engine.check_workers(Replies({"first": lost, "second": "0"}), "tcp://here:1")

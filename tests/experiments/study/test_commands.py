@@ -60,7 +60,9 @@ def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
 
 @pytest.mark.long
 def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
-    code, _, err = typed("study", "run", "question.yaml", "--engine", "serial", "--set", "budget={time: 1 us}")
+    code, _, err = typed(
+        "study", "run", "question.yaml", "--engine", "serial", "--set", "budget={time: 1 us}"
+    )
     assert code == 0
     assert "within the budget; continue: skysim study resume question.yaml" in err
     code, _, err = typed("study", "run", "question.yaml", "--engine", "serial")
@@ -75,12 +77,20 @@ def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
 def test_what_was_overridden_is_remembered(typed):
     words = ("question.yaml", "--engine", "serial", "--out", "here")
     assert typed("study", "run", *words, "--set", "replicates=3")[0] == 0
-    assert json.loads(typed("study", "status", "question.yaml", "--out", "here", "--json")[1])["trials"] == 6
+    assert (
+        json.loads(typed("study", "status", "question.yaml", "--out", "here", "--json")[1])[
+            "trials"
+        ]
+        == 6
+    )
 
 
 @pytest.mark.slow
 def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
-    assert typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0] == 0
+    assert (
+        typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0]
+        == 0
+    )
     refused = typed("study", "resume", "question.yaml", "--engine", "serial", "--set", "seed=2")
     assert refused[0] == 2
     assert "another study" in refused[2]
@@ -100,13 +110,22 @@ def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
 @pytest.mark.long
 def test_the_worst_are_named_with_what_repeats_them(typed):
     assert typed("study", "run", "question.yaml", "--engine", "serial")[0] == 0
-    code, out, _ = typed("study", "worst", "question.yaml", "--response", "cross_arcsec_p95", "--json")
+    code, out, _ = typed(
+        "study", "worst", "question.yaml", "--response", "cross_arcsec_p95", "--json"
+    )
     told = json.loads(out)
     assert (code, len(told)) == (0, 3)
-    assert [one["cross_arcsec"] for one in told] == sorted((one["cross_arcsec"] for one in told), reverse=True)
+    assert [one["cross_arcsec"] for one in told] == sorted(
+        (one["cross_arcsec"] for one in told), reverse=True
+    )
     assert told[0]["command"] == f"skysim study replay question.yaml {told[0]['trial']}"
-    again = json.loads(typed("study", "replay", "question.yaml", str(told[0]["trial"]), "--json")[1])
-    assert (again["boresight_ra_deg"], again["boresight_dec_deg"]) == (told[0]["ra_deg"], told[0]["dec_deg"])
+    again = json.loads(
+        typed("study", "replay", "question.yaml", str(told[0]["trial"]), "--json")[1]
+    )
+    assert (again["boresight_ra_deg"], again["boresight_dec_deg"]) == (
+        told[0]["ra_deg"],
+        told[0]["dec_deg"],
+    )
     words = ("study", "worst", "question.yaml", "--where", "strays=5", "--count", "2")
     _, out, _ = typed(*words, "--response", "cross_arcsec_p95")
     line = r"^1\. RA [\d.]+°, Dec [+-][\d.]+°, \d+ lights: cross .*″, roll .*″ \(strays = 5\)$"
@@ -155,7 +174,10 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
             "--engine: unknown engine 'ray'; allowed: pool, serial, dask",
         ),
         (("run", "question.yaml", "--engine", "dask"), "--scheduler: required with --engine dask"),
-        (("run", "question.yaml", "--set", "replicates"), "--set: replicates; allowed: path.to.key=value"),
+        (
+            ("run", "question.yaml", "--set", "replicates"),
+            "--set: replicates; allowed: path.to.key=value",
+        ),
         (("run", "question.yaml", "--set", "replicates=0"), "replicates: 0 is not allowed"),
         (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of dome_"),
         (("run", "question"), "question: no such study; did you mean question.yaml?"),
@@ -184,6 +206,12 @@ def test_a_slip_is_told_in_one_line(typed, words, complaint):
 def test_the_studies_are_listed(typed):
     code, out, _ = typed("study", "--json")
     assert code == 0
-    assert {"dome_shape", "dome_size", "led_count", "rate_smear", "false_stars", "moon_and_planets", "end_to_end"} <= {
-        entry["name"] for entry in json.loads(out)
-    }
+    assert {
+        "dome_shape",
+        "dome_size",
+        "led_count",
+        "rate_smear",
+        "false_stars",
+        "moon_and_planets",
+        "end_to_end",
+    } <= {entry["name"] for entry in json.loads(out)}

@@ -54,7 +54,11 @@ with store.writing(Path(sys.argv[2])) as kept:
     runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
 ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
-ENVIRONMENT = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+ENVIRONMENT = (
+    os.environ
+    | ONE_THREAD
+    | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+)
 
 
 def study(folder: Path, text: str = STUDY) -> plan.Plan:
@@ -84,7 +88,10 @@ def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(tmp_path
     """One level's scene file vanishes after the study was checked: its trials fail, in a pool as in one process."""
     lost = tmp_path / "lost.yaml"
     lost.write_text((ROOT / "scenes" / "shefex2.yaml").read_text())
-    plan_ = study(tmp_path, STUDY.replace("trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]"))
+    plan_ = study(
+        tmp_path,
+        STUDY.replace("trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]"),
+    )
     lost.unlink()
     paths = [tmp_path / f"{n}.sqlite" for n in range(2)]
     both: list[Engine] = [engines.Serial(), engines.Pool(2)]
@@ -164,11 +171,15 @@ class FakePool:
     """
 
     def __init__(self, deaths: int) -> None:
-        self.deaths, self.seen, self.retries = deaths, set[int](), list[int]()
-        self.pending, self._processes = dict[Future[engines.TimedRows], list[int]](), None
+        self.deaths = deaths
+        self.seen = set[int]()
+        self.retries = list[int]()
+        self.pending = dict[Future[engines.TimedRows], list[int]]()
+        self._processes = None
 
     def submit(self, _: Any, chunk: engines.Chunk) -> Future[engines.TimedRows]:
-        future, first = Future[engines.TimedRows](), chunk[0].first
+        future = Future[engines.TimedRows]()
+        first = chunk[0].first
         self.pending[future] = list(range(first, first + len(chunk[0].replicates)))
         if not self.seen.isdisjoint(self.pending[future]):
             self.retries.append(len(self.pending))
@@ -183,7 +194,10 @@ class FakePool:
                 future.set_exception(BrokenProcessPool())
         else:
             future = next(iter(self.pending))
-            rows = [trials.Row(n, 0, n, 0, "", "", trials.Outcome("solved"), None, 0.0) for n in self.pending[future]]
+            rows = [
+                trials.Row(n, 0, n, 0, "", "", trials.Outcome("solved"), None, 0.0)
+                for n in self.pending[future]
+            ]
             del self.pending[future]
             future.set_result((rows, 0.0))
         return SimpleNamespace(done=[future])
@@ -197,11 +211,16 @@ def test_trials_that_are_lost_with_a_worker_are_retried_alone(
     plan_: plan.Plan, monkeypatch: pytest.MonkeyPatch, deaths: int, failed: list[int]
 ) -> None:
     """Four chunks of three trials. The first death counts for no trial, as others run; the next three for trial 2."""
-    pool, chunks = FakePool(deaths), [(trials.Segment(0, {}, n, range(n, n + 3)),) for n in range(0, 12, 3)]
-    queue = SimpleNamespace(next=lambda: chunks.pop(0) if chunks else (), report_time=lambda *_: None)
+    pool = FakePool(deaths)
+    chunks = [(trials.Segment(0, {}, n, range(n, n + 3)),) for n in range(0, 12, 3)]
+    queue = SimpleNamespace(
+        next=lambda: chunks.pop(0) if chunks else (), report_time=lambda *_: None
+    )
     monkeypatch.setattr(engines, "start_pool", lambda *_: pool)
     monkeypatch.setattr(engines, "wait", pool.wait)
-    rows = [row for batch in engines.Pool(2).run(trials.TrialJob(plan_.spec), queue) for row in batch]
+    rows = [
+        row for batch in engines.Pool(2).run(trials.TrialJob(plan_.spec), queue) for row in batch
+    ]
     assert sorted(row.trial for row in rows) == list(range(12))
     assert [row.trial for row in rows if row.error is not None] == failed
     assert set(pool.retries) == ({1} if deaths else set())
@@ -238,7 +257,9 @@ class Run:
         assert self.family, "it had no workers"
         _, orphans = psutil.wait_procs(self.family, timeout=5)
         # A container without an init keeps the dead of a dead parent.
-        assert not [one for one in orphans if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+        assert not [
+            one for one in orphans if one.is_running() and one.status() != psutil.STATUS_ZOMBIE
+        ]
         return status
 
 
@@ -247,7 +268,9 @@ class Run:
 def test_a_pool_killed_at_any_instant_resumes_with_any_number_of_workers(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path, kills: int
 ) -> None:
-    path, draw, before = tmp_path / "killed.sqlite", np.random.default_rng(kills), 0
+    path = tmp_path / "killed.sqlite"
+    draw = np.random.default_rng(kills)
+    before = 0
     for n in range(kills):
         run = Run(plan_, path, 2 + n % 2)
         assert run.reach(before + 1)
@@ -264,7 +287,9 @@ def test_a_pool_killed_at_any_instant_resumes_with_any_number_of_workers(
 
 
 @pytest.mark.long
-def test_a_pool_interrupted_by_the_keyboard_resumes(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
+def test_a_pool_interrupted_by_the_keyboard_resumes(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path
+) -> None:
     path = tmp_path / "interrupted.sqlite"
     run = Run(plan_, path, 2)
     assert run.reach(1)
@@ -277,10 +302,14 @@ def test_a_pool_interrupted_by_the_keyboard_resumes(plan_: plan.Plan, serial_con
 
 
 @pytest.mark.long
-def test_memory_stays_flat_over_many_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any) -> None:
+def test_memory_stays_flat_over_many_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stubs: Any
+) -> None:
     """100,000 trials of a pool: between a fifth and the end the coordinator grows by less than 20 MB."""
     monkeypatch.setattr(engines, "initialize_worker", stubs.begin_trivial)
-    plan_, me, seen = study(tmp_path, STUDY.replace("150", "50000")), psutil.Process(), []
+    plan_ = study(tmp_path, STUDY.replace("150", "50000"))
+    me = psutil.Process()
+    seen = []
     done(
         plan_,
         tmp_path / "many.sqlite",
@@ -312,20 +341,25 @@ def cluster_of(
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     address = f"tcp://127.0.0.1:{port}"
-    everyone = [*("--host", "127.0.0.1"), "--no-dashboard"]
+    everyone = ["--host", "127.0.0.1", "--no-dashboard"]
     dask = [sys.executable, "-m"]
     commands = [[*dask, "distributed.cli.dask_scheduler", "--port", str(port), *everyone]]
     plan_ = [*dask, "distributed.cli.dask_worker", address, *everyone, "--nthreads", "1", *worker]
     commands += [[*plan_, "--local-directory", str(folder)]] * count
     with (folder / "log").open("wb") as log:
         processes = [
-            subprocess.Popen(one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log) for one in commands
+            subprocess.Popen(one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log)
+            for one in commands
         ]
         try:
             yield Cluster(address, processes[1:])
         finally:
             for process in reversed(processes):
-                for one in psutil.Process(process.pid).children(recursive=True) if process.poll() is None else ():
+                for one in (
+                    psutil.Process(process.pid).children(recursive=True)
+                    if process.poll() is None
+                    else ()
+                ):
                     one.kill()
                 process.kill()
                 process.wait(10)
@@ -363,9 +397,13 @@ def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
 
 
 @pytest.mark.long
-def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(cluster: Cluster, plan_: plan.Plan) -> None:
+def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
+    cluster: Cluster, plan_: plan.Plan
+) -> None:
     engine = on_dask(cluster, 2)
-    rows = engine.run(trials.TrialJob(plan_.spec), runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)))
+    rows = engine.run(
+        trials.TrialJob(plan_.spec), runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials))
+    )
     assert next(rows)[0].error is None
     assert {len(state) for state in engine.client.run(recipes).values()} == {1}
     assert isinstance(rows, Generator)
@@ -396,7 +434,9 @@ def tasks(dask_scheduler: Any) -> int:
 def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
     on_dask(cluster, 2).client.run(change_code, "0123456789abcdef")
     try:
-        with pytest.raises(InputError, match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}"):
+        with pytest.raises(
+            InputError, match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}"
+        ):
             dask(cluster.address)
     finally:
         from distributed import Client
@@ -414,7 +454,9 @@ def change_code(version: str) -> None:
 def test_dask_loses_a_worker_and_makes_the_same_rows(
     cluster: Cluster, plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
-    engine, victims, path = on_dask(cluster, 2), cluster.workers[:1], tmp_path / "dask.sqlite"
+    engine = on_dask(cluster, 2)
+    victims = cluster.workers[:1]
+    path = tmp_path / "dask.sqlite"
     assert engine.workers >= 1
 
     def kill(progress: runner.Progress) -> None:
@@ -431,7 +473,9 @@ def test_dask_loses_a_worker_and_makes_the_same_rows(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"])
+@pytest.mark.parametrize(
+    "scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"]
+)
 def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786") as refused:
@@ -452,18 +496,24 @@ def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.long
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.delitem(sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False)
+    monkeypatch.delitem(
+        sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False
+    )
     monkeypatch.delattr(skysim.experiments.study.execution, "dask_engine", raising=False)
     with pytest.raises(InputError, match=r"pip install 'skysim\[dask\]'"):
         dask("tcp://127.0.0.1:8786")
 
 
 @pytest.mark.long
-def test_a_trial_that_kills_dask_workers_fails_and_no_other(plan_: plan.Plan, tmp_path: Path, stubs: Any) -> None:
-    bad, found = deaths(plan_), os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
+def test_a_trial_that_kills_dask_workers_fails_and_no_other(
+    plan_: plan.Plan, tmp_path: Path, stubs: Any
+) -> None:
+    bad = deaths(plan_)
+    found = os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
     dask = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "PYTHONPATH": found}
     for cluster in cluster_of(tmp_path, "--nworkers", "2", environment=dask):
-        engine, path = on_dask(cluster, 2), tmp_path / "deadly.sqlite"
+        engine = on_dask(cluster, 2)
+        path = tmp_path / "deadly.sqlite"
         engine.client.register_worker_callbacks(stubs.make_deadly)
         done(plan_, path, engine)
         with store.open_store(path) as stored:
@@ -472,7 +522,9 @@ def test_a_trial_that_kills_dask_workers_fails_and_no_other(plan_: plan.Plan, tm
 
 
 @pytest.mark.long
-def test_a_lost_scheduler_is_told_and_what_came_is_kept(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
+def test_a_lost_scheduler_is_told_and_what_came_is_kept(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path
+) -> None:
     path = tmp_path / "lost.sqlite"
     for cluster in cluster_of(tmp_path, "--no-nanny"):
         engine = on_dask(cluster, 1)

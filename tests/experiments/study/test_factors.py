@@ -44,9 +44,18 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
     [
         ({"distribution": "normal", "mean": 3.0, "sigma": 2.0}, stats.norm(3, 2)),
         ({"distribution": "lognormal", "median": 3.0, "sigma": 0.5}, stats.lognorm(0.5, scale=3)),
-        ({"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 4.0}, stats.triang(0.25, 0, 4)),
         (
-            {"distribution": "truncated_normal", "mean": 3.0, "sigma": 2.0, "low": 2.0, "high": 6.0},
+            {"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 4.0},
+            stats.triang(0.25, 0, 4),
+        ),
+        (
+            {
+                "distribution": "truncated_normal",
+                "mean": 3.0,
+                "sigma": 2.0,
+                "low": 2.0,
+                "high": 6.0,
+            },
             stats.truncnorm(-0.5, 1.5, 3, 2),
         ),
         ({"distribution": "integers", "low": 2, "high": 6}, stats.randint(2, 7)),
@@ -56,7 +65,9 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
 )
 def test_a_factor_drawn_is_distributed_as_told(told, law):
     """Even shares through `at` against SciPy's law: mean and spread to the grid's own error."""
-    drawn = np.array([READ(told | {"key": "x"}).value_at(share)[0] for share in (np.arange(4_000) + 0.5) / 4_000])
+    drawn = np.array(
+        [READ(told | {"key": "x"}).value_at(share)[0] for share in (np.arange(4_000) + 0.5) / 4_000]
+    )
     assert np.mean(drawn) == pytest.approx(law.mean(), rel=2e-3)
     assert np.std(drawn) == pytest.approx(law.std(), rel=5e-3)
 
@@ -67,7 +78,10 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
         ({"key": "x", "from": "1 m", "to": "2 in"}, "have different units"),
         ({"key": "x", "from": 3, "to": 2}, "allowed: below to"),
         ({"key": "x", "from": 0, "to": 2, "scale": "log"}, "allowed: above 0 with"),
-        ({"key": "x", "distribution": "normal", "mean": 1}, "normal: parameters mean; allowed: mean, sigma"),
+        (
+            {"key": "x", "distribution": "normal", "mean": 1},
+            "normal: parameters mean; allowed: mean, sigma",
+        ),
         ({"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"}, "different units"),
         ({"key": "x", "distribution": "normal", "mean": 1, "sigma": 0}, "sigma is 0; allowed"),
         (
@@ -75,10 +89,20 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
             "not in ascending order",
         ),
         (
-            {"key": "x", "distribution": "truncated_normal", "mean": 1, "sigma": 1, "low": 3, "high": 2},
+            {
+                "key": "x",
+                "distribution": "truncated_normal",
+                "mean": 1,
+                "sigma": 1,
+                "low": 3,
+                "high": 2,
+            },
             "low, high are not in ascending order",
         ),
-        ({"key": "x", "distribution": "truncated_normal", "mean": 1, "sigma": 1}, "allowed: mean, sigma, low, high"),
+        (
+            {"key": "x", "distribution": "truncated_normal", "mean": 1, "sigma": 1},
+            "allowed: mean, sigma, low, high",
+        ),
         ({"key": "x", "from": "wide", "to": 2}, "is not a number"),
         ({"key": "X y", "values": [1]}, "pattern"),
         ({"levels": {}}, "at least 1"),
@@ -92,7 +116,13 @@ def test_a_factor_that_makes_no_sense_is_refused(told, complaint):
 
 @pytest.mark.parametrize("u", [0.0, 1e-9, 0.3, 1.0])
 def test_a_truncated_normal_stays_within_its_bounds(u):
-    told = {"key": "x", "distribution": "truncated_normal", "mean": "1 mm", "sigma": "5 mm", "low": "0 mm"}
+    told = {
+        "key": "x",
+        "distribution": "truncated_normal",
+        "mean": "1 mm",
+        "sigma": "5 mm",
+        "low": "0 mm",
+    }
     value, settings = READ(told | {"high": "3 mm"}).value_at(u)
     assert settings == {"x": value}
     assert 0 <= float(value.removesuffix(" mm")) <= 3
@@ -139,14 +169,18 @@ def test_sobols_points_cover_a_square_more_evenly_than_chance():
         "a": READ({"key": "x", "from": 0.0, "to": 1.0}),
         "b": READ({"key": "y", "from": 0.0, "to": 1.0}),
     }
-    found = np.array([list(p.levels.values()) for p in points(Design(kind="sobol", points=64), factors, 3)])
+    found = np.array(
+        [list(p.levels.values()) for p in points(Design(kind="sobol", points=64), factors, 3)]
+    )
     random = np.random.default_rng(1).random((20, 64, 2))
     assert qmc.discrepancy(found) < 0.3 * np.mean([qmc.discrepancy(one) for one in random])
 
 
 def test_saltellis_blocks_are_a_b_and_a_with_a_column_of_b():
     factors = {name: READ({"key": name, "from": 0.0, "to": 1.0}) for name in "xyz"}
-    found = np.array([list(p.levels.values()) for p in points(Design(kind="saltelli", points=8), factors, 5)])
+    found = np.array(
+        [list(p.levels.values()) for p in points(Design(kind="saltelli", points=8), factors, 5)]
+    )
     a, b, *mixed = found.reshape(5, 8, 3)
     assert not np.isin(a, b).any()
     for n, block in enumerate(mixed):

@@ -20,7 +20,10 @@ STUDY: dict[str, Any] = {
     "title": "Any dome of the kind",
     "scene": "afit_simsat",
     "seed": 5,
-    "set": {"light.layout": {"kind": "random", "count": 300, "cap_deg": 40}, "tracker.survey": {"led_sigma": "0.2 mm"}},
+    "set": {
+        "light.layout": {"kind": "random", "count": 300, "cap_deg": 40},
+        "tracker.survey": {"led_sigma": "0.2 mm"},
+    },
     "trial": {"kind": "centroids", "tilt_deg": [0, 10]},
     "factors": {"noise": {"key": "trial.noise_px", "values": [0.1, 0.2]}},
     "hardware": ["light.layout.hardware_seed", "tracker.survey.seed"],
@@ -35,7 +38,9 @@ def loaded(folder: Path, **keys: Any) -> plan.Plan:
     return loader.load(path)
 
 
-def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(tmp_path: Path) -> None:
+def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
+    tmp_path: Path,
+) -> None:
     spec = loaded(tmp_path).spec
     drawn = [spec.trial_settings({"trial.noise_px": 0.1}, n) for n in range(50)]
     assert all(set(one) == {"trial.noise_px", *STUDY["hardware"]} for one in drawn)
@@ -53,7 +58,8 @@ def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
     told = loaded(tmp_path)
     assert done(told, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
-        columns, lines = kept.columns(), table.table(kept, told.study.responses)
+        columns = kept.columns()
+        lines = table.table(kept, told.study.responses)
         assert len(set(columns["scene"])) == 6
         assert np.ptp(columns["stars"]) > 0
         assert [line.levels for line in lines] == [{"noise": 0.1}, {"noise": 0.2}]
@@ -61,7 +67,9 @@ def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
         again = replay.replay(told, kept, 8, tmp_path / "trial_8")
     assert again.changed == []
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.prepare_store(told, kept, resume=True)  # its first and last scenes are those of their own hardware
+        runner.prepare_store(
+            told, kept, resume=True
+        )  # its first and last scenes are those of their own hardware
 
 
 @pytest.mark.slow
@@ -87,7 +95,10 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
             "hardware: tracker.survey.seed has no effect without errors of the survey",
         ),
         (
-            {"factors": {"draw": {"key": "light.layout.hardware_seed", "values": [1, 2, 3]}}, "hardware": []},
+            {
+                "factors": {"draw": {"key": "light.layout.hardware_seed", "values": [1, 2, 3]}},
+                "hardware": [],
+            },
             r"factors.draw: light.layout.hardware_seed numbers draws of the hardware; allowed: hardware: \[light",
         ),
         (
@@ -96,18 +107,26 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
+def test_what_cannot_be_drawn_is_refused(
+    tmp_path: Path, change: dict[str, Any], complaint: str
+) -> None:
     with pytest.raises(InputError, match=complaint):
         loaded(tmp_path, **change)
 
 
 def test_domes_with_names_are_levels_and_seeds_may_be_sampled(tmp_path: Path) -> None:
-    named = {"dome": {"levels": {name: {"light.layout.hardware_seed": n} for n, name in enumerate("AB")}}}
+    named = {
+        "dome": {"levels": {name: {"light.layout.hardware_seed": n} for n, name in enumerate("AB")}}
+    }
     assert len(loaded(tmp_path, factors=named, hardware=[]).points) == 2
-    sampled = {"survey": {"key": "tracker.survey.seed", "distribution": "integers", "low": 0, "high": 99}}
+    sampled = {
+        "survey": {"key": "tracker.survey.seed", "distribution": "integers", "low": 0, "high": 99}
+    }
     design = {"kind": "lhs", "points": 4}
     assert len(loaded(tmp_path, factors=sampled, design=design, hardware=[]).points) == 4
 
 
 def test_hardware_is_part_of_the_digest(tmp_path: Path) -> None:
-    assert loaded(tmp_path).digest != loaded(tmp_path, hardware=["light.layout.hardware_seed"]).digest
+    assert (
+        loaded(tmp_path).digest != loaded(tmp_path, hardware=["light.layout.hardware_seed"]).digest
+    )

@@ -37,10 +37,15 @@ STUDY: dict[str, Any] = {
 }
 
 
-def columns(count: int, sky: bool = False, low: float = 0.0, high: float = 30.0, **given: Any) -> Columns:
+def columns(
+    count: int, sky: bool = False, low: float = 0.0, high: float = 30.0, **given: Any
+) -> Columns:
     """Solved trials in random directions, uniform in solid angle; `given` replaces columns."""
     table: dict[str, Any] = {name: np.full(count, np.nan) for name in FIELDS}
-    table |= {name: np.zeros(count) for name in ("wrong", "ambiguous", "misidentified", "roll_noise", "misled")}
+    table |= {
+        name: np.zeros(count)
+        for name in ("wrong", "ambiguous", "misidentified", "roll_noise", "misled")
+    }
     table |= {"trial": np.arange(count), "point": np.zeros(count, int), "seed": np.arange(count)}
     table |= {"frames": np.ones(count), "solved": np.ones(count), "stars": np.full(count, 9.0)}
     table |= {name: np.ones(count) for name in ("x_arcsec", "y_arcsec", "roll_arcsec", "nees")}
@@ -60,10 +65,18 @@ def columns(count: int, sky: bool = False, low: float = 0.0, high: float = 30.0,
 
 @pytest.mark.parametrize(
     ("sky", "low", "high"),
-    [(False, 0.0, 30.0), (False, 20.0, 21.0), (False, 0.0, 90.0), (True, -90.0, 90.0), (True, 10.0, 60.0)],
+    [
+        (False, 0.0, 30.0),
+        (False, 20.0, 21.0),
+        (False, 0.0, 90.0),
+        (True, -90.0, 90.0),
+        (True, 10.0, 60.0),
+    ],
 )
 @pytest.mark.parametrize("count", [60, 1500, 20_000])
-def test_cells_cover_the_directions_once_and_are_about_equal(sky: bool, low: float, high: float, count: int) -> None:
+def test_cells_cover_the_directions_once_and_are_about_equal(
+    sky: bool, low: float, high: float, count: int
+) -> None:
     """Solid angles by cos and sin of the edges: their sum is the region's, each is within twice the mean."""
     cells = list(maps.partition(low, high, count, sky))
 
@@ -89,14 +102,22 @@ def test_each_trial_is_in_one_cell(sky: bool) -> None:
     assert sum(cell.values for cell in panel.cells) == 3000
     mean = 3000 / len(panel.cells)
     # Counts are binomial: within five sigmas of a mean that is right to a factor of two.
-    assert all(mean / 2 - 5 * math.sqrt(mean) < cell.values < 2 * mean + 5 * math.sqrt(mean) for cell in panel.cells)
+    assert all(
+        mean / 2 - 5 * math.sqrt(mean) < cell.values < 2 * mean + 5 * math.sqrt(mean)
+        for cell in panel.cells
+    )
 
 
 def test_a_cell_has_the_response_of_its_own_trials() -> None:
     """Lights grow with tilt and the half at azimuths below 180 deg is ambiguous."""
     table = columns(2000)
     ambiguous = (table["body_azimuth_deg"] < 180).astype(float)
-    table = {**table, "stars": np.floor(table["body_tilt_deg"]), "ambiguous": ambiguous, "solved": 1 - ambiguous}
+    table = {
+        **table,
+        "stars": np.floor(table["body_tilt_deg"]),
+        "ambiguous": ambiguous,
+        "solved": 1 - ambiguous,
+    }
     shares = maps.direction_map("", table, "ambiguous").cells
     assert {cell.value for cell in shares if cell.right_deg <= 180} == {1.0}
     assert {cell.value for cell in shares if cell.left_deg >= 180} == {0.0}
@@ -109,7 +130,9 @@ def test_a_cell_of_too_few_values_is_hatched() -> None:
     solved = np.arange(1500) % 20 == 0
     table = columns(1500, roll_arcsec=np.where(solved, 5.0, np.nan))
     panel = maps.direction_map("", table, "roll_arcsec_median")
-    assert [cell.shown for cell in panel.cells] == [cell.values >= maps.MIN_VALUES for cell in panel.cells]
+    assert [cell.shown for cell in panel.cells] == [
+        cell.values >= maps.MIN_VALUES for cell in panel.cells
+    ]
     assert sum(cell.values for cell in panel.cells) == solved.sum()
     assert sum(cell.shown for cell in panel.cells) < len(panel.cells) / 4
     figure = Map(kind="map", value="roll_arcsec_median")
@@ -127,7 +150,9 @@ def test_the_sky_keeps_its_areas() -> None:
         polygon = maps.outline(maps.Cell(low, high, left, right, 0.0, 9), True)
         x, y = polygon.T
         area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
-        solid = (math.sin(math.radians(high)) - math.sin(math.radians(low))) * math.radians(right - left)
+        solid = (math.sin(math.radians(high)) - math.sin(math.radians(low))) * math.radians(
+            right - left
+        )
         assert area == pytest.approx(solid, rel=0.01)
 
 
@@ -136,7 +161,9 @@ def test_directions_are_where_the_projection_puts_them() -> None:
     y = +- sqrt 2. Under the dome, tilt 20 at azimuth 90 is (0, 20)."""
     assert maps.place(0.0, 360.0, True) == pytest.approx([0, 0], abs=1e-12)
     half = math.sqrt(0.5)
-    assert maps.place(0.0, 450.0, True) == pytest.approx([-2 * math.sqrt(2) * half / math.sqrt(1 + half), 0])
+    assert maps.place(0.0, 450.0, True) == pytest.approx(
+        [-2 * math.sqrt(2) * half / math.sqrt(1 + half), 0]
+    )
     assert maps.place(90.0, 300.0, True) == pytest.approx([0, math.sqrt(2)], abs=1e-9)
     assert maps.place(0.0, 180.0, True) == pytest.approx([2 * math.sqrt(2), 0])
     assert maps.place(20.0, 90.0, False) == pytest.approx([0, 20], abs=1e-12)
@@ -164,10 +191,16 @@ def test_a_map_has_a_panel_for_each_level_and_is_a_picture() -> None:
         figure = Map(kind="map", value="wrong", by=by)
         panels = maps.direction_maps(LINES, figure, study(), of_points(*tables))
         assert [panel.label for panel in panels] == labels
-        assert [{cell.value for cell in panel.cells} for panel in panels] == [{one} for one in wrong]
-        picture = cv2.imdecode(np.frombuffer(maps.map_png(panels, figure), np.uint8), cv2.IMREAD_COLOR)
+        assert [{cell.value for cell in panel.cells} for panel in panels] == [
+            {one} for one in wrong
+        ]
+        picture = cv2.imdecode(
+            np.frombuffer(maps.map_png(panels, figure), np.uint8), cv2.IMREAD_COLOR
+        )
         assert picture.shape[1] > picture.shape[0] * len(labels) * 0.9
-    assert maps.caption(panels, figure, study(), LINES).startswith("wrong by direction, at leds = 500. Directions of")
+    assert maps.caption(panels, figure, study(), LINES).startswith(
+        "wrong by direction, at leds = 500. Directions of"
+    )
 
 
 def test_the_colors_of_a_proportion_are_the_same_whatever_its_values() -> None:
@@ -194,17 +227,26 @@ def test_a_map_without_trials_is_empty() -> None:
 
 
 def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
-    dome, sky = columns(50), columns(50, True)
+    dome = columns(50)
+    sky = columns(50, True)
     both = {name: np.concatenate([dome[name], sky[name]]) for name in dome}
-    with pytest.raises(InputError, match="map of wrong: trials under a dome and under the stars; allowed: where"):
+    with pytest.raises(
+        InputError, match="map of wrong: trials under a dome and under the stars; allowed: where"
+    ):
         maps.direction_map("", both, "wrong")
 
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"trial": {"kind": "flight"}}, r"figures.0.kind: a map of flights, which have no single attitude"),
-        ({"figures": [{"kind": "map", "value": "wrong", "by": "led"}]}, "figures.0.by: unknown factor 'led'"),
+        (
+            {"trial": {"kind": "flight"}},
+            r"figures.0.kind: a map of flights, which have no single attitude",
+        ),
+        (
+            {"figures": [{"kind": "map", "value": "wrong", "by": "led"}]},
+            "figures.0.by: unknown factor 'led'",
+        ),
         ({"figures": [{"kind": "map", "value": "wrongs"}]}, "figures.0: unknown response 'wrongs'"),
         (
             {"figures": [{"kind": "map", "value": "wrong", "where": {"leds": 7}}]},
@@ -212,9 +254,13 @@ def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
         ),
     ],
 )
-def test_a_map_that_cannot_be_is_refused(tmp_path: Any, change: dict[str, Any], complaint: str) -> None:
+def test_a_map_that_cannot_be_is_refused(
+    tmp_path: Any, change: dict[str, Any], complaint: str
+) -> None:
     path = tmp_path / "study.yaml"
-    path.write_text(yaml.safe_dump(STUDY | {"figures": [{"kind": "map", "value": "wrong"}]} | change))
+    path.write_text(
+        yaml.safe_dump(STUDY | {"figures": [{"kind": "map", "value": "wrong"}]} | change)
+    )
     with pytest.raises(InputError, match=complaint):
         loader.load(path)
 
@@ -224,7 +270,9 @@ def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
     few = maps.direction_map("", columns(40), "roll_arcsec_p95")
     assert max(cell.values for cell in few.cells) < 20
     assert not any(cell.shown for cell in few.cells)
-    assert any(cell.shown for cell in maps.direction_map("", columns(40), "roll_arcsec_median").cells)
+    assert any(
+        cell.shown for cell in maps.direction_map("", columns(40), "roll_arcsec_median").cells
+    )
     many = maps.direction_map("", columns(3000), "roll_arcsec_p95")
     assert np.mean([cell.shown for cell in many.cells]) > 0.9
     assert all(cell.shown == (cell.values >= 20) for cell in many.cells)
@@ -239,26 +287,39 @@ def test_the_worst_are_the_largest_errors_in_different_places() -> None:
     table = columns(500)
     roll = np.linspace(1, 2, 500)
     roll[[7, 8, 40, 90]] = [90, 80, 70, 60]
-    tilt, azimuth = table["body_tilt_deg"].copy(), table["body_azimuth_deg"].copy()
-    tilt[[7, 8, 40, 90]], azimuth[[7, 8, 40, 90]] = [10, 12, 25, 25], [100, 101, 10, 200]
+    tilt = table["body_tilt_deg"].copy()
+    azimuth = table["body_azimuth_deg"].copy()
+    tilt[[7, 8, 40, 90]] = [10, 12, 25, 25]
+    azimuth[[7, 8, 40, 90]] = [100, 101, 10, 200]
     table = {**table, "roll_arcsec": roll, "body_tilt_deg": tilt, "body_azimuth_deg": azimuth}
     found = worst.worst_trials(table, "roll_arcsec_p95")
     assert [one.trial for one in found] == [7, 40, 90]  # 8 is beside 7
-    assert (found[0].direction, found[0].event) == ("tilt 10.0°, azimuth 100°", "cross 1.41″, roll 90″")
+    assert (found[0].direction, found[0].event) == (
+        "tilt 10.0°, azimuth 100°",
+        "cross 1.41″, roll 90″",
+    )
 
 
 def test_the_worst_of_a_proportion_count_for_it() -> None:
     """Ambiguous ones first by being unsolved, then by the fewest lights; `identified` names those that are not."""
     table = columns(300, low=0, high=90)
     apart = np.linspace(0, 300, 300) % 360
-    ambiguous, stars = np.zeros(300), np.full(300, 9.0)
-    ambiguous[[3, 60, 150]], stars[[3, 60, 150]] = 1, [5, 3, 4]
+    ambiguous = np.zeros(300)
+    stars = np.full(300, 9.0)
+    ambiguous[[3, 60, 150]] = 1
+    stars[[3, 60, 150]] = [5, 3, 4]
     status = np.where(ambiguous > 0, "ambiguous: so", "solved").astype(object)
     error = np.where(ambiguous > 0, np.nan, 1.0)
     table = {
         **table,
-        **{"ambiguous": ambiguous, "solved": 1 - ambiguous, "stars": stars, "status": status},
-        **{"x_arcsec": error, "roll_arcsec": error, "body_azimuth_deg": apart, "body_tilt_deg": np.full(300, 60.0)},
+        "ambiguous": ambiguous,
+        "solved": 1 - ambiguous,
+        "stars": stars,
+        "status": status,
+        "x_arcsec": error,
+        "roll_arcsec": error,
+        "body_azimuth_deg": apart,
+        "body_tilt_deg": np.full(300, 60.0),
     }
     for response in ("ambiguous", "identified", "refused"):
         assert [one.trial for one in worst.worst_trials(table, response)] == [60, 150, 3]
@@ -273,7 +334,9 @@ def test_a_plain_quantity_ranks_single_trials() -> None:
     table = columns(60, roll_arcsec=np.arange(60.0))
     assert worst.worst_trials(table, "identified") == []
     assert worst.worst_trials(table, "roll_arcsec")[0].trial == 59
-    by_quantity, by_response = (worst.worst_trials(table, name) for name in ("roll_arcsec", "roll_arcsec_p95"))
+    by_quantity, by_response = (
+        worst.worst_trials(table, name) for name in ("roll_arcsec", "roll_arcsec_p95")
+    )
     assert [one.trial for one in by_quantity] == [one.trial for one in by_response]
     fewest = columns(60, stars=np.arange(60.0) + 4)
     assert worst.worst_trials(fewest, "stars")[0].trial == 0
@@ -295,14 +358,27 @@ def test_the_worst_can_be_pasted_as_a_start() -> None:
 def test_the_worst_of_real_trials_are_found_again_by_their_number() -> None:
     """A trial is replayed from the number in the list, with the same attitude and error."""
     plan = loader.load("led_count", {"replicates": "40"})
-    point = next(n for n, one in enumerate(plan.points) if one.levels == {"leds": 1000, "placement": "poisson"})
+    point = next(
+        n
+        for n, one in enumerate(plan.points)
+        if one.levels == {"leds": 1000, "placement": "poisson"}
+    )
     segment = trials.Segment(point, plan.points[point].settings, 40 * point, range(40))
     rows = trials.run_segments(plan.spec, (segment,))
-    table: dict[str, Any] = {name: np.array([getattr(row.outcome, name) for row in rows]) for name in FIELDS}
-    table |= {name: np.array([getattr(row, name) for row in rows]) for name in ("trial", "point", "seed")}
+    table: dict[str, Any] = {
+        name: np.array([getattr(row.outcome, name) for row in rows]) for name in FIELDS
+    }
+    table |= {
+        name: np.array([getattr(row, name) for row in rows]) for name in ("trial", "point", "seed")
+    }
     first = worst.worst_trials(table, "roll_arcsec_p95")[0]
     (again,) = trials.run_segments(
-        plan.spec, (segment._replace(first=first.trial, replicates=range(first.trial % 40, first.trial % 40 + 1)),)
+        plan.spec,
+        (
+            segment._replace(
+                first=first.trial, replicates=range(first.trial % 40, first.trial % 40 + 1)
+            ),
+        ),
     )
     assert abs(again.outcome.roll_arcsec) == pytest.approx(first.roll_arcsec, rel=1e-12)
     assert again.outcome.body_tilt_deg == first.tilt_deg

@@ -41,7 +41,9 @@ def with_match(report: Report, star: Floats) -> Report:
     """The report with other stars or LEDs for the same lights."""
     match = report.attitude.match
     assert match is not None
-    changed = StarMatch(match.observed, star.astype(np.int64), match.cam_from_ref, match.log10_chance)
+    changed = StarMatch(
+        match.observed, star.astype(np.int64), match.cam_from_ref, match.log10_chance
+    )
     return Report(replace(report.attitude, match=changed), report.centroids)
 
 
@@ -57,12 +59,19 @@ def test_a_light_matched_with_another_star_is_a_misidentification(spec: TrialSpe
         star[k] = star[k - 1]
         planted = scored(setup, with_match(report, star), lights)
         assert (planted.misidentified, planted.roll_noise, planted.wrong) == (1, 0, 0)
-        assert (planted.wrong_matches, planted.misled) == (1, 0)  # the attitude is the right one still
+        assert (planted.wrong_matches, planted.misled) == (
+            1,
+            0,
+        )  # the attitude is the right one still
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME])
-@pytest.mark.parametrize(("distance_px", "wrong"), [(SAME_LIGHT_PX - 0.6, 0), (SAME_LIGHT_PX + 0.6, 1)])
-def test_a_light_is_the_stars_own_within_three_pixels(spec: TrialSpec, distance_px: float, wrong: int) -> None:
+@pytest.mark.parametrize(
+    ("distance_px", "wrong"), [(SAME_LIGHT_PX - 0.6, 0), (SAME_LIGHT_PX + 0.6, 1)]
+)
+def test_a_light_is_the_stars_own_within_three_pixels(
+    spec: TrialSpec, distance_px: float, wrong: int
+) -> None:
     setup, report, lights = solved(spec)
     match = report.attitude.match
     assert match is not None
@@ -73,12 +82,16 @@ def test_a_light_is_the_stars_own_within_three_pixels(spec: TrialSpec, distance_
 
 
 @pytest.mark.parametrize(("sigmas", "misled"), [(5.0, 0), (7.0, 1)])
-def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(sigmas: float, misled: int) -> None:
+def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(
+    sigmas: float, misled: int
+) -> None:
     """NEES 25 is allowed, 49 is not (40.8 has the probability 1e-8); with the right lights neither is misled."""
     setup, report, lights = solved(SKY)
     truth = setup.lab.camera.mount.cam_from_body * lights.lab_from_body.inv()
     error = Rotation.from_rotvec([sigmas * 1e-6, 0, 0])
-    attitude = replace(report.attitude, cam_from_ref=error * truth, covariance_rad2=1e-12 * np.eye(3))
+    attitude = replace(
+        report.attitude, cam_from_ref=error * truth, covariance_rad2=1e-12 * np.eye(3)
+    )
     assert scored(setup, Report(attitude, report.centroids), lights).misled == 0
     match = report.attitude.match
     assert match is not None
@@ -92,14 +105,19 @@ def test_a_light_displaced_in_the_exposure_is_still_its_stars() -> None:
     setup, report, lights = solved(SKY)
     shift_px = np.array([9.0, -4.0])
     displaced = lights._replace(flux_xy_px=lights.xy_px + shift_px)
-    moved = Report(report.attitude, replace(report.centroids, xy_px=report.centroids.xy_px + shift_px))
+    moved = Report(
+        report.attitude, replace(report.centroids, xy_px=report.centroids.xy_px + shift_px)
+    )
     assert scored(setup, moved, displaced).misidentified == 0
     assert scored(setup, report, displaced).misidentified == 1
-    assert scored(setup, moved, displaced).centroid_px == pytest.approx(scored(setup, report, lights).centroid_px)
+    assert scored(setup, moved, displaced).centroid_px == pytest.approx(
+        scored(setup, report, lights).centroid_px
+    )
 
 
 @pytest.mark.parametrize(
-    ("roll_arcmin", "sigma_arcmin", "noise", "wrong"), [(12, 5, 1, 0), (9, 5, 0, 0), (12, 1, 0, 1), (70, 40, 1, 1)]
+    ("roll_arcmin", "sigma_arcmin", "noise", "wrong"),
+    [(12, 5, 1, 0), (9, 5, 0, 0), (12, 1, 0, 1), (70, 40, 1, 1)],
 )
 def test_honest_roll_noise_is_beyond_ten_arcminutes_and_within_the_covariance(
     roll_arcmin: float, sigma_arcmin: float, noise: int, wrong: int
@@ -130,14 +148,21 @@ def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
 def test_centroids_scatter_as_the_trial_says() -> None:
     """RMS about each axis over 200 trials of some 20 lights each: to 4 standard errors, 0.3 / sqrt(2 * 4000)."""
     rows = trials.run_segments(SKY, (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),))
-    weighted = [(row.outcome.centroid_px**2 * row.outcome.detected, row.outcome.detected) for row in rows]
+    weighted = [
+        (row.outcome.centroid_px**2 * row.outcome.detected, row.outcome.detected) for row in rows
+    ]
     mean_square, lights = np.sum(weighted, axis=0)
-    assert math.sqrt(mean_square / lights) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(4 * lights))
+    assert math.sqrt(mean_square / lights) == pytest.approx(
+        0.3, abs=4 * 0.3 / math.sqrt(4 * lights)
+    )
 
 
 def test_false_lights_have_no_centroid_error() -> None:
-    centroids_px, true_px = np.array([[10.0, 10.3], [50.0, 50.0]]), np.array([[10.0, 10.0], [90.0, 90.0]])
-    assert outcomes.centroid_error_px(centroids_px, true_px, 3.0) == pytest.approx(0.3 / math.sqrt(2))
+    centroids_px = np.array([[10.0, 10.3], [50.0, 50.0]])
+    true_px = np.array([[10.0, 10.0], [90.0, 90.0]])
+    assert outcomes.centroid_error_px(centroids_px, true_px, 3.0) == pytest.approx(
+        0.3 / math.sqrt(2)
+    )
     assert math.isnan(outcomes.centroid_error_px(centroids_px[1:], true_px, 3.0))
     assert math.isnan(outcomes.centroid_error_px(np.empty((0, 2)), true_px, 3.0))
 
@@ -146,7 +171,9 @@ def test_false_lights_have_no_centroid_error() -> None:
 def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0})
     setup = setups.prepared_setup(spec, {})
-    expected_px = math.radians(4.0) * setup.lab.scene.exposure.time_s * setup.lab.scene.camera.focal_px
+    expected_px = (
+        math.radians(4.0) * setup.lab.scene.exposure.time_s * setup.lab.scene.camera.focal_px
+    )
     assert trials.run_frame_trial(setup, 5).streak_px == pytest.approx(expected_px, rel=0.03)
     assert math.isnan(trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px)
 
@@ -157,7 +184,9 @@ def test_frames_of_a_closed_loop_have_the_streaks_of_their_lights_in_the_true_mo
     base = {"exposure.frames": 3, "vehicle.imu": {}, "filter": {"start_deg": 0.1}}
     setup = setups.prepared_setup(replace(DOME, base=base, trial={"kind": "flight"}), {})
     flight = trials.trial_flight(setup, 4)
-    streaks_px = [outcome.streak_px for _, outcome in trials.flight_outcomes(flight, setup.estimator)]
+    streaks_px = [
+        outcome.streak_px for _, outcome in trials.flight_outcomes(flight, setup.estimator)
+    ]
     projected_px = [median_path_px(flight, index) for index in range(3)]
     assert max(projected_px) > 0.5
     assert streaks_px == pytest.approx(projected_px, rel=0.05)
@@ -171,7 +200,9 @@ def median_path_px(flight: Flight, index: int) -> float:
     ends_px = []
     for t_s in (window.open_s, window.open_s + window.exposure_s):
         lab_from_body = flight.trajectory().attitude_at(t_s)
-        offset_m = lab_from_body.inv().apply(camera.sources.place[seen, :3]) - camera.mount.camera_body_m
+        offset_m = (
+            lab_from_body.inv().apply(camera.sources.place[seen, :3]) - camera.mount.camera_body_m
+        )
         ends_px.append(camera.optics.project(camera.mount.cam_from_body.apply(offset_m)))
     return float(np.median(np.hypot(*(ends_px[1] - ends_px[0]).T)))
 
@@ -186,18 +217,29 @@ def test_a_row_has_the_attitude_of_its_trial() -> None:
         assert (Rotation.from_quat(wxyz, scalar_first=True) * drawn.inv()).magnitude() < 1e-12
         if spec is DOME:
             tilt, azimuth = np.radians([outcome.body_tilt_deg, outcome.body_azimuth_deg])
-            axis = [math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)]
+            axis = [
+                math.sin(tilt) * math.cos(azimuth),
+                math.sin(tilt) * math.sin(azimuth),
+                math.cos(tilt),
+            ]
             assert drawn.apply([0, 0, 1]) == pytest.approx(axis, abs=1e-12)
             assert math.isnan(outcome.boresight_ra_deg)
         else:
-            ra, dec, _ = np.degrees(ra_dec_roll_rad(setup.lab.camera.mount.cam_from_body * drawn.inv()))
-            assert (outcome.boresight_ra_deg, outcome.boresight_dec_deg) == pytest.approx((ra, dec), abs=1e-9)
+            ra, dec, _ = np.degrees(
+                ra_dec_roll_rad(setup.lab.camera.mount.cam_from_body * drawn.inv())
+            )
+            assert (outcome.boresight_ra_deg, outcome.boresight_dec_deg) == pytest.approx(
+                (ra, dec), abs=1e-9
+            )
             assert math.isnan(outcome.body_tilt_deg)
 
 
-def test_the_worst_frame_of_a_flight_is_a_wrong_one_then_an_unsolved_one_then_the_largest_error() -> None:
+def test_the_worst_frame_of_a_flight_is_a_wrong_one_then_an_unsolved_one_then_the_largest_error() -> (
+    None
+):
     small, large = (Outcome("solved", 1, 1, 0, error, 0.0, 0.0) for error in (1.0, 50.0))
-    unsolved, wrong = Outcome("ambiguous", 1), Outcome("solved", 1, 1, 1, 5.0, 0.0, 0.0)
+    unsolved = Outcome("ambiguous", 1)
+    wrong = Outcome("solved", 1, 1, 1, 5.0, 0.0, 0.0)
     assert outcomes.worst_frame([small, large]) is large
     assert outcomes.worst_frame([small, unsolved, large]) is unsolved
     assert outcomes.worst_frame([small, wrong, unsolved, large]) is wrong

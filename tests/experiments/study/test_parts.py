@@ -29,7 +29,9 @@ from skysim.experiments.study.report import export
 from skysim.results.files import row_parts
 
 pytest.importorskip("pyarrow")
-POINTS, EACH, BATCH = 3, 40, 10
+POINTS = 3
+EACH = 40
+BATCH = 10
 POINT = [Point({"strays": n}, {"trial.false_lights": n}) for n in range(POINTS)]
 
 
@@ -44,12 +46,38 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
     point, replicate = divmod(trial, each)
     rng = np.random.default_rng([point, replicate])
     if failed:
-        return Row(trial, point, replicate, 7 * replicate, "", "code", Outcome("failed"), f"Traceback\nat {trial}", 0.1)
+        return Row(
+            trial,
+            point,
+            replicate,
+            7 * replicate,
+            "",
+            "code",
+            Outcome("failed"),
+            f"Traceback\nat {trial}",
+            0.1,
+        )
     errors = rng.normal(size=3).tolist() if replicate % 7 else [np.nan] * 3
-    told = Outcome("solved" if replicate % 7 else "refused", 1, int(replicate % 7 > 0), int(replicate == 8), *errors)
+    told = Outcome(
+        "solved" if replicate % 7 else "refused",
+        1,
+        int(replicate % 7 > 0),
+        int(replicate == 8),
+        *errors,
+    )
     for name in ("boresight_ra_deg", "boresight_dec_deg", "stars", "centroid_px"):
         setattr_frozen(told, name, float(rng.uniform(0, 60)))
-    return Row(trial, point, replicate, 7 * replicate, f"scene {point}", "code", told, None, 1e-3 * (1 + replicate))
+    return Row(
+        trial,
+        point,
+        replicate,
+        7 * replicate,
+        f"scene {point}",
+        "code",
+        told,
+        None,
+        1e-3 * (1 + replicate),
+    )
 
 
 def setattr_frozen(outcome: Outcome, name: str, value: float) -> None:
@@ -63,7 +91,9 @@ def begun(path: Path, each: int = EACH) -> Any:
     class Begun:
         def __enter__(self) -> store.Store:
             self.kept = opened.__enter__()
-            self.kept.begin(POINT, replicates=str(each), title="strays", code="code", study="title: strays")
+            self.kept.begin(
+                POINT, replicates=str(each), title="strays", code="code", study="title: strays"
+            )
             return self.kept
 
         def __exit__(self, *error: Any) -> None:
@@ -114,7 +144,9 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     with pytest.MonkeyPatch.context() as patch:
         for name, size in {"MOST_ROWS": 50, "PART_ROWS": 20}.items():
             patch.setattr(store, name, size)
-        return filled(folder / "one.sqlite", rows, parts=False), filled(folder / "parts.sqlite", rows)
+        return filled(folder / "one.sqlite", rows, parts=False), filled(
+            folder / "parts.sqlite", rows
+        )
 
 
 # One table.
@@ -143,7 +175,9 @@ def test_both_are_one_table(both: tuple[Path, Path]) -> None:
         assert parted.trial_range() == kept.trial_range() == "0 to 119"
         for trial in range(0, 120, 7):
             assert parted.trial(trial) == kept.trial(trial)
-            assert list(map(type, parted.trial(trial).values())) == list(map(type, kept.trial(trial).values()))
+            assert list(map(type, parted.trial(trial).values())) == list(
+                map(type, kept.trial(trial).values())
+            )
         with pytest.raises(InputError, match=r"trial 120: not in .*; allowed: 0 to 119"):
             parted.trial(120)
         for points in [(0,), (1,), (2,), (0, 2), (0, 1, 2), (1,), (3,)]:
@@ -187,14 +221,27 @@ def test_an_export_reads_some_trials_at_a_time(both: tuple[Path, Path], tmp_path
 
 def test_tables_and_worst_trials_are_the_same(both: tuple[Path, Path]) -> None:
     asked = plan.Study.model_validate(
-        {"schema": 1, "title": "strays", "scene": "shefex2", "seed": 1, "trial": {"kind": "centroids"}}
-        | {"factors": {"strays": {"key": "trial.false_lights", "values": [0, 1, 2]}}, "responses": ["identified"]}
+        {
+            "schema": 1,
+            "title": "strays",
+            "scene": "shefex2",
+            "seed": 1,
+            "trial": {"kind": "centroids"},
+        }
+        | {
+            "factors": {"strays": {"key": "trial.false_lights", "values": [0, 1, 2]}},
+            "responses": ["identified"],
+        }
     )
-    names, found = ("identified", "cross_arcsec_rms", "roll_arcsec_p90", "failed", "time_ms_mean"), []
+    names = ("identified", "cross_arcsec_rms", "roll_arcsec_p90", "failed", "time_ms_mean")
+    found = []
     for path in both:
         with store.open_store(path) as kept:
             rows = table.table(kept, names)
-            chosen = [worst.worst_of_levels(asked, kept, "roll_arcsec", {"strays": n}) for n in range(POINTS)]
+            chosen = [
+                worst.worst_of_levels(asked, kept, "roll_arcsec", {"strays": n})
+                for n in range(POINTS)
+            ]
             found.append(repr((rows, chosen)))
     assert found[0] == found[1]
 
@@ -206,7 +253,8 @@ class Killer:
     """Ends this process by SIGKILL in the step of a move that is named."""
 
     def __init__(self, step: str) -> None:
-        self.step, self.listed = step, False
+        self.step = step
+        self.listed = False
 
     def __call__(self, step: str) -> None:
         if step == self.step:
@@ -230,7 +278,10 @@ STEPS += ["INSERT INTO parts", "DELETE FROM trials", "DELETE FROM timings", "COM
 
 def die_in_step(path: Path, step: str) -> None:
     """Add rows until the step of a move in which this process is killed."""
-    kill, sync, to_arrow, replace = Killer(step), row_parts.sync, row_parts.to_arrow, os.replace
+    kill = Killer(step)
+    sync = row_parts.sync
+    to_arrow = row_parts.to_arrow
+    replace = os.replace
 
     def dying(before: str, does: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *arguments: (kill(before), does(*arguments))[1]
@@ -255,18 +306,24 @@ def forked(does: Callable[[], object]) -> int:
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_a_kill_in_any_step_of_a_move_loses_nothing_and_doubles_nothing(step: str, tmp_path: Path) -> None:
+def test_a_kill_in_any_step_of_a_move_loses_nothing_and_doubles_nothing(
+    step: str, tmp_path: Path
+) -> None:
     path = tmp_path / "s.sqlite"
     assert forked(partial(die_in_step, path, step)) == -signal.SIGKILL
     files = sorted((tmp_path / "s.parts").iterdir())
     assert len(files) == {"arrow": 0, "next batch": 3}.get(step, 1)
     kept_rows = 0 if step == "next batch" else 60
     assert in_sqlite(path) == kept_rows
-    expected = {name: values[:60] for name, values in whole(filled(tmp_path / "whole.sqlite", ALL)).items()}
+    expected = {
+        name: values[:60] for name, values in whole(filled(tmp_path / "whole.sqlite", ALL)).items()
+    }
     assert whole(path) == expected
     with store.writing(path) as kept:
         # What is not listed is gone, and the move that was cut off is made up for.
-        assert sorted(part.path for part in kept.parts()) == sorted((tmp_path / "s.parts").iterdir())
+        assert sorted(part.path for part in kept.parts()) == sorted(
+            (tmp_path / "s.parts").iterdir()
+        )
         assert kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0] == in_sqlite(path) < 50
         assert kept.counts()["done"] == 60
         add_all(kept, ALL[60:])
@@ -280,9 +337,11 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told, draw = loader.load(tmp_path / "strays.yaml"), random.Random(2)
+    told = loader.load(tmp_path / "strays.yaml")
+    draw = random.Random(2)
     done(told, tmp_path / "whole.sqlite")
-    often, killed = tmp_path / "often.sqlite", 0
+    often = tmp_path / "often.sqlite"
+    killed = 0
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
     workers.start_fork_server()  # as an earlier test may have done
 
@@ -298,7 +357,9 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
             return 0
 
     for _ in range(6):
-        pid, before, end = os.fork(), stored(), time.monotonic() + 30
+        pid = os.fork()
+        before = stored()
+        end = time.monotonic() + 30
         if pid == 0:
             try:
                 # The fork server is no child of this process, which needs its own.
@@ -317,7 +378,8 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
     assert killed >= 3
     run(0.0)
     without_time = [
-        {k: v for k, v in whole(path).items() if k != "time_ms"} for path in (tmp_path / "whole.sqlite", often)
+        {k: v for k, v in whole(path).items() if k != "time_ms"}
+        for path in (tmp_path / "whole.sqlite", often)
     ]
     assert without_time[0] == without_time[1]
     assert len(list((tmp_path / "often.parts").iterdir())) >= 4
@@ -369,7 +431,9 @@ def test_failed_trials_are_run_again(tmp_path: Path) -> None:
 
 
 def test_failed_trials_alone_never_move(tmp_path: Path) -> None:
-    path = filled(tmp_path / "s.sqlite", [row(trial, failed=True) for trial in range(POINTS * EACH)])
+    path = filled(
+        tmp_path / "s.sqlite", [row(trial, failed=True) for trial in range(POINTS * EACH)]
+    )
     assert in_sqlite(path) == POINTS * EACH
     assert not list(tmp_path.glob("s.parts/*"))
 
@@ -408,7 +472,11 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)
     part = tmp_path / "s.parts/000002.parquet"
     data = part.read_bytes()
-    for change in (lambda: part.write_bytes(data[:-9]), lambda: part.write_bytes(b"no"), part.unlink):
+    for change in (
+        lambda: part.write_bytes(data[:-9]),
+        lambda: part.write_bytes(b"no"),
+        part.unlink,
+    ):
         change()
         with (
             store.open_store(path) as kept,
@@ -422,11 +490,26 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ("UPDATE parts SET rows = 7 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: 7"),
-        ("UPDATE parts SET last = 'x' WHERE part = 2", r"s\.sqlite: not a valid study store: .*'x'"),
-        ("UPDATE parts SET wrong = x'31' WHERE part = 2", r"s\.sqlite: not a valid study store: .*b'1'"),
-        ("UPDATE parts SET rows = -1 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: -1"),
-        ("UPDATE parts SET last = 0 WHERE part = 3", r"000003\.parquet: not a valid part .* allowed: 0 to 0, 0 to 39"),
-        ("UPDATE meta SET value = '0' WHERE key = 'replicates'", r"s\.sqlite: not a valid study store: replicates 0"),
+        (
+            "UPDATE parts SET last = 'x' WHERE part = 2",
+            r"s\.sqlite: not a valid study store: .*'x'",
+        ),
+        (
+            "UPDATE parts SET wrong = x'31' WHERE part = 2",
+            r"s\.sqlite: not a valid study store: .*b'1'",
+        ),
+        (
+            "UPDATE parts SET rows = -1 WHERE part = 2",
+            r"000002\.parquet: has \d+ rows; allowed: -1",
+        ),
+        (
+            "UPDATE parts SET last = 0 WHERE part = 3",
+            r"000003\.parquet: not a valid part .* allowed: 0 to 0, 0 to 39",
+        ),
+        (
+            "UPDATE meta SET value = '0' WHERE key = 'replicates'",
+            r"s\.sqlite: not a valid study store: replicates 0",
+        ),
     ],
 )
 def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
@@ -449,14 +532,19 @@ def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
         ("replicate", lambda replicate: replicate[:1]),
     ],
 )
-def test_a_part_with_other_values_is_one_clear_line(column: str, values: Callable[[Any], Any], tmp_path: Path) -> None:
+def test_a_part_with_other_values_is_one_clear_line(
+    column: str, values: Callable[[Any], Any], tmp_path: Path
+) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)
     part = tmp_path / "s.parts/000002.parquet"
     columns = {name: row_parts.read_column(part, name) for name in store.COLUMNS if name != "trial"}
     changed = columns | {column: values(columns[column])}
     row_parts.write_part(part, {name: one[: len(changed[column])] for name, one in changed.items()})
     for read in (store.Store.trial_range, store.Store.scenes, lambda kept: kept.done(10)):
-        with store.open_store(path) as kept, pytest.raises(InputError, match=r"^[^\n]*000002\.parquet: [^\n]+$"):
+        with (
+            store.open_store(path) as kept,
+            pytest.raises(InputError, match=r"^[^\n]*000002\.parquet: [^\n]+$"),
+        ):
             read(kept)
 
 
@@ -471,7 +559,9 @@ def test_an_earlier_skysim_refuses_a_store_with_parts(tmp_path: Path) -> None:
         assert kept.counts()["done"] == len(kept.columns()["trial"]) == 20
 
 
-def test_columns_are_dropped_when_they_are_too_many_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_are_dropped_when_they_are_too_many_to_keep(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     asked: list[str] = []
 
     def source(name: str) -> np.ndarray:

@@ -37,7 +37,9 @@ def test_a_plan_has_every_trial_of_every_point(tmp_path):
 
 def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
     told = loader.load(written(tmp_path, STUDY))
-    same = loader.load(written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", "")))
+    same = loader.load(
+        written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
+    )
     assert same.digest == told.digest
     for change in (
         ("seed: 1", "seed: 2"),
@@ -48,25 +50,39 @@ def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
 
 
 def test_an_override_changes_the_study(tmp_path):
-    told = loader.load(written(tmp_path, STUDY), {"replicates": "7", "factors.strays.values": "[1, 2, 3]"})
+    told = loader.load(
+        written(tmp_path, STUDY), {"replicates": "7", "factors.strays.values": "[1, 2, 3]"}
+    )
     assert told.trials == 3 * 3 * 7
 
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (("replicates: 4", "replicas: 4"), r"replicas: unknown key; did you mean replicates\?.*line 10\)"),
+        (
+            ("replicates: 4", "replicas: 4"),
+            r"replicas: unknown key; did you mean replicates\?.*line 10\)",
+        ),
         (
             ("cross_arcsec_p95", "cross_arcsec_p96"),
             r"responses.1: unknown response 'cross_arcsec_p96'; allowed: over.*line 11\)",
         ),
-        (("trial.false_lights", "trial.falselights"), r"factors.strays: 0: trial.falselights.*line 8\)"),
-        (("camera.focal_length", "camera.focal"), r"factors.focal: '25 mm': camera.focal: unknown key"),
+        (
+            ("trial.false_lights", "trial.falselights"),
+            r"factors.strays: 0: trial.falselights.*line 8\)",
+        ),
+        (
+            ("camera.focal_length", "camera.focal"),
+            r"factors.focal: '25 mm': camera.focal: unknown key",
+        ),
         (
             ('"30 mm"', '"30 in"'),
             r"factors.focal: from '20 mm' and to '30 in' have different units.*line 9\)",
         ),
-        (('"20 mm"', '"0 mm"'), r"factors.focal: '0 mm': camera.focal_length: '0 mm' is not allowed"),
+        (
+            ('"20 mm"', '"0 mm"'),
+            r"factors.focal: '0 mm': camera.focal_length: '0 mm' is not allowed",
+        ),
         (("noise_px: 0.1", "noise_px: -1"), r"trial.*noise_px.*line 6\)"),
         (("kind: centroids", "kind: guesses"), r"trial.kind: unknown kind 'guesses'; allowed:"),
         (
@@ -85,7 +101,10 @@ def test_an_override_changes_the_study(tmp_path):
             ("cross_arcsec_p95", "ambiguous"),
             r"responses.1: no tracker of this study reports ambiguity; allowed: under a dome.*line 11\)",
         ),
-        (("scene: shefex2", "scene: collimated_display"), r"trial.kind: centroids with a collimated display"),
+        (
+            ("scene: shefex2", "scene: collimated_display"),
+            r"trial.kind: centroids with a collimated display",
+        ),
         (("scene: shefex2", "scene: shefex3"), r"shefex3: no such scene; allowed:"),
         (
             ("replicates: 4", "replicates: 4\nbudget: {trials: 23}"),
@@ -115,7 +134,9 @@ def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
 
 
 def test_there_is_no_such_study():
-    with pytest.raises(InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"):
+    with pytest.raises(
+        InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"
+    ):
         loader.load("which")
 
 
@@ -141,11 +162,17 @@ responses: [identified]
 
 def test_codes_of_leds_need_a_flight(tmp_path):
     """One frame shows one bit."""
-    assert loader.load(written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))).trials == 2
+    assert (
+        loader.load(written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))).trials
+        == 2
+    )
     single = FLIGHT.format(scene="coded_spiral", start="scene").replace(
         "{kind: flight, start: scene}", "{kind: frames}"
     )
-    with pytest.raises(InputError, match=r"frames with tracker\.decoder, which needs many; allowed: centroids, flight"):
+    with pytest.raises(
+        InputError,
+        match=r"frames with tracker\.decoder, which needs many; allowed: centroids, flight",
+    ):
         loader.load(written(tmp_path, single))
 
 
@@ -156,12 +183,32 @@ def test_codes_of_leds_need_a_flight(tmp_path):
         ("afit_simsat", "scene", None),
         ("shefex2", "{dec_deg: [0, 30]}", None),
         ("shefex2", "{near: {body: moon}}", None),
-        ("afit_simsat", "{near: {body: moon}}", "trial.start.near: has no effect with light of kind dome"),
+        (
+            "afit_simsat",
+            "{near: {body: moon}}",
+            "trial.start.near: has no effect with light of kind dome",
+        ),
         ("shefex2", "{near: {body: moon, off_deg: [5, 1]}}", "5 to 1; allowed: the smaller first"),
-        ("afit_simsat", "{tilt_deg: 31}", "trial.start.tilt_deg: 31; allowed: up to vehicle.tilt_stop_deg 30"),
-        ("afit_simsat", "{dec_deg: [0, 30]}", "trial.start.dec_deg: has no effect with light of kind dome"),
-        ("shefex2", "{tilt_deg: 5}", "trial.start.tilt_deg: has no effect with light of kind stars"),
-        ("collimated_display", "random", "trial.start: random with a collimated display; allowed: scene"),
+        (
+            "afit_simsat",
+            "{tilt_deg: 31}",
+            "trial.start.tilt_deg: 31; allowed: up to vehicle.tilt_stop_deg 30",
+        ),
+        (
+            "afit_simsat",
+            "{dec_deg: [0, 30]}",
+            "trial.start.dec_deg: has no effect with light of kind dome",
+        ),
+        (
+            "shefex2",
+            "{tilt_deg: 5}",
+            "trial.start.tilt_deg: has no effect with light of kind stars",
+        ),
+        (
+            "collimated_display",
+            "random",
+            "trial.start: random with a collimated display; allowed: scene",
+        ),
         ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
     ],
 )
@@ -178,13 +225,18 @@ def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, 
     ("axis", "complaint"),
     [
         ("sideways", "rate_axis: 'sideways' is not allowed"),
-        ("{body: [0, 0, 0]}", "rate_axis: allowed: one of body and camera, a vector that is not zero"),
+        (
+            "{body: [0, 0, 0]}",
+            "rate_axis: allowed: one of body and camera, a vector that is not zero",
+        ),
         ("{body: [1, 0, 0], camera: [1, 0, 0]}", "allowed: one of body and camera"),
         ("{lab: [1, 0, 0]}", "rate_axis.lab: unknown key"),
     ],
 )
 def test_an_axis_is_a_name_or_one_vector(axis, complaint, tmp_path):
     trial = f"{{kind: frames, rate_deg_s: 1, rate_axis: {axis}}}"
-    text = STUDY.replace("{kind: centroids, noise_px: 0.1}", trial).replace("trial.false_lights", "seed")
+    text = STUDY.replace("{kind: centroids, noise_px: 0.1}", trial).replace(
+        "trial.false_lights", "seed"
+    )
     with pytest.raises(InputError, match=complaint):
         loader.load(written(tmp_path, text))

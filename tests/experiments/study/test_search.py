@@ -53,7 +53,8 @@ STUDY: dict[str, Any] = {
 class Law:
     """An engine that answers by a law of the settings instead of trials."""
 
-    name, workers = "law", 1
+    name = "law"
+    workers = 1
 
     def __init__(self, law: Callable[[Settings], Outcome]) -> None:
         self.law = law
@@ -69,13 +70,18 @@ class Law:
             chunks.report_time(chunk, 0.1)
 
     def row(self, spec: plan.TrialSpec, segment: Any, trial: int, k: int) -> Row:
-        seed, code = seed_of(spec, segment.point, k), code_version()
+        seed = seed_of(spec, segment.point, k)
+        code = code_version()
         try:
-            return Row(trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0)
+            return Row(
+                trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0
+            )
         except InputError as error:
             return Row(trial, segment.point, k, seed, REFUSED, code, FAILED, str(error), 0.0)
         except ArithmeticError as error:
-            return Row(trial, segment.point, k, seed, "s", code, FAILED, f"ArithmeticError: {error}", 0.0)
+            return Row(
+                trial, segment.point, k, seed, "s", code, FAILED, f"ArithmeticError: {error}", 0.0
+            )
 
 
 def angle(arcsec: float, solved: bool = True) -> Outcome:
@@ -85,7 +91,8 @@ def angle(arcsec: float, solved: bool = True) -> Outcome:
 
 def bowl(settings: Settings) -> Outcome:
     """Least, 1, at x = 0.7, y = 0.2."""
-    x, y = settings["trial.noise_px"], settings["trial.magnitude_sigma"]
+    x = settings["trial.noise_px"]
+    y = settings["trial.magnitude_sigma"]
     return angle(1 + (x - 0.7) ** 2 + (y - 0.2) ** 2)
 
 
@@ -103,7 +110,9 @@ def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
     return made
 
 
-def searched(told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None) -> search.SearchResult:
+def searched(
+    told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None
+) -> search.SearchResult:
     with store.writing(out) as kept:
         runner.prepare_store(told, kept, bool(kept.meta("digest")))
         return search.search(told, kept, engine, watch)
@@ -141,8 +150,14 @@ def test_more_is_better_where_the_study_says_so(tmp_path: Path) -> None:
 def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
     """angle = 1 / x against a price of x: every x at y = 0 is on the true front, and its law is angle * price = 1."""
     cost = {"per": {"x": 1, "y": 1}}
-    told = changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}], cost=cost, candidates=40)
-    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"])))
+    told = changed(
+        objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}],
+        cost=cost,
+        candidates=40,
+    )
+    found = searched(
+        loaded(tmp_path, told), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"]))
+    )
     on = {one.number for one in found.front}
     assert len(on) >= 5
     for one in found.candidates:
@@ -152,9 +167,13 @@ def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
             for two in found.candidates
         )
         assert beaten == (one.number not in on)
-    assert [one.objectives[0] for one in found.front] == sorted(one.objectives[0] for one in found.front)
+    assert [one.objectives[0] for one in found.front] == sorted(
+        one.objectives[0] for one in found.front
+    )
     tightness = [math.prod(one.objectives) for one in found.candidates]
-    assert np.median(tightness[-15:]) < np.median(tightness[:10])  # it has learnt that y costs and brings nothing
+    assert np.median(tightness[-15:]) < np.median(
+        tightness[:10]
+    )  # it has learnt that y costs and brings nothing
 
 
 def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
@@ -163,7 +182,12 @@ def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
     def law(settings: Settings) -> Outcome:
         return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
 
-    told = changed(constraints=[{"response": "identified", "at_least": 0.9}, {"response": "cost", "at_most": 10}])
+    told = changed(
+        constraints=[
+            {"response": "identified", "at_least": 0.9},
+            {"response": "cost", "at_most": 10},
+        ]
+    )
     found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
     (best,) = found.front
     assert 1.04 <= best.objectives[0] < 1.14
@@ -208,14 +232,18 @@ def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
     told = changed(objectives=[{"response": "cost"}], cost={"per": {"x": 1}}, candidates=20)
     found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
     assert any(one.refused for one in found.candidates)
-    assert found.front[0].cost == min(one.cost for one in found.candidates if not one.refused) >= 0.5
+    assert (
+        found.front[0].cost == min(one.cost for one in found.candidates if not one.refused) >= 0.5
+    )
 
 
 def test_failures_end_it(tmp_path: Path) -> None:
     def law(settings: Settings) -> Outcome:
         raise ArithmeticError("a fault")
 
-    found = searched(loaded(tmp_path, STUDY | {"budget": {"failures": 6}}), tmp_path / "s.db", Law(law))
+    found = searched(
+        loaded(tmp_path, STUDY | {"budget": {"failures": 6}}), tmp_path / "s.db", Law(law)
+    )
     with store.open_store(tmp_path / "s.db") as kept:
         assert 6 <= kept.counts()["failed"] <= 8
     assert not found.finished
@@ -223,7 +251,9 @@ def test_failures_end_it(tmp_path: Path) -> None:
 
 
 def test_time_ends_it(tmp_path: Path) -> None:
-    found = searched(loaded(tmp_path, STUDY | {"budget": {"time": "1 us"}}), tmp_path / "s.db", Law(bowl))
+    found = searched(
+        loaded(tmp_path, STUDY | {"budget": {"time": "1 us"}}), tmp_path / "s.db", Law(bowl)
+    )
     assert not found.finished
     assert len(found.candidates) <= 1
 
@@ -296,7 +326,9 @@ def test_another_question_than_the_store_has_is_refused(tmp_path: Path) -> None:
     made = loaded(tmp_path, changed(candidates=3))
     searched(made, tmp_path / "s.db", Law(bowl))
     with store.writing(tmp_path / "s.db") as kept:
-        kept.set_points([Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})], first=1)
+        kept.set_points(
+            [Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})], first=1
+        )
         with pytest.raises(InputError, match=r"candidate 1 is .*version of optuna"):
             search.search(made, kept, Law(bowl))
 
@@ -313,13 +345,18 @@ def test_few_points_are_tried_once_each(tmp_path: Path) -> None:
         (x, y) for x in (0.1, 0.5, 0.9) for y in (0.2, 0.4)
     ]
     assert {one.levels["y"] for one in found.front} == {0.2}
-    assert {one.levels["x"] for one in found.front} <= {0.5, 0.9}  # as near to 0.7, but for rounding
+    assert {one.levels["x"] for one in found.front} <= {
+        0.5,
+        0.9,
+    }  # as near to 0.7, but for rounding
 
 
 def test_watch_is_told_of_the_whole_search(tmp_path: Path) -> None:
     seen = []
     made = loaded(tmp_path, changed(candidates=5))
-    searched(made, tmp_path / "s.db", Law(bowl), lambda now: seen.append((now.trials, now.done, now.now)))
+    searched(
+        made, tmp_path / "s.db", Law(bowl), lambda now: seen.append((now.trials, now.done, now.now))
+    )
     assert {trials for trials, _, _ in seen} == {20}
     assert [done for _, done, _ in seen] == sorted({done for _, done, _ in seen})
     assert seen[-1] == (20, 20, 20)
@@ -351,7 +388,11 @@ DOME = STUDY | {
 
 
 def priced(folder: Path, parts: str) -> plan.Plan:
-    config = {"candidates": 2, "objectives": [{"response": "cost"}], "cost": {"parts": parts, "base": 7}}
+    config = {
+        "candidates": 2,
+        "objectives": [{"response": "cost"}],
+        "cost": {"parts": parts, "base": 7},
+    }
     return loaded(folder, DOME | {"optimize": config})
 
 
@@ -384,13 +425,19 @@ def test_other_prices_are_another_search(tmp_path: Path) -> None:
 def test_bad_prices_are_the_study_s_fault(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: .*study\.yaml"):
         priced(tmp_path, "none.csv")
-    with pytest.raises(InputError, match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome"):
+    with pytest.raises(
+        InputError, match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome"
+    ):
         loaded(tmp_path, changed(cost={"parts": "assumed"}))
 
 
-def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_s_front_has_levels_error_and_cost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The two of three candidates that no other beats, as a table."""
-    study = loaded(tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])).study
+    study = loaded(
+        tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])
+    ).study
     assert study.optimize is not None
     values = ((40.0, 100.0), (30.0, 200.0), (50.0, 300.0))
     candidates = [
@@ -401,7 +448,10 @@ def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: 
     result = search.SearchResult(candidates, search.front(study.optimize, candidates), True)
     heads, cells = search.front_cells(study, result)
     assert heads == ["candidate", "x", "y", "angle_arcsec_median", "cost"]
-    assert cells == [["1", "0.25", "0.5", "30 (20..60)", "200"], ["0", "0", "0.5", "40 (20..60)", "100"]]
+    assert cells == [
+        ["1", "0.25", "0.5", "30 (20..60)", "200"],
+        ["0", "0", "0.5", "40 (20..60)", "100"],
+    ]
     Report("", front_table(study, result)).print()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "3 candidates, 3 of them feasible; the front:"
@@ -431,13 +481,19 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
             {"cost": {"levels": {"z": {"dear": 5, "cheap": 1}}}},
             r"levels\.z: .*allowed: a price of each of cheap, precise",
         ),
-        ({"cost": {"levels": {"x": {"a": 1}}}}, r"levels\.x: .*optimize\.cost\.per, as it is a range"),
+        (
+            {"cost": {"levels": {"x": {"a": 1}}}},
+            r"levels\.x: .*optimize\.cost\.per, as it is a range",
+        ),
         (
             {"objectives": [{"response": "beauty"}]},
             r"objectives\.0\.response: unknown response 'beauty'; allowed: .*, or cost",
         ),
         ({"objectives": [{"response": "time_ms_mean"}]}, r"time_ms_mean is not reproducible"),
-        ({"objectives": [{"response": "cost"}, {"response": "cost"}]}, r"objectives: cost occurs twice"),
+        (
+            {"objectives": [{"response": "cost"}, {"response": "cost"}]},
+            r"objectives: cost occurs twice",
+        ),
         (
             {"constraints": [{"response": "identified"}]},
             r"constraints\.0: no bound; allowed: at_least, at_most",
@@ -446,7 +502,10 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
     ],
 )
 def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], says: str) -> None:
-    study = changed(**told) | {"factors": STUDY["factors"] | {"z": LEVELS}, "budget": {"trials": 1000}}
+    study = changed(**told) | {
+        "factors": STUDY["factors"] | {"z": LEVELS},
+        "budget": {"trials": 1000},
+    }
     with pytest.raises(InputError, match=says):
         search.check(plan.Study.model_validate(study))
 

@@ -83,9 +83,13 @@ def until(path: Path, count: int) -> None:
 
 
 @pytest.mark.long
-def test_a_writer_killed_at_any_instant_leaves_whole_batches(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+def test_a_writer_killed_at_any_instant_leaves_whole_batches(
+    told: plan.Plan, whole: str, tmp_path: Path
+) -> None:
     """And a run that goes on after each of its deaths ends with the store of a run that nobody disturbed."""
-    often, draw, left = tmp_path / "often.sqlite", random.Random(1), [0]
+    often = tmp_path / "often.sqlite"
+    draw = random.Random(1)
+    left = [0]
     for _ in range(6):
         pid = child(partial(done, told, often, resume=left[-1] > 0))
         until(often, min(left[-1] + 1, told.trials))
@@ -107,7 +111,9 @@ def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
     pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.05)))
     try:
         until(path, 1)
-        with pytest.raises(InputError, match="in use by another run; allowed: one run at a time") as refused:
+        with pytest.raises(
+            InputError, match="in use by another run; allowed: one run at a time"
+        ) as refused:
             done(told, path, resume=True)
         assert "\n" not in str(refused.value)
         with store.open_store(path) as kept:  # who only reads is welcome
@@ -119,7 +125,9 @@ def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_interrupted_by_the_keyboard_it_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+def test_interrupted_by_the_keyboard_it_resumes(
+    told: plan.Plan, whole: str, tmp_path: Path
+) -> None:
     path = tmp_path / "interrupted.sqlite"
     pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.02)))
     until(path, 5)
@@ -156,15 +164,23 @@ def test_another_study_or_other_code_is_refused(
 
 
 @pytest.mark.slow
-def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(told: plan.Plan, tmp_path: Path) -> None:
-    more, whole, grown = other(told, replicates="5"), tmp_path / "whole.sqlite", tmp_path / "grown.sqlite"
+def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
+    told: plan.Plan, tmp_path: Path
+) -> None:
+    more = other(told, replicates="5")
+    whole = tmp_path / "whole.sqlite"
+    grown = tmp_path / "grown.sqlite"
     done(more, whole)
     done(other(told, replicates="2"), grown)
     assert done(more, grown, resume=True).now == 9
     assert contents(grown) == contents(whole)
     with store.open_store(whole) as kept, store.open_store(grown) as other_store:
         assert kept.meta("replicates") == other_store.meta("replicates") == "5"
-        assert len(other_store.columns()["time_ms"]) == np.count_nonzero(other_store.columns()["time_ms"] > 0) == 15
+        assert (
+            len(other_store.columns()["time_ms"])
+            == np.count_nonzero(other_store.columns()["time_ms"] > 0)
+            == 15
+        )
     with pytest.raises(InputError, match="another study"):
         done(other(told, replicates="4"), grown, resume=True)
 
@@ -175,7 +191,10 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
     for opened in (store.open_store, store.writing):
         with pytest.raises(InputError, match=r"text\.sqlite: .*not a database"), opened(path):
             pass
-    with pytest.raises(InputError, match="no such store"), store.open_store(tmp_path / "none.sqlite"):
+    with (
+        pytest.raises(InputError, match="no such store"),
+        store.open_store(tmp_path / "none.sqlite"),
+    ):
         pass
     with pytest.raises(InputError, match="unable to open"), store.writing(taken(tmp_path)):
         pass
@@ -191,8 +210,12 @@ COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything b
 
 
 @pytest.mark.parametrize("value", ["x'ff00'", "x'3132'"])  # the second are digits
-@pytest.mark.parametrize(("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]])
-def test_a_value_of_another_type_is_one_clear_line(table: str, column: str, value: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]]
+)
+def test_a_value_of_another_type_is_one_clear_line(
+    table: str, column: str, value: str, tmp_path: Path
+) -> None:
     """SQLite stores any type in any column, so a damaged file can hold bytes where skysim wrote text or numbers."""
     path = tmp_path / "odd.sqlite"
     with store.writing(path) as kept:
@@ -202,7 +225,14 @@ def test_a_value_of_another_type_is_one_clear_line(table: str, column: str, valu
     with closing(sqlite3.connect(path)) as db, db:
         assert db.execute(f"UPDATE {table} SET {column} = {value}").rowcount
     with pytest.raises(InputError) as refused, store.open_store(path) as kept:
-        kept.meta("code"), kept.points(), kept.runs(), kept.failures(), kept.counts(), kept.columns()
+        (
+            kept.meta("code"),
+            kept.points(),
+            kept.runs(),
+            kept.failures(),
+            kept.counts(),
+            kept.columns(),
+        )
     assert re.fullmatch(r"[^\n]*odd\.sqlite: not a valid study store: [^\n]+", str(refused.value))
     assert str(refused.value).count("odd.sqlite") == 1
 
@@ -214,7 +244,10 @@ def test_a_resumed_store_with_text_for_a_number_is_refused(tmp_path: Path) -> No
         kept.add([row, row._replace(trial=1), row._replace(trial=2)])
     with closing(sqlite3.connect(path)) as db, db:
         db.execute("UPDATE trials SET point = 'two' WHERE trial = 2")
-    with store.writing(path) as kept, pytest.raises(InputError, match=r"odd\.sqlite: .*'two'.*allowed: int, str"):
+    with (
+        store.writing(path) as kept,
+        pytest.raises(InputError, match=r"odd\.sqlite: .*'two'.*allowed: int, str"),
+    ):
         kept.scenes()
 
 
@@ -257,7 +290,9 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
     assert done(told, path, resume=True).failed == len(bad)
     with store.open_store(path) as kept:
         assert kept.counts() == {"done": told.trials, "failed": len(bad), "wrong": 0}
-        assert kept.failures() == [(trial, f"ZeroDivisionError: of {seeds[trial]}") for trial in bad]
+        assert kept.failures() == [
+            (trial, f"ZeroDivisionError: of {seeds[trial]}") for trial in bad
+        ]
         row = kept.trial(bad[0])
         assert (row["seed"], row["status"], row["frames"]) == (seeds[bad[0]], "failed", 0)
         assert row["error"].startswith("Traceback")
@@ -300,12 +335,15 @@ def test_rows_are_kept_all_or_none(tmp_path: Path) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) -> None:
-    first, count = data.draw(st.integers(0, 5)), data.draw(st.integers(1, 6))
+    first = data.draw(st.integers(0, 5))
+    count = data.draw(st.integers(1, 6))
     replicates = data.draw(st.integers(1, 50))
     points = [Point({"n": n}, {"trial.lights": n}) for n in range(first, first + count)]
     span = range(first * replicates, (first + count) * replicates)
     missing = sorted(data.draw(st.sets(st.sampled_from(span))))
-    todo, came, size = runner.ChunkQueue(points, replicates, np.array(missing, np.int64), first), [], 1
+    todo = runner.ChunkQueue(points, replicates, np.array(missing, np.int64), first)
+    came = []
+    size = 1
     while chunk := todo.next():
         for point, told, number, which in chunk:
             assert told == {"trial.lights": point}
@@ -325,7 +363,8 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
 def test_chunks_are_sized_by_time() -> None:
     """Trials of 10 ms: chunks double until they take CHUNK_S, and shrink as trials take longer."""
     point = [Point({}, {})]
-    todo, sizes = runner.ChunkQueue(point, 10_000, np.arange(10_000)), []
+    todo = runner.ChunkQueue(point, 10_000, np.arange(10_000))
+    sizes = []
     for trial_s in [0.01] * 8 + [0.1] * 2:
         chunk = todo.next()
         sizes.append(sum(len(segment.replicates) for segment in chunk))
@@ -338,7 +377,9 @@ def test_chunks_are_sized_by_time() -> None:
 @pytest.mark.parametrize(("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)])
 def test_many_workers_complete_no_more_chunks_than_few(workers: int, rate_hz: float) -> None:
     """Of trials of 10 ms: the chunks of a second, from their size."""
-    todo = runner.ChunkQueue([Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers))
+    todo = runner.ChunkQueue(
+        [Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers)
+    )
     size = 0
     for _ in range(14):
         size = sum(len(segment.replicates) for segment in todo.next())

@@ -39,7 +39,13 @@ RING = {"key": "trial.tilt_deg", "values": [[10, 20], [0, 10]]}
 
 
 def study(**keys: Any) -> Study:
-    base = {"schema": 1, "title": "Which <dome>?", "scene": "afit_simsat", "seed": 11, "replicates": 20}
+    base = {
+        "schema": 1,
+        "title": "Which <dome>?",
+        "scene": "afit_simsat",
+        "seed": 11,
+        "replicates": 20,
+    }
     base |= {"trial": {"kind": "centroids"}, "responses": ["identified", "cross_arcsec_median"]}
     return Study.model_validate(base | {"factors": {"tilt": TILT}} | keys)
 
@@ -56,7 +62,11 @@ def outcome(point: int, replicate: int) -> Outcome:
 
 
 def filled(
-    path: Path, asked: Study, tried: list[Point] | None = None, done: int | None = None, failed: int = 0
+    path: Path,
+    asked: Study,
+    tried: list[Point] | None = None,
+    done: int | None = None,
+    failed: int = 0,
 ) -> Path:
     tried = points(asked) if tried is None else tried
     rows = []
@@ -66,7 +76,12 @@ def filled(
         told = Outcome("failed") if error else outcome(point, replicate)
         rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
     with store.writing(path) as kept:
-        kept.begin(kept.points(), study="title: Which <dome>?", code="cafe0123", replicates=str(asked.replicates))
+        kept.begin(
+            kept.points(),
+            study="title: Which <dome>?",
+            code="cafe0123",
+            replicates=str(asked.replicates),
+        )
         kept.set_points(tried)
         kept.add(rows)
         kept.record_run("pool", 2, len(rows), 4.0)
@@ -104,7 +119,8 @@ class Html(HTMLParser):
         if tag in ("p", "code", "div", "pre"):
             self._inside.append((told.get("id") or told.get("class") or tag).strip())
         if tag in ("h2", "summary"):
-            self._in_title, self._title = True, ""
+            self._in_title = True
+            self._title = ""
         if tag == "table":
             self.tables.setdefault(self._section, [])
         if tag == "tr":
@@ -123,7 +139,8 @@ class Html(HTMLParser):
         if tag in ("p", "code", "div", "pre"):
             self._inside.pop()
         if tag in ("h2", "summary"):
-            self._in_title, self._section = False, self._title
+            self._in_title = False
+            self._section = self._title
         if tag in ("td", "th"):
             self._cell = False
 
@@ -138,9 +155,13 @@ class Html(HTMLParser):
 
 def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
     with store.open_store(path) as kept:
-        about = Overview([("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")], [], False)
+        about = Overview(
+            [("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")], [], False
+        )
         found = Analysis(table(kept, study_report.responses(asked)), about, **more)
-        text = study_report.compose(asked, kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND).html()
+        text = study_report.compose(
+            asked, kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND
+        ).html()
     return text, Html(text)
 
 
@@ -197,7 +218,9 @@ def test_the_first_ten_failures_are_named_with_what_replays_them(tmp_path: Path)
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, failed=12), asked)
     told = html.said["items bad"]
-    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [(str(n), str(n)) for n in range(10)]
+    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [
+        (str(n), str(n)) for n in range(10)
+    ]
     assert told.startswith("12 trials failed")
     assert "skysim study replay FILE 0" in told
 
@@ -233,10 +256,20 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
         ({"figures": [{"kind": "curve", "x": "tilt", "y": "wrong", "log": True}]}, 1),
         (
             {"factors": {"tilt": TILT, "dome": DOME}}
-            | {"figures": [{"kind": "heat", "x": "tilt", "y": "dome", "value": "stars_least", "log": True}]},
+            | {
+                "figures": [
+                    {"kind": "heat", "x": "tilt", "y": "dome", "value": "stars_least", "log": True}
+                ]
+            },
             1,
         ),
-        ({"factors": {"tilt": {"key": "a", "from": 1, "to": 9}}, "design": {"kind": "lhs", "points": 80}}, 2),
+        (
+            {
+                "factors": {"tilt": {"key": "a", "from": 1, "to": 9}},
+                "design": {"kind": "lhs", "points": 80},
+            },
+            2,
+        ),
     ],
 )
 def test_figures_exist_of_every_kind(tmp_path: Path, keys: dict[str, Any], count: int) -> None:
@@ -251,10 +284,18 @@ def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
     part = Summary(0.4, 0.3, 0.5, 8)
     index = [Index("tilt", name, part, part, 1.0) for name in ("cross_arcsec", "roll_arcsec")]
     factors = {"tilt": {"key": "a", "from": 1, "to": 9}}
-    asked = study(factors=factors, design={"kind": "saltelli", "points": 4}, responses=["identified"])
+    asked = study(
+        factors=factors, design={"kind": "saltelli", "points": 4}, responses=["identified"]
+    )
     html = written(filled(tmp_path / "a.sqlite", asked), asked, indices=index)[1]
     assert len(html.images) == 2 + 1
-    assert html.tables["Sobol indices"][1] == ["cross_arcsec", "tilt", "1", "0.4 (0.3..0.5)", "0.4 (0.3..0.5)"]
+    assert html.tables["Sobol indices"][1] == [
+        "cross_arcsec",
+        "tilt",
+        "1",
+        "0.4 (0.3..0.5)",
+        "0.4 (0.3..0.5)",
+    ]
     objectives = [{"response": "cross_arcsec_median"}, {"response": "cost"}]
     wanted = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
     asked = study(factors=factors, optimize=wanted | {"candidates": 4}, responses=["identified"])
@@ -276,7 +317,9 @@ def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
 # What is shown.
 
 
-def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(tmp_path: Path) -> None:
+def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(
+    tmp_path: Path,
+) -> None:
     asked = study(factors={"dome": DOME, "radius": RADIUS, "ring": RING})
     lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
     curve = Curve(kind="curve", x="radius", y="identified", by="dome")
@@ -296,7 +339,8 @@ def test_what_is_drawn_is_what_was_arranged(tmp_path: Path) -> None:
     from matplotlib.figure import Figure as Canvas
 
     asked = study(replicates=10)  # too few for a median's interval at every point
-    lines, fig = lines_of(filled(tmp_path / "s.sqlite", asked), asked), Canvas()
+    lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
+    fig = Canvas()
     curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
     figures.draw_curve(fig, lines, curve, asked)
     (axes,) = fig.axes
@@ -310,9 +354,12 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_nee
     from matplotlib.figure import Figure as Canvas
 
     nan = math.nan
-    levels = zip([20, 0, 10], [(5, 4, 9, 70, 0), (3, 0, 6, 70, 0), (8, nan, nan, 40, 19)], strict=True)
+    levels = zip(
+        [20, 0, 10], [(5, 4, 9, 70, 0), (3, 0, 6, 70, 0), (8, nan, nan, 40, 19)], strict=True
+    )
     lines = [
-        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told)}, 70) for n, (one, told) in enumerate(levels)
+        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told)}, 70)
+        for n, (one, told) in enumerate(levels)
     ]
     for log in (False, True):
         fig = Canvas()
@@ -320,11 +367,17 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_nee
         figures.draw_curve(fig, lines, curve, study())
         (axes,) = fig.axes
         low = axes.get_ylim()[0]
-        ends = {round(one[0, 0]): sorted(one[:, 1]) for one in axes.collections[0].get_segments() if len(one)}
+        ends = {
+            round(one[0, 0]): sorted(one[:, 1])
+            for one in axes.collections[0].get_segments()
+            if len(one)
+        }
         assert ends[20] == [4, 9]
         assert ends[0][0] == (low / 10 if log else 0)
         assert np.isnan(ends.get(10, [nan])).all()
-        assert "none where a point needs up to 19 more trials" in layout.caption(curve, study(), lines)
+        assert "none where a point needs up to 19 more trials" in layout.caption(
+            curve, study(), lines
+        )
 
 
 def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
@@ -341,19 +394,43 @@ def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
     (axes,) = fig.axes
     joined = next(line for line in axes.lines if line.get_linestyle() == "-")
     assert joined.get_ydata() == pytest.approx([3, np.nan, 5], nan_ok=True)
-    hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
-    assert [(line.get_xdata().tolist(), line.get_ydata().tolist()) for line in hollow] == [([10], [4.0])]
+    hollow = [
+        line
+        for line in axes.lines
+        if line.get_markerfacecolor() == "white" and len(line.get_xdata())
+    ]
+    assert [(line.get_xdata().tolist(), line.get_ydata().tolist()) for line in hollow] == [
+        ([10], [4.0])
+    ]
     assert [text.get_text() for text in axes.texts] == ["n=12"]
-    assert "Hollow, without a line: few of the point's trials" in layout.caption(curve, study(), lines)
-    heat = layout.grid(lines, Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"), study())
-    assert [[bool(heat.few[n, n]), int(heat.values[n, n])] for n in range(3)] == [[False, 60], [True, 12], [False, 50]]
+    assert "Hollow, without a line: few of the point's trials" in layout.caption(
+        curve, study(), lines
+    )
+    heat = layout.grid(
+        lines, Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"), study()
+    )
+    assert [[bool(heat.few[n, n]), int(heat.values[n, n])] for n in range(3)] == [
+        [False, 60],
+        [True, 12],
+        [False, 50],
+    ]
 
 
 @pytest.mark.parametrize(
     ("values", "trials", "few"),
-    [(60, 60, False), (30, 60, False), (29, 60, True), (9, 10, False), (4, 6, True), (3, 3, False), (0, 60, False)],
+    [
+        (60, 60, False),
+        (30, 60, False),
+        (29, 60, True),
+        (9, 10, False),
+        (4, 6, True),
+        (3, 3, False),
+        (0, 60, False),
+    ],
 )
-def test_few_is_less_than_half_or_less_than_five_of_more(values: int, trials: int, few: bool) -> None:
+def test_few_is_less_than_half_or_less_than_five_of_more(
+    values: int, trials: int, few: bool
+) -> None:
     row = PointRow(0, {}, {"nees_mean": Summary(1.0, 1.0, 1.0, values)}, trials)
     assert has_few_values(row, "nees_mean") == few
 
@@ -369,7 +446,9 @@ def test_shares_are_drawn_from_zero_to_one() -> None:
     assert fig.axes[0].get_ylim() == (-0.03, 1.03)
     heat = Heat(kind="heat", x="tilt", y="tilt", value="identified")
     scales = [color_scale(np.array(values), heat) for values in ([0.3, 0.31], [0.9, 1.0], [])]
-    assert {(one["cmap"], one["norm"].vmin, one["norm"].vmax) for one in scales} == {("cividis", 0, 1)}
+    assert {(one["cmap"], one["norm"].vmin, one["norm"].vmax) for one in scales} == {
+        ("cividis", 0, 1)
+    }
     other = color_scale(np.array([3.0, 9.0]), heat.model_copy(update={"value": "nees_mean"}))
     assert (other["cmap"] != "cividis", other["norm"].vmin, other["norm"].vmax) == (True, 3, 9)
 
@@ -377,8 +456,12 @@ def test_shares_are_drawn_from_zero_to_one() -> None:
 def test_a_curve_of_nees_has_a_line_at_three() -> None:
     from matplotlib.figure import Figure as Canvas
 
-    lines = [PointRow(n, {"tilt": tilt}, {"nees": Summary(9.0, 8.0, 10.0, 99)}, 99) for n, tilt in enumerate((0, 10))]
-    curve, fig = Curve(kind="curve", x="tilt", y="nees"), Canvas()
+    lines = [
+        PointRow(n, {"tilt": tilt}, {"nees": Summary(9.0, 8.0, 10.0, 99)}, 99)
+        for n, tilt in enumerate((0, 10))
+    ]
+    curve = Curve(kind="curve", x="tilt", y="nees")
+    fig = Canvas()
     figures.draw_curve(fig, lines, curve, study())
     (axes,) = fig.axes
     assert [one.get_ydata() for one in axes.lines if one.get_linestyle() == ":"] == [[3, 3]]
@@ -394,13 +477,17 @@ def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Pa
     cell = layout.grid(lines, heat, asked)
     assert (cell.x.levels, cell.y.levels) == ([0, 10, 20], ["sphere", "flat", "cube"])
     # Tilts stand in the file as 20, 0, 10; the last point, cube at 10 degrees, is not done.
-    assert cell.value == pytest.approx(np.array([[2, 3, 1], [5, 6, 4], [8, np.nan, 7.0]]), nan_ok=True)
+    assert cell.value == pytest.approx(
+        np.array([[2, 3, 1], [5, 6, 4], [8, np.nan, 7.0]]), nan_ok=True
+    )
 
 
 def test_axes_know_numbers_quantities_names_and_lists() -> None:
     def axis(factor: dict[str, Any], levels: list[Any]) -> axes.Axis:
         return axes.axis(
-            study(factors={"a": factor}), [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)], "a"
+            study(factors={"a": factor}),
+            [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)],
+            "a",
         )
 
     quantity = axis(RADIUS, ["96 in", "24 in", "48 in"])
@@ -409,13 +496,19 @@ def test_axes_know_numbers_quantities_names_and_lists() -> None:
     assert rings[:3] == ("a [deg]", [[10, 20], [0, 10]], False)
     assert rings.coordinate([0, 10]) == 1
     assert axis({"key": "x", "values": [True, False]}, [False, True])[1:3] == ([True, False], False)
-    assert axis({"key": "x", "values": ["1 m", "1 ft"]}, ["1 ft", "1 m"])[1:3] == (["1 m", "1 ft"], False)
+    assert axis({"key": "x", "values": ["1 m", "1 ft"]}, ["1 ft", "1 m"])[1:3] == (
+        ["1 m", "1 ft"],
+        False,
+    )
     steps = {"key": "x", "from": 1, "to": 1000}
     assert [axis(steps | {"scale": one}, [1, 10, 100, 1000]).log for one in ("linear", "log")] == [
         False,
         True,
     ]
-    assert [axis({"key": "x", "values": v}, v).log for v in ([50, 100, 200, 800], [0, 1, 10, 100], [1, 5, 9, 13])] == [
+    assert [
+        axis({"key": "x", "values": v}, v).log
+        for v in ([50, 100, 200, 800], [0, 1, 10, 100], [1, 5, 9, 13])
+    ] == [
         True,
         False,
         False,
@@ -446,13 +539,21 @@ def test_figures_that_nobody_named_follow_from_the_factors() -> None:
     def chosen(**keys: Any) -> list[tuple[Any, ...]]:
         asked = study(responses=["wrong"], **keys)
         tried = points(asked)
-        lines = [PointRow(n, one.levels, {"wrong": Summary(0.0, 0.0, 0.1, 9)}) for n, one in enumerate(tried)]
-        return [tuple(one.model_dump(exclude={"where", "log"}).values()) for one in layout.figures(asked, lines)]
+        lines = [
+            PointRow(n, one.levels, {"wrong": Summary(0.0, 0.0, 0.1, 9)})
+            for n, one in enumerate(tried)
+        ]
+        return [
+            tuple(one.model_dump(exclude={"where", "log"}).values())
+            for one in layout.figures(asked, lines)
+        ]
 
     assert chosen() == [("curve", "tilt", "wrong", None)]
     assert chosen(factors={"dome": DOME, "tilt": TILT}) == [("curve", "tilt", "wrong", "dome")]
     assert chosen(factors={"tilt": TILT, "n": many}) == [("heat", "tilt", "n", "wrong")]
-    assert chosen(factors={"tilt": TILT, "dome": DOME, "n": many}) == [("curve", "tilt", "wrong", "dome")]
+    assert chosen(factors={"tilt": TILT, "dome": DOME, "n": many}) == [
+        ("curve", "tilt", "wrong", "dome")
+    ]
     assert chosen(factors={"tilt": {"key": "x", "values": [5]}}) == []
     drawn = {"factors": {"n": many, "dome": DOME}, "design": {"kind": "lhs", "points": 9}}
     assert chosen(**drawn) == [("curve", "n", "wrong", None), ("curve", "dome", "wrong", None)]
@@ -470,16 +571,28 @@ def test_drawn_factors_part_points_into_equal_bands() -> None:
     ]
     shown = layout.series(lines, Curve(kind="curve", x="x", y="nees_mean", by="b"), asked)
     assert [len(one.x) for one in shown] == [10] * 4
-    assert all(before.value.max() < after.value.min() for before, after in itertools.pairwise(shown))
+    assert all(
+        before.value.max() < after.value.min() for before, after in itertools.pairwise(shown)
+    )
     assert all((np.diff(one.x) > 0).all() for one in shown)
 
 
 def test_a_search_is_shown_by_candidate_with_its_bounds() -> None:
-    constraints = [{"response": "cost", "at_most": 9}, {"response": "wrong", "at_least": 0, "at_most": 0.1}]
-    asked = study(optimize={"objectives": [{"response": "identified", "better": "more"}], "constraints": constraints})
+    constraints = [
+        {"response": "cost", "at_most": 9},
+        {"response": "wrong", "at_least": 0, "at_most": 0.1},
+    ]
+    asked = study(
+        optimize={
+            "objectives": [{"response": "identified", "better": "more"}],
+            "constraints": constraints,
+        }
+    )
     assert asked.optimize is not None
     responses = {"identified": Summary(0.5, 0.4, 0.6, 9), "wrong": Summary(0.2, 0.1, 0.3, 9)}
-    panels = layout.panels([PointRow(n, {"tilt": n}, responses) for n in (0, 1)], asked.optimize, {1: 4.0})
+    panels = layout.panels(
+        [PointRow(n, {"tilt": n}, responses) for n in (0, 1)], asked.optimize, {1: 4.0}
+    )
     assert list(panels) == ["identified", "cost", "wrong"]
     assert panels["identified"].label == "identified [share], more is better"
     assert panels["cost"].value == pytest.approx([np.nan, 4.0], nan_ok=True)

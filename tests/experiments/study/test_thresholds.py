@@ -41,7 +41,13 @@ def logistic(x: np.ndarray, middle: float, width: float) -> np.ndarray:
 
 
 def counted(hits: list[int], trials: int = 400, limit: float = 0.95, log: bool = False) -> Crossing:
-    return crossing(LEVELS[: len(hits)] + log, np.array(hits, float), np.full(len(hits), float(trials)), limit, log)
+    return crossing(
+        LEVELS[: len(hits)] + log,
+        np.array(hits, float),
+        np.full(len(hits), float(trials)),
+        limit,
+        log,
+    )
 
 
 def test_a_line_between_two_levels_crosses_where_it_should() -> None:
@@ -53,11 +59,14 @@ def test_a_line_between_two_levels_crosses_where_it_should() -> None:
     rising = crossing(np.array([1.0, 2, 4, 6, 8]), hits, np.full(5, 400.0), 0.95)
     assert rising.value == pytest.approx(4 + 2 * 0.75)
     assert (rising.low, rising.high, rising.rising) == (4, 6, True)
-    assert counted([400, 400, 400, 400, 400, 320, 200, 100], log=True).value == pytest.approx(5 * (7 / 5) ** 0.25)
+    assert counted([400, 400, 400, 400, 400, 320, 200, 100], log=True).value == pytest.approx(
+        5 * (7 / 5) ** 0.25
+    )
 
 
 def test_beyond_the_levels_there_is_no_number() -> None:
-    above, below = counted([400] * 8), counted([320, 300, 200, 100, 50, 20, 10, 0])
+    above = counted([400] * 8)
+    below = counted([320, 300, 200, 100, 50, 20, 10, 0])
     assert (above.value, above.low, above.high) == (math.inf, 10, math.inf)
     assert (below.value, below.low, below.high) == (-math.inf, -math.inf, 0)
 
@@ -78,23 +87,29 @@ def test_a_curve_that_falls_and_rises_has_no_threshold() -> None:
 
 def test_noise_of_a_monotonic_curve_is_no_misfit() -> None:
     """Of 500 falling curves drawn with 100 trials a level, at most one in a hundred is called not monotonic."""
-    rng, truth = np.random.default_rng(4), logistic(LEVELS, 5.0, 1.0)
+    rng = np.random.default_rng(4)
+    truth = logistic(LEVELS, 5.0, 1.0)
     draws = rng.binomial(100, truth, size=(500, 8)).astype(float)
-    missed = sum(math.isnan(crossing(LEVELS, hits, np.full(8, 100.0), 0.95).value) for hits in draws)
+    missed = sum(
+        math.isnan(crossing(LEVELS, hits, np.full(8, 100.0), 0.95).value) for hits in draws
+    )
     assert missed <= 5
 
 
 @pytest.mark.parametrize(("middle", "width"), [(6.0, 0.6), (7.0, 1.2), (9.0, 0.2)])
 def test_the_interval_holds_the_truth_as_often_as_promised(middle: float, width: float) -> None:
     """Logistic curves cross 0.95 at middle - width ln 19. Of 600 draws each, at least 95 % to four standard errors."""
-    rng, truth = np.random.default_rng(7), middle - width * math.log(19)
+    rng = np.random.default_rng(7)
+    truth = middle - width * math.log(19)
     draws = rng.binomial(100, logistic(LEVELS, middle, width), size=(600, 8)).astype(float)
     found = [crossing(LEVELS, hits, np.full(8, 100.0), 0.95) for hits in draws]
     inside = np.mean([one.low <= truth <= one.high for one in found])
     assert inside >= 0.95 - 4 * math.sqrt(0.95 * 0.05 / 600)
 
 
-def test_the_interval_is_wrong_no_more_often_than_promised_where_a_level_is_just_below_the_limit() -> None:
+def test_the_interval_is_wrong_no_more_often_than_promised_where_a_level_is_just_below_the_limit() -> (
+    None
+):
     """The hardest case, a level at 0.949: it is called certainly above in at most 2.5 % of 2,000 draws."""
     rng = np.random.default_rng(8)
     truth = np.array([1.0, 1.0, 0.949, 0.5, 0.1, 0, 0, 0])
@@ -108,12 +123,16 @@ def test_the_estimate_approaches_the_truth() -> None:
     """With 10^5 trials and levels each tenth: to a third of a step."""
     x = np.arange(0, 10, 0.1)
     hits = np.random.default_rng(9).binomial(100_000, logistic(x, 6.0, 0.8)).astype(float)
-    assert crossing(x, hits, np.full(len(x), 1e5), 0.95).value == pytest.approx(6 - 0.8 * math.log(19), abs=0.03)
+    assert crossing(x, hits, np.full(len(x), 1e5), 0.95).value == pytest.approx(
+        6 - 0.8 * math.log(19), abs=0.03
+    )
 
 
 def test_the_isotonic_fit_pools_neighbors_that_violate_the_order() -> None:
     """By hand: 0.9 of 10 trials after 0.8 of 30 is pooled to 33 of 40."""
-    fit = thresholds.isotonic(np.array([1.0, 0.8, 0.9, 0.1]), np.array([10.0, 30, 10, 10]), rising=False)
+    fit = thresholds.isotonic(
+        np.array([1.0, 0.8, 0.9, 0.1]), np.array([10.0, 30, 10, 10]), rising=False
+    )
     assert fit == pytest.approx([1, 33 / 40, 33 / 40, 0.1])
 
 
@@ -122,7 +141,11 @@ def test_the_isotonic_fit_pools_neighbors_that_violate_the_order() -> None:
 
 def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[PointRow]:
     return [
-        PointRow(n, {"rate": rate, "chain": chain}, {"identified": metrics.proportion(round(p * trials), trials)})
+        PointRow(
+            n,
+            {"rate": rate, "chain": chain},
+            {"identified": metrics.proportion(round(p * trials), trials)},
+        )
         for chain, curve in shares.items()
         for n, (rate, p) in enumerate(zip(LEVELS.astype(int).tolist(), curve, strict=True))
     ]
@@ -153,7 +176,9 @@ def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> No
     """A point without trials is left out; two levels are the least."""
     study = Study.model_validate(STUDY)
     line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": metrics.proportion(9, 10)})
-    other = line._replace(levels={"rate": 1, "chain": "slow"}, responses={"identified": metrics.NO_VALUE})
+    other = line._replace(
+        levels={"rate": 1, "chain": "slow"}, responses={"identified": metrics.NO_VALUE}
+    )
     assert thresholds.sentences(study.thresholds[0], study, [line, other]) == [
         "chain = slow: identified has no trials at two levels of rate yet."
     ]
@@ -162,14 +187,19 @@ def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> No
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"response": "nees"}, r"thresholds.0.response: nees is no proportion; allowed: identified.*\(.*line 2\d\)"),
+        (
+            {"response": "nees"},
+            r"thresholds.0.response: nees is no proportion; allowed: identified.*\(.*line 2\d\)",
+        ),
         ({"along": "chain", "by": None}, "thresholds.0.along: chain has no two numeric levels"),
         ({"along": "speed"}, "thresholds.0.along: unknown factor 'speed'; allowed: rate, chain"),
         ({"limit": 1.5}, "thresholds.0.limit: 1.5 is not allowed"),
         ({"where": {"rate": 99}}, "thresholds.0.where.rate: unknown level 99; allowed: 0, 1"),
     ],
 )
-def test_a_threshold_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
+def test_a_threshold_that_cannot_be_is_refused(
+    tmp_path: Path, change: dict[str, Any], complaint: str
+) -> None:
     tree = STUDY | {"thresholds": [STUDY["thresholds"][0] | change]}
     path = tmp_path / "study.yaml"
     path.write_text(yaml.safe_dump(tree, sort_keys=False))
@@ -178,9 +208,12 @@ def test_a_threshold_that_cannot_be_is_refused(tmp_path: Path, change: dict[str,
 
 
 @pytest.mark.parametrize(
-    ("share", "limit", "needed"), [(1.0, 0.9, 36), (1.0, 0.95, 72), (1.0, 0.99, 368), (0.0, 0.95, 2), (0.98, 0.95, 0)]
+    ("share", "limit", "needed"),
+    [(1.0, 0.9, 36), (1.0, 0.95, 72), (1.0, 0.99, 368), (0.0, 0.95, 2), (0.98, 0.95, 0)],
 )
-def test_a_limit_needs_as_many_trials_as_its_exact_bound(share: float, limit: float, needed: int) -> None:
+def test_a_limit_needs_as_many_trials_as_its_exact_bound(
+    share: float, limit: float, needed: int
+) -> None:
     """ceil(ln 0.025 / ln limit): 36 at 90 %, 72 at 95 %, 368 at 99 %; of 98 % the fewest n by the binomial tail."""
     found = thresholds.trials_needed(share, limit, above=share > limit)
     if needed:
@@ -212,7 +245,9 @@ def test_two_trials_give_two_levels_and_no_number() -> None:
 
 
 def test_a_threshold_is_one_of_a_proportion() -> None:
-    assert Threshold.model_validate({"response": "coverage_4", "limit": 0.9, "along": "x"}).axes == {
+    assert Threshold.model_validate(
+        {"response": "coverage_4", "limit": 0.9, "along": "x"}
+    ).axes == {
         "along": "x",
         "by": None,
     }

@@ -29,14 +29,20 @@ def test_a_trial_is_the_same_whatever_was_tried_before():
     settings = {"trial.false_lights": 3}
     first = trials.run_segments(SKY, (trials.Segment(5, settings, 500, range(0, 20)),))
     again = trials.run_segments(
-        SKY, (trials.Segment(5, settings, 513, range(13, 14)), trials.Segment(5, settings, 500, range(1)))
+        SKY,
+        (
+            trials.Segment(5, settings, 513, range(13, 14)),
+            trials.Segment(5, settings, 500, range(1)),
+        ),
     )
     assert [row[:8] for row in again] == [row[:8] for row in (first[13], first[0])]
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME], ids=["sky", "dome"])
 def test_trials_without_noise_are_solved(spec: TrialSpec) -> None:
-    for row in trials.run_segments(spec, (trials.Segment(0, {"trial.noise_px": 0.0}, 0, range(3)),)):
+    for row in trials.run_segments(
+        spec, (trials.Segment(0, {"trial.noise_px": 0.0}, 0, range(3)),)
+    ):
         assert (row.error, row.outcome.status, row.outcome.wrong) == (None, "solved", 0)
 
 
@@ -47,7 +53,9 @@ def test_pairs_of_points_share_attitude_and_noise_unless_told_otherwise():
 
 
 def test_what_a_trial_raises_is_in_its_row_with_its_seed():
-    row = trials.run_segments(SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),))[0]
+    row = trials.run_segments(
+        SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),)
+    )[0]
     assert row.outcome.status == "failed"
     assert row.outcome.frames == 0
     assert "camera.focal_length" in row.error
@@ -80,14 +88,18 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
     """Of the site at the scene's start, by astropy's AltAz."""
     site = {"latitude_deg": 53.1, "longitude_deg": 8.8}
     near = {"body": "zenith", "off_deg": [57.0, 63.0]}
-    ready = setups.prepared_setup(SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near})
+    ready = setups.prepared_setup(
+        SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near}
+    )
     rng = np.random.default_rng(4)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(200)])
     x, y, z = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1])).T
     place = EarthLocation.from_geodetic(8.8, 53.1)
     with iers.conf.set_temp("auto_download", False):
         boresight = SkyCoord(np.arctan2(y, x) * u.rad, np.arcsin(z) * u.rad)
-        altitude_deg = boresight.transform_to(AltAz(location=place, obstime=Time("2012-10-29T22:00:00"))).alt.deg
+        altitude_deg = boresight.transform_to(
+            AltAz(location=place, obstime=Time("2012-10-29T22:00:00"))
+        ).alt.deg
     assert altitude_deg.min() > 27 - 0.01  # aberration
     assert altitude_deg.max() < 33 + 0.01
     assert altitude_deg.std() > 1
@@ -119,12 +131,17 @@ def test_any_turn_about_the_boresight_is_as_likely_as_another():
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     seen = drawn.inv().apply([0, 0, 1])
     assert np.degrees(np.arccos(seen[:, 2])) == pytest.approx(20, abs=1e-9)
-    assert stats.kstest(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) % 1, "uniform").pvalue > 1e-4
+    assert (
+        stats.kstest(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) % 1, "uniform").pvalue > 1e-4
+    )
 
 
 @pytest.mark.parametrize("angles", [(0.3, 1.1, -2.0), (3.0, 0.0, 1.0), (-1.0, math.pi, 0.2)])
 def test_three_turns_are_scipys(angles):
-    off = Rotation.from_quat(trials.zyz(*angles), scalar_first=True) * Rotation.from_euler("ZYZ", angles).inv()
+    off = (
+        Rotation.from_quat(trials.zyz(*angles), scalar_first=True)
+        * Rotation.from_euler("ZYZ", angles).inv()
+    )
     assert off.magnitude() < 1e-14
 
 
@@ -137,22 +154,32 @@ def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
     _, truth = render_at_rest(lab.camera, lab_from_body)
     xy_px, electrons = detections.visible_sources(lab, lab_from_body)
     size_px = np.array(lab.camera.canvas.shape[::-1])
-    inner = np.flatnonzero(((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1))
+    inner = np.flatnonzero(
+        ((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1)
+    )
     assert len(inner) >= 5
     for n in inner:
         off = np.hypot(*(xy_px - truth.sources.xy_px[n]).T)
         assert off.min() < 1e-9
         # Patches are cut where an image is spent; PWM is lit for whole pulses or parts of one.
-        assert electrons[off.argmin()] == pytest.approx(truth.sources.electrons[n], rel=0.11 if spec is DOME else 0.01)
+        assert electrons[off.argmin()] == pytest.approx(
+            truth.sources.electrons[n], rel=0.11 if spec is DOME else 0.01
+        )
 
 
 def test_what_is_spoilt_is_spoilt_as_told():
     """Noise, share missed, false lights: mean and spread over many fields."""
     ready = setups.prepared_setup(SKY, {})
-    trial = CentroidTrial(kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0)
-    xy_px, electrons = np.full((40, 2), 300.0), np.linspace(1e5, 2e5, 40)
+    trial = CentroidTrial(
+        kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0
+    )
+    xy_px = np.full((40, 2), 300.0)
+    electrons = np.linspace(1e5, 2e5, 40)
     rng = np.random.default_rng(6)
-    seen = [detections.simulate_detections(trial, xy_px, electrons, ready.lab.scene, rng) for _ in range(400)]
+    seen = [
+        detections.simulate_detections(trial, xy_px, electrons, ready.lab.scene, rng)
+        for _ in range(400)
+    ]
     true = [np.hypot(*(one.xy_px - 300).T) < 3 for one in seen]
     kept = sum(int(one.sum()) for one in true)
     assert kept / (400 * 40) == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 16_000))
@@ -186,7 +213,10 @@ CODED = TrialSpec("coded_spiral", ".", 1, {}, {"kind": "centroids"}, True)
 
 def coded(settings: dict[str, Any], count: int) -> list[Any]:
     """Outcomes of trials under the spiral of 400 coded LEDs."""
-    return [row.outcome for row in trials.run_segments(CODED, (trials.Segment(0, settings, 0, range(count)),))]
+    return [
+        row.outcome
+        for row in trials.run_segments(CODED, (trials.Segment(0, settings, 0, range(count)),))
+    ]
 
 
 CODES = [
@@ -200,8 +230,11 @@ CODES = [
 def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     """Of frame 7, over the mean light of each LED: bits, edges of bits, pulses."""
     ready = setups.prepared_setup(CODED, {"light.led.code": code})
-    lab, lab_from_body = ready.lab.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
-    ((rows, xy_px, electrons),) = detections.visible_rows(lab, Rotation.concatenate([lab_from_body]))
+    lab = ready.lab.in_run(5)
+    lab_from_body = Rotation.from_rotvec([0.1, 0.05, 1.0])
+    ((rows, xy_px, electrons),) = detections.visible_rows(
+        lab, Rotation.concatenate([lab_from_body])
+    )
     light_e = electrons * detections.brightness(lab, rows, 7)
     _, truth = render_at_rest(lab.camera, lab_from_body, 7)
     size_px = np.array(lab.camera.canvas.shape[::-1])
@@ -209,7 +242,9 @@ def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     assert len(inner) >= 2
     for n in inner:
         off_px = np.hypot(*(truth.sources.xy_px - xy_px[n]).T)
-        rendered_e = truth.sources.electrons[off_px.argmin()] if off_px.min() < 0.5 else 0.0  # a dark LED is no source
+        rendered_e = (
+            truth.sources.electrons[off_px.argmin()] if off_px.min() < 0.5 else 0.0
+        )  # a dark LED is no source
         assert light_e[n] == pytest.approx(rendered_e, rel=0.01, abs=1)
 
 
@@ -233,9 +268,14 @@ def test_codes_without_light_to_read_them_are_refused_not_guessed():
 @pytest.mark.slow
 def test_centroid_trials_err_as_much_as_theory_says():
     """QUEST's covariance holds: mean NEES of three degrees of freedom, to five standard errors."""
-    spec = replace(SKY, base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5})
+    spec = replace(
+        SKY,
+        base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5},
+    )
     rows = trials.run_segments(spec, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),))
-    nees = np.array([row.outcome.nees for row in rows if row.outcome.solved and not row.outcome.wrong])
+    nees = np.array(
+        [row.outcome.nees for row in rows if row.outcome.solved and not row.outcome.wrong]
+    )
     assert len(nees) > 350
     assert nees.mean() == pytest.approx(3, abs=5 * math.sqrt(6 / len(nees)))
 
@@ -249,7 +289,9 @@ def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     _, truth, told_px = trials.render_trial_frame(ready, 77)
     wanted = math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
     assert math.hypot(*told_px) == pytest.approx(wanted, rel=1e-12)
-    middle = np.argmin(np.hypot(*(truth.sources.xy_px - np.array(ready.lab.camera.canvas.shape[::-1]) / 2).T))
+    middle = np.argmin(
+        np.hypot(*(truth.sources.xy_px - np.array(ready.lab.camera.canvas.shape[::-1]) / 2).T)
+    )
     assert truth.sources.streak_px[middle] == pytest.approx(wanted, rel=0.03)
     came = trials.run_frame_trial(ready, 77)
     assert came.frames == 1
@@ -270,7 +312,9 @@ def test_a_flight_counts_its_frames_after_it_settled():
 @pytest.mark.slow
 def test_a_flights_filter_is_scored_at_every_tick():
     told = {
-        **{"vehicle.imu": {}, "filter": {"start_deg": 0.1}, "exposure.frames": 4},
+        "vehicle.imu": {},
+        "filter": {"start_deg": 0.1},
+        "exposure.frames": 4,
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
     spec = replace(DOME, base=told, trial={"kind": "flight"})
@@ -302,7 +346,10 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     model = tmp_path / "ship.xml"
     text = (SCENES / "vehicles" / "shefex2.xml").read_text()
     model.write_text(text)
-    told = [setups.scene_hash(plan.resolve_point(SKY, sets)[0]) for sets in ({}, {"camera.f_number": 1.5}, {})]
+    told = [
+        setups.scene_hash(plan.resolve_point(SKY, sets)[0])
+        for sets in ({}, {"camera.f_number": 1.5}, {})
+    ]
     assert told[0] == told[2] != told[1]
     own = {"vehicle.model": str(model)}
     first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
@@ -339,10 +386,15 @@ def test_a_frame_turns_about_the_axis_that_is_named(axis, frame, expected):
 
 def test_a_turn_about_the_boresight_leaves_its_star_where_it_is():
     """Streaks grow with the distance from the image's center: rate x exposure x distance."""
-    ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0})
+    ready = setups.prepared_setup(
+        FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0}
+    )
     _, truth, streak_px = trials.render_trial_frame(ready, 3)
-    sources, camera = truth.sources, ready.lab.scene.camera
-    distance_px = np.hypot(*(sources.xy_px - [(camera.width_px - 1) / 2, (camera.height_px - 1) / 2]).T)
+    sources = truth.sources
+    camera = ready.lab.scene.camera
+    distance_px = np.hypot(
+        *(sources.xy_px - [(camera.width_px - 1) / 2, (camera.height_px - 1) / 2]).T
+    )
     swept = np.radians(20.0) * ready.lab.scene.exposure.time_s * distance_px
     near = distance_px < 150  # where tan is its angle
     assert near.sum() > 3
@@ -393,7 +445,10 @@ AT_REST = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames"}, True)
 def test_a_turn_is_about_the_rates_axis():
     """By this angle across the boresight, the same axis at every angle; other attitudes have another seed."""
     first, small, large = (rendered({"trial.turn_deg": turn}) for turn in (0.0, 0.5, 2.0))
-    turns = [(one.cam_from_lab * first.cam_from_lab.inv()).as_rotvec(degrees=True) for one in (small, large)]
+    turns = [
+        (one.cam_from_lab * first.cam_from_lab.inv()).as_rotvec(degrees=True)
+        for one in (small, large)
+    ]
     assert np.linalg.norm(turns, axis=1) == pytest.approx([0.5, 2.0], rel=1e-9)
     assert turns[0] * 4 == pytest.approx(turns[1], abs=1e-9)
     assert turns[0][2] == pytest.approx(0, abs=1e-12)
@@ -405,11 +460,14 @@ def test_a_turn_is_about_the_rates_axis():
 
 def test_accelerated_lights_are_seen_where_the_law_puts_them():
     """From rest at mid-exposure they move by a t^2 / 2: their mean is a T^2 / 24 away, and they are a T^2 / 8 long."""
-    acceleration, time_s = 200.0, 0.04
+    acceleration = 200.0
+    time_s = 0.04
     truth = rendered({"trial.acceleration_deg_s2": acceleration})
     focal_px = 25e-3 / 9.9e-6
     sources = truth.sources
-    near = np.hypot(*(sources.xy_px - [329, 246]).T) < 150  # where the image's scale is that of the center
+    near = (
+        np.hypot(*(sources.xy_px - [329, 246]).T) < 150
+    )  # where the image's scale is that of the center
     lag_px = np.hypot(*(sources.flux_xy_px - sources.xy_px)[near].T)
     bend_px = np.radians(acceleration) * time_s**2 * focal_px
     assert near.sum() >= 3
@@ -430,14 +488,18 @@ def test_tracking_follows_a_motion_until_its_prediction_leaves_the_windows(gyro)
     At 4 px all are found and at 14 px, which is more than 8 px along one axis in any direction, none. A gyro measures
     the acceleration too.
     """
-    pixel_deg, between_s = math.degrees(9.9e-6 / 25e-3), 0.1
+    pixel_deg = math.degrees(9.9e-6 / 25e-3)
+    between_s = 0.1
     accelerations = [missed_px * pixel_deg / between_s**2 for missed_px in (4.0, 14.0)]
     near, far = (
-        tracked_statuses({"trial.acceleration_deg_s2": one, "trial.gyro": gyro}, range(3)) for one in accelerations
+        tracked_statuses({"trial.acceleration_deg_s2": one, "trial.gyro": gyro}, range(3))
+        for one in accelerations
     )
     assert near == ["solved"] * 3
     assert [status.startswith("tracking lost") for status in far] == [not gyro] * 3
-    assert tracked_statuses({"trial.rate_deg_s": 2.0, "trial.gyro": gyro}, range(3)) == ["solved"] * 3
+    assert (
+        tracked_statuses({"trial.rate_deg_s": 2.0, "trial.gyro": gyro}, range(3)) == ["solved"] * 3
+    )
 
 
 def test_a_tracked_frame_has_the_motion_of_its_time():

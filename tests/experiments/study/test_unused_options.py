@@ -31,8 +31,20 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
 @pytest.mark.parametrize(
     ("scene", "trial", "factors", "settings", "told"),
     [
-        ("afit_simsat", "{kind: frames, tracked: 2}", NOISE, "{}", r"trial.tracked: has no effect.*line 6\)"),
-        ("afit_simsat", "{kind: frames, gyro: true}", NOISE, "{}", r"trial.gyro: has no effect.*line 6\)"),
+        (
+            "afit_simsat",
+            "{kind: frames, tracked: 2}",
+            NOISE,
+            "{}",
+            r"trial.tracked: has no effect.*line 6\)",
+        ),
+        (
+            "afit_simsat",
+            "{kind: frames, gyro: true}",
+            NOISE,
+            "{}",
+            r"trial.gyro: has no effect.*line 6\)",
+        ),
         (
             "afit_simsat",
             DOME,
@@ -40,9 +52,27 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
             "{}",
             r"factors.chain: 'with gyro': trial.gyro: has no effect",
         ),
-        ("shefex2", "{kind: centroids, tilt_deg: 20}", NOISE, "{}", r"trial.tilt_deg: has no effect"),
-        ("afit_simsat", "{kind: centroids, dec_deg: [0, 90]}", NOISE, "{}", r"trial.dec_deg: has no effect"),
-        ("afit_simsat", "{kind: centroids, near: {body: moon}}", NOISE, "{}", r"trial.near: has no effect"),
+        (
+            "shefex2",
+            "{kind: centroids, tilt_deg: 20}",
+            NOISE,
+            "{}",
+            r"trial.tilt_deg: has no effect",
+        ),
+        (
+            "afit_simsat",
+            "{kind: centroids, dec_deg: [0, 90]}",
+            NOISE,
+            "{}",
+            r"trial.dec_deg: has no effect",
+        ),
+        (
+            "afit_simsat",
+            "{kind: centroids, near: {body: moon}}",
+            NOISE,
+            "{}",
+            r"trial.near: has no effect",
+        ),
         (
             "shefex2",
             "{kind: frames, dec_deg: [0, 9], near: {body: moon}}",
@@ -50,7 +80,13 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
             "{}",
             r"trial.dec_deg: has no effect",
         ),
-        ("shefex2", "{kind: frames}", NOISE, "{seed: 4}", r"set: seed: has no effect: every trial has its own"),
+        (
+            "shefex2",
+            "{kind: frames}",
+            NOISE,
+            "{seed: 4}",
+            r"set: seed: has no effect: every trial has its own",
+        ),
         (
             "shefex2",
             "{kind: frames}",
@@ -72,7 +108,13 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
             "{exposure.time_tag_jitter: 1 ms}",
             r"set: exposure.time_tag_jitter: has no",
         ),
-        ("shefex2", "{kind: frames}", NOISE, "{exposure.first: 1 s}", r"set: exposure.first: has no effect"),
+        (
+            "shefex2",
+            "{kind: frames}",
+            NOISE,
+            "{exposure.first: 1 s}",
+            r"set: exposure.first: has no effect",
+        ),
         (
             "shefex2",
             "{kind: centroids}",
@@ -87,7 +129,13 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
             "{}",
             r"factors.disk: .*light.led.disk_diameter: has no effect",
         ),
-        ("afit_simsat", DOME, NOISE, "{tracker.limit_mag: 5}", r"set: tracker.limit_mag: has no effect: under a dome"),
+        (
+            "afit_simsat",
+            DOME,
+            NOISE,
+            "{tracker.limit_mag: 5}",
+            r"set: tracker.limit_mag: has no effect: under a dome",
+        ),
         (
             "afit_simsat",
             DOME,
@@ -112,9 +160,24 @@ def test_an_option_without_effect_is_refused(
         ("shefex2", "{kind: frames, gyro: true}", NOISE, "{}"),
         ("afit_simsat", "{kind: frames, gyro: true}", NOISE, "{tracker.detector: default}"),
         ("shefex2", "{kind: frames}", NOISE, "{exposure.frames: 1, exposure.rate_hz: 5}"),
-        ("shefex2", "{kind: flight}", "rate: {key: exposure.frames, values: [4, 5]}", "{motion.rate_deg_s: [1, 0, 0]}"),
-        ("celestial_dome", "{kind: centroids}", 'disk: {key: light.led.disk_diameter, values: ["1 mm", "2 mm"]}', "{}"),
-        ("shefex2", "{kind: frames}", "name: {key: tracker.name, values: [own]}", "{tracker.limit_mag: 6}"),
+        (
+            "shefex2",
+            "{kind: flight}",
+            "rate: {key: exposure.frames, values: [4, 5]}",
+            "{motion.rate_deg_s: [1, 0, 0]}",
+        ),
+        (
+            "celestial_dome",
+            "{kind: centroids}",
+            'disk: {key: light.led.disk_diameter, values: ["1 mm", "2 mm"]}',
+            "{}",
+        ),
+        (
+            "shefex2",
+            "{kind: frames}",
+            "name: {key: tracker.name, values: [own]}",
+            "{tracker.limit_mag: 6}",
+        ),
     ],
 )
 def test_an_option_with_an_effect_is_allowed(
@@ -124,7 +187,9 @@ def test_an_option_with_an_effect_is_allowed(
 
 
 @pytest.mark.parametrize("order", ["[local, default]", "[default, local]"])
-def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(order: str, tmp_path: Path) -> None:
+def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(
+    order: str, tmp_path: Path
+) -> None:
     """Whichever level of the detector is the middle: with one of them the gyro is used."""
     factors = f"detector: {{key: tracker.detector, values: {order}}}, gyro: {{key: trial.gyro, values: [false, true]}}"
     assert loader.load(study(tmp_path, "afit_simsat", DOME, factors)).trials == 8
@@ -135,22 +200,42 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(order
     ("scene", "trial", "settings", "change"),
     [
         ("afit_simsat", DOME, {}, {"trial.gyro": True}),
-        ("shefex2", "{kind: frames}", {"tracker.detector": "local", "tracker.centroider": "cog"}, {"trial.gyro": True}),
-        ("shefex2", "{kind: frames}", {}, {"exposure.frames": 7, "exposure.time_tag_jitter": "1 ms"}),
+        (
+            "shefex2",
+            "{kind: frames}",
+            {"tracker.detector": "local", "tracker.centroider": "cog"},
+            {"trial.gyro": True},
+        ),
+        (
+            "shefex2",
+            "{kind: frames}",
+            {},
+            {"exposure.frames": 7, "exposure.time_tag_jitter": "1 ms"},
+        ),
         (
             "shefex2",
             "{kind: frames}",
             {},
             {"motion.jitter": [{"kind": "line", "frequency_hz": 9, "rms_arcsec": [9, 9, 9]}]},
         ),
-        ("shefex2", "{kind: centroids}", {}, {"camera.detector.read_noise_e": 90, "exposure.time": "3 ms"}),
+        (
+            "shefex2",
+            "{kind: centroids}",
+            {},
+            {"camera.detector.read_noise_e": 90, "exposure.time": "3 ms"},
+        ),
         (
             "shefex2",
             "{kind: centroids}",
             {"camera.chromatic": {"wavelength": ["500 nm", "600 nm"], "corner_px": [0, 1]}},
             {"camera.chromatic.focus": ["0 um", "9 um"]},
         ),
-        ("afit_simsat", CENTROIDS, {}, {"light.led.intensity": "1 mcd", "camera.psf": {"kind": "gaussian"}}),
+        (
+            "afit_simsat",
+            CENTROIDS,
+            {},
+            {"light.led.intensity": "1 mcd", "camera.psf": {"kind": "gaussian"}},
+        ),
     ],
 )
 def test_what_is_refused_changes_no_outcome(

@@ -25,26 +25,44 @@ LAWS = ("inertial", "zenith")
 
 def availability(
     scene: SceneArg,
-    law: Annotated[str, typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it.")] = "inertial",
-    off_deg: Annotated[float, typer.Option(help="Angle of the boresight from the zenith, 180 is nadir.")] = 0.0,
-    around_deg: Annotated[float, typer.Option(help="Its azimuth from the flight direction, left positive.")] = 0.0,
-    span: Annotated[str, typer.Option(help="orbit, day or year, from the scene's start_time.")] = "orbit",
-    samples: Annotated[int, typer.Option(min=10, max=10_000_000, help="Times that are computed.")] = 20_000,
+    law: Annotated[
+        str, typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it.")
+    ] = "inertial",
+    off_deg: Annotated[
+        float, typer.Option(help="Angle of the boresight from the zenith, 180 is nadir.")
+    ] = 0.0,
+    around_deg: Annotated[
+        float, typer.Option(help="Its azimuth from the flight direction, left positive.")
+    ] = 0.0,
+    span: Annotated[
+        str, typer.Option(help="orbit, day or year, from the scene's start_time.")
+    ] = "orbit",
+    samples: Annotated[
+        int, typer.Option(min=10, max=10_000_000, help="Times that are computed.")
+    ] = 20_000,
     overrides: Overrides = None,
-    picture: Annotated[Path | None, typer.Option(help="Also write a picture (.png) of the angles over time.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Also write a picture (.png) of the angles over time.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
     config = load(scene, None, None, overrides)
     if config.orbit is None or config.orbit.exclusion is None:
-        raise InputError("orbit.exclusion", "the scene has none", "a scene with a section orbit with exclusion")
+        raise InputError(
+            "orbit.exclusion", "the scene has none", "a scene with a section orbit with exclusion"
+        )
     for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
         if value not in allowed:
             raise InputError(f"--{name} {value}", "", ", ".join(allowed))
     if law == "inertial" and (off_deg or around_deg):
-        raise InputError("--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith")
+        raise InputError(
+            "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
+        )
     with progress_callback("availability", quiet=json) as watch:
-        found = computed(config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch)
+        found = computed(
+            config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch
+        )
     fractions = fractions_of(found, config)
     if picture is not None:
         write_picture(picture, found, config)
@@ -53,7 +71,10 @@ def availability(
         return
     exclusion = config.orbit.exclusion
     limits = {"Sun": exclusion.sun_deg, "Earth": exclusion.earth_deg, "Moon": exclusion.moon_deg}
-    rows = [[name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"] for name, limit in limits.items()]
+    rows = [
+        [name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"]
+        for name, limit in limits.items()
+    ]
     rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
     rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
     columns = [Column("", kind="text"), Column("condition"), Column("fraction of time")]
@@ -76,7 +97,9 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
     return Pointing("inertial", direction(start.ra_deg, start.dec_deg))
 
 
-def computed(scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any) -> Samples:
+def computed(
+    scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any
+) -> Samples:
     """The angles over the span, or over one revolution."""
     import numpy as np
 
@@ -89,16 +112,28 @@ def computed(scene: Scene, pointing: Pointing, span_s: float | None, samples: in
     assert orbit is not None
     if span_s is None:
         first = orbit.states(np.zeros(1))
-        energy = np.sum(first.velocity_m_s**2) / 2 - EARTH_MU_M3_S2 / np.linalg.norm(first.position_m)
+        energy = np.sum(first.velocity_m_s**2) / 2 - EARTH_MU_M3_S2 / np.linalg.norm(
+            first.position_m
+        )
         if energy >= 0:
             raise InputError("--span orbit", "this orbit is not closed", "day, year")
         span_s = float(2 * np.pi * EARTH_MU_M3_S2 / (-2 * energy) ** 1.5)
     t_s = np.asarray((np.arange(samples) + 0.5) * (span_s / samples), float)
-    known = catalog.read_for("tracker.catalog", scene.tracker.catalog).to_limit(scene.tracker.limit_mag)
+    known = catalog.read_for("tracker.catalog", scene.tracker.catalog).to_limit(
+        scene.tracker.limit_mag
+    )
     camera = scene.camera
     area_px = camera.width_px * camera.height_px
     field_rad = math.atan(math.sqrt(area_px / math.pi) / camera.focal_px)
-    return sample(orbit, scene.start_time, t_s, pointing, stars.apparent(known, scene.start_time), field_rad, watch)
+    return sample(
+        orbit,
+        scene.start_time,
+        t_s,
+        pointing,
+        stars.apparent(known, scene.start_time),
+        field_rad,
+        watch,
+    )
 
 
 def fractions_of(found: Samples, scene: Scene) -> dict[str, float]:
@@ -121,7 +156,8 @@ def write_picture(path: Path, found: Samples, scene: Scene) -> None:
 
     assert scene.orbit is not None
     assert scene.orbit.exclusion is not None
-    exclusion, hours = scene.orbit.exclusion, found.t_s / HOUR_S
+    exclusion = scene.orbit.exclusion
+    hours = found.t_s / HOUR_S
     curves = (
         ("Sun", found.sun_deg, exclusion.sun_deg),
         ("Earth's limb", found.earth_deg, exclusion.earth_deg),
@@ -134,7 +170,15 @@ def write_picture(path: Path, found: Samples, scene: Scene) -> None:
             axes.plot(hours, angle_deg, color=color, label=name)
             axes.axhline(limit_deg, color=color, linestyle=":", linewidth=0.8)
         free = np.all(list(found.outside(exclusion).values()), axis=0)
-        axes.fill_between(hours, 0, 1, where=free, transform=axes.get_xaxis_transform(), color="#009e73", alpha=0.15)
+        axes.fill_between(
+            hours,
+            0,
+            1,
+            where=free,
+            transform=axes.get_xaxis_transform(),
+            color="#009e73",
+            alpha=0.15,
+        )
         axes.set(xlabel="time [h]", ylabel="angle from the boresight [deg]")
         axes.legend()
 

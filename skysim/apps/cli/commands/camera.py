@@ -26,7 +26,9 @@ def complete_camera(incomplete: str) -> list[str]:
     """Names of camera presets, scenes and YAML files that begin with what was typed."""
     from skysim.core.paths import DATA
 
-    names = {path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)}
+    names = {
+        path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)
+    }
     return sorted(names | set(complete_scene(incomplete)))
 
 
@@ -42,7 +44,9 @@ class CameraGroup(TyperGroup):
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Subcommands, and what `show` takes."""
-        item = type(super().shell_complete(ctx, "")[0])  # the class of typer's own parser or of click
+        item = type(
+            super().shell_complete(ctx, "")[0]
+        )  # the class of typer's own parser or of click
         names = [] if incomplete.startswith("-") else complete_camera(incomplete)
         return [*super().shell_complete(ctx, incomplete), *map(item, names)]
 
@@ -64,7 +68,11 @@ def cameras(context: typer.Context, json: Json = False) -> None:
     listed = [preset_entry(path) for path in sorted(loader.PRESETS.glob("*.yaml"))]
     width = terminal_width()
     print_list(
-        listed, json, lambda entry: "{name:11s} {size:15s} {pixel:8s} {shutter:10s} {what}".format(**entry)[:width]
+        listed,
+        json,
+        lambda entry: "{name:11s} {size:15s} {pixel:8s} {shutter:10s} {what}".format(**entry)[
+            :width
+        ],
     )
 
 
@@ -96,7 +104,8 @@ def camera_show(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format.")
+        Path | None,
+        typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
     ] = None,
     set_: Overrides = None,
     json: Json = False,
@@ -117,7 +126,11 @@ def camera_show(
         files.make_folder(out.parent)
         files.write_text(out, opencv_calibration.text(lens))
     if json:
-        known = dataclasses.asdict(lens) | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px} if lens else {}
+        known = (
+            dataclasses.asdict(lens) | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
+            if lens
+            else {}
+        )
         print_json(body | known)
         return
     print("size             {width_px} x {height_px} px".format(**body))
@@ -134,18 +147,26 @@ def camera_show(
         print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")
 
 
-def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | None, dict[str, int]]:
+def read_camera(
+    name: str, overrides: list[str] | None
+) -> tuple[Calibration | None, dict[str, int]]:
     """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
     from skysim.core.io.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
     if opencv_calibration.looks_like_calibration(Path(name)):
         if overrides:
-            raise InputError(f"--set {overrides[0]}", f"has no effect: {name} is a calibration", "a scene, a camera")
+            raise InputError(
+                f"--set {overrides[0]}",
+                f"has no effect: {name} is a calibration",
+                "a scene, a camera",
+            )
         lens = opencv_calibration.read(Path(name))
         return lens, {"width_px": lens.width_px, "height_px": lens.height_px}
     values = parse_overrides(overrides)
-    if not Path(name).suffix and name not in (known := loader.list_cameras() + loader.list_scenes()):
+    if not Path(name).suffix and name not in (
+        known := loader.list_cameras() + loader.list_scenes()
+    ):
         problem, names = unknown_name("camera", name, known)
         raise InputError("", problem, f"{names}, or a .yaml file")
     path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
@@ -156,13 +177,18 @@ def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | N
     else:
         camera = loader.load_camera(path, PLACEHOLDER_LENS if alone else None, values)
     has_lens = not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
-    return camera.calibration() if has_lens else None, {"width_px": camera.width_px, "height_px": camera.height_px}
+    return camera.calibration() if has_lens else None, {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+    }
 
 
 def sheet_option(name: str) -> Any:
     """The option of a question of the data sheet."""
     question = QUESTIONS[name]
-    return typer.Option(OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}.")
+    return typer.Option(
+        OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}."
+    )
 
 
 Answer = str | None
@@ -187,8 +213,12 @@ def camera_new(
     read_noise: Annotated[Answer, sheet_option("read_noise")] = None,
     dark_current: Annotated[Answer, sheet_option("dark_current")] = None,
     prnu: Annotated[Answer, sheet_option("prnu")] = None,
-    name: Annotated[str, typer.Option(help="Name of camera, lens and data sheets, for the file's first line.")] = "",
-    out: Annotated[Path, typer.Option(help="The file to write, for the key camera.preset.")] = Path("camera.yaml"),
+    name: Annotated[
+        str, typer.Option(help="Name of camera, lens and data sheets, for the file's first line.")
+    ] = "",
+    out: Annotated[Path, typer.Option(help="The file to write, for the key camera.preset.")] = Path(
+        "camera.yaml"
+    ),
     json: Json = False,
 ) -> None:
     """Write a camera file from the numbers of a data sheet: asks for each; with options, only those are used.
@@ -199,7 +229,9 @@ def camera_new(
     from skysim.scene.data_sheet import sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():
-        raise InputError(f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file")
+        raise InputError(
+            f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
+        )
     answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
     if not answers:
         answers = ask_all()
@@ -216,16 +248,23 @@ def ask_all() -> dict[str, str]:
     """Ask for each number of the data sheet; a wrong answer is asked again, an empty one is not stated."""
     from skysim.scene.data_sheet import sheet
 
-    print("Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated.")
+    print(
+        "Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated."
+    )
     answers: dict[str, str] = {}
     for name, question in QUESTIONS.items():
         required = name in sheet.PLACEHOLDERS
         if not required and name not in sheet.outstanding(answers):
             continue  # of a lens or a shutter that this camera does not have
         assumed = "" if required else sheet.outstanding(answers)[name].assumed or "left out"
-        print(f"\n{question.ask}\n  where: {question.where}" + (f"\n  not stated: {assumed}" if assumed else ""))
+        print(
+            f"\n{question.ask}\n  where: {question.where}"
+            + (f"\n  not stated: {assumed}" if assumed else "")
+        )
         while True:
-            text = typer.prompt(f"  {name.replace('_', '-')}", default="", show_default=False).strip()
+            text = typer.prompt(
+                f"  {name.replace('_', '-')}", default="", show_default=False
+            ).strip()
             try:
                 if text:
                     sheet.outstanding(answers | {name: text})
@@ -241,12 +280,19 @@ def ask_all() -> dict[str, str]:
 def print_new(path: Path, filled: Sheet) -> None:
     """Print what a new camera file assumes, and how to use it."""
     lens, body = read_camera(str(path), None)
-    print("{path}: {width_px} x {height_px} px".format(path=path, **body) + (f"; {lens.field_text()}" if lens else ""))
+    print(
+        "{path}: {width_px} x {height_px} px".format(path=path, **body)
+        + (f"; {lens.field_text()}" if lens else "")
+    )
     if filled.missing:
         print(f"not stated, and assumed in {path}:")
     width = min(max(terminal_width(), 40), 100)
     for one in filled.missing:
         name = one.name.replace("_", " ")
         line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
-        print(textwrap.fill(line, width, initial_indent="  ", subsequent_indent=" " * 21, break_on_hyphens=False))
+        print(
+            textwrap.fill(
+                line, width, initial_indent="  ", subsequent_indent=" " * 21, break_on_hyphens=False
+            )
+        )
     print(f"in a scene: camera: {{preset: {path}}}; skysim camera {path} shows it")

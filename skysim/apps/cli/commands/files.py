@@ -13,7 +13,8 @@ from skysim.results.report.as_text import print_table
 from skysim.results.report.blocks import Column, Table
 
 scenes_app = typer.Typer(
-    invoke_without_command=True, help="List the shipped scenes; show every key of a scene, or export it for MuJoCo."
+    invoke_without_command=True,
+    help="List the shipped scenes; show every key of a scene, or export it for MuJoCo.",
 )
 catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
 
@@ -64,12 +65,14 @@ def scenes_export(
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    lab, use = build_lab(loaded), f"python -m mujoco.viewer --mjcf={path}"
+    lab = build_lab(loaded)
+    use = f"python -m mujoco.viewer --mjcf={path}"
     if path.suffix.lower() == ".csv":
         text, cap_deg = lab.export_leds()
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
     elif (ending := path.suffix.lower()) in templates.TEMPLATES:
-        text, use = templates.template(lab, ending), "print it at 100 %" if ending == ".svg" else "in mm"
+        text = templates.template(lab, ending)
+        use = "print it at 100 %" if ending == ".svg" else "in mm"
     else:
         text = lab.export_mjcf()
     files.make_folder(path.parent)
@@ -81,7 +84,10 @@ def scenes_export(
 def scenes_parts(
     scene: SceneArg,
     prices: Annotated[
-        str, typer.Option(metavar="FILE", help="Table of prices (.csv); `assumed` is the one that comes along.")
+        str,
+        typer.Option(
+            metavar="FILE", help="Table of prices (.csv); `assumed` is the one that comes along."
+        ),
     ] = "assumed",
     out: Annotated[Path | None, typer.Option(help="Also write the list as CSV.")] = None,
     seed: Seed = None,
@@ -102,7 +108,10 @@ def scenes_parts(
         print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
         return
     rows = [*map(parts.cells, found.lines), ["total", "", "", "", "", f"{found.total:.2f}", ""]]
-    columns = [Column(head, kind="text" if head in ("part", "what") else "number") for head in parts.COLUMNS]
+    columns = [
+        Column(head, kind="text" if head in ("part", "what") else "number")
+        for head in parts.COLUMNS
+    ]
     print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
 
 
@@ -110,13 +119,19 @@ def scenes_parts(
 def catalog_build(
     source: Annotated[
         Literal["hipparcos", "gaia"],
-        typer.Option(help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."),
+        typer.Option(
+            help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."
+        ),
     ] = "hipparcos",
     limit: Annotated[
-        float | None, typer.Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0.")
+        float | None,
+        typer.Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs.")
+        Path | None,
+        typer.Option(
+            help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -134,7 +149,9 @@ def catalog_build(
 
 @catalog_app.command("info")
 def catalog_info(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")] = "gaia_v8.0",
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")
+    ] = "gaia_v8.0",
     json: Json = False,
 ) -> None:
     """Show star counts and provenance of a star catalog."""
@@ -144,9 +161,14 @@ def catalog_info(
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
+    ],
     to: Annotated[
-        list[str], typer.Option("--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable.")
+        list[str],
+        typer.Option(
+            "--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."
+        ),
     ],
     out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
     json: Json = False,

@@ -13,19 +13,28 @@ from skysim.core.errors import InputError
 
 def gui(
     scene: SceneArg = "shefex2",
-    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 serves other machines too.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
-        str, typer.Option(help="Access token that browsers must send; default: a random one, in the printed link.")
+        str,
+        typer.Option(
+            help="Access token that browsers must send; default: a random one, in the printed link."
+        ),
     ] = "",
     folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path("out"),
     camera: Annotated[
         list[str] | None,
-        typer.Option(metavar="SOURCE", help="Live camera that the page may watch: index, file or address; repeatable."),
+        typer.Option(
+            metavar="SOURCE",
+            help="Live camera that the page may watch: index, file or address; repeatable.",
+        ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(min=1, help="Most worker processes, one for each page; further pages wait.")
+        int,
+        typer.Option(min=1, help="Most worker processes, one for each page; further pages wait."),
     ] = 12,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
@@ -38,5 +47,9 @@ def gui(
     try:
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:
-        raise InputError("", f"skysim gui needs {error.name}", "after pip install 'skysim[gui]'") from None
-    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), camera or [], workers, show)
+        raise InputError(
+            "", f"skysim gui needs {error.name}", "after pip install 'skysim[gui]'"
+        ) from None
+    server.serve(
+        scene, host, port, token, folder.resolve(), out.resolve(), camera or [], workers, show
+    )

@@ -15,15 +15,22 @@ from skysim.results.report.as_text import print_blocks
 
 def reproduce(
     ids: Annotated[
-        list[str] | None, typer.Argument(metavar="ID|all", help="Experiments, or all; default: list them.")
+        list[str] | None,
+        typer.Argument(metavar="ID|all", help="Experiments, or all; default: list them."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Run fewer trials; the intervals are wider.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Run fewer trials; the intervals are wider.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of all random streams.")] = 1,
-    report: Annotated[bool, typer.Option("--report", help="Also write an HTML page with the papers' figures.")] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write an HTML page with the papers' figures.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
         Path | None,
-        typer.Option(help="Also write a Markdown page with its images beside it, as docs/findings/papers.md."),
+        typer.Option(
+            help="Also write a Markdown page with its images beside it, as docs/findings/papers.md."
+        ),
     ] = None,
     open_: OpenReport = False,
     json: Json = False,
@@ -35,7 +42,8 @@ def reproduce(
         from skysim.experiments.papers.published import experiments
 
         listed = [
-            {"id": id, "title": published.title, "source": published.source} for id, published in experiments().items()
+            {"id": id, "title": published.title, "source": published.source}
+            for id, published in experiments().items()
         ]
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return

@@ -50,7 +50,10 @@ def run(
     tracker: Annotated[str | None, typer.Option(metavar="NAME", help=TRACKER_HELP)] = None,
     program: Programs = None,
     scene_3d: Annotated[
-        bool, typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.")
+        bool,
+        typer.Option(
+            "--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."
+        ),
     ] = False,
     open_: OpenReport = False,
     json: Json = False,
@@ -63,10 +66,17 @@ def run(
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.flight import open_flight
 
-    stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    stages = selected_stages(
+        detector=detector, centroider=centroider, identifier=identifier, solver=solver
+    )
     if tracker is not None:
         stages["name"] = tracker
-    loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
+    loaded = load(
+        scene,
+        frames,
+        seed,
+        [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())],
+    )
     with open_flight(loaded, programs=used_programs(program, scene_names(loaded))) as flight:
         plan = check(flight.lab)
         for finding in plan.findings:
@@ -100,7 +110,8 @@ def render(
     out: Out = None,
     set_: Overrides = None,
     preview: Annotated[
-        bool, typer.Option("--preview", help="Write an 8-bit image of each frame with the truth marked.")
+        bool,
+        typer.Option("--preview", help="Write an 8-bit image of each frame with the truth marked."),
     ] = False,
     json: Json = False,
 ) -> None:
@@ -113,7 +124,9 @@ def render(
     folder = output_folder(out, loaded.name)
     paths = list[str]()
     with open_flight(loaded) as flight:
-        if warning := assumptions.camera_outside_warning(loaded, flight.lab.camera.mount, flight.lab.start):
+        if warning := assumptions.camera_outside_warning(
+            loaded, flight.lab.camera.mount, flight.lab.start
+        ):
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
@@ -127,7 +140,9 @@ def render(
 
 def compare(
     scene: SceneArg,
-    tracker: Annotated[list[str], typer.Option(metavar="NAME", help=f"{TRACKER_HELP[:-1]}; repeatable.")],
+    tracker: Annotated[
+        list[str], typer.Option(metavar="NAME", help=f"{TRACKER_HELP[:-1]}; repeatable.")
+    ],
     program: Programs = None,
     frames: Frames = None,
     seed: Seed = None,
@@ -152,7 +167,9 @@ def compare(
         Flight(lab, UserParts(programs, tracker=entrants[tracker[0]])) as flight,
         terminal.progress_callback(loaded.title, quiet=json) as update,
     ):
-        for frame, truth, row_by_tracker in tracker_comparison.compare_frames(flight, entrants, update):
+        for frame, truth, row_by_tracker in tracker_comparison.compare_frames(
+            flight, entrants, update
+        ):
             recorder = recorder or Recorder(output_folder(out, loaded.name), lab.camera)
             recorder.write(frame, truth)
             for name, row in row_by_tracker.items():
@@ -160,7 +177,9 @@ def compare(
     assert recorder is not None
     lines = tracker_comparison.write_scores(recorder.folder, rows, loaded)
     if json:
-        terminal.print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})
+        terminal.print_json(
+            {"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)}
+        )
     else:
         terminal.print_scores(lines, recorder.folder)
 

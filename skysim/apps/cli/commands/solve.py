@@ -27,7 +27,9 @@ def solve(
     ] = None,
     fov: Annotated[
         float | None,
-        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."),
+        typer.Option(
+            help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."
+        ),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -36,14 +38,22 @@ def solve(
         ),
     ] = None,
     live: Annotated[
-        str | None, typer.Option(help="Also solve a frame of a live camera: its index, a video file or an address.")
+        str | None,
+        typer.Option(
+            help="Also solve a frame of a live camera: its index, a video file or an address."
+        ),
     ] = None,
     time: Annotated[
-        str | None, typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
+        str | None,
+        typer.Option(
+            help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."
+        ),
     ] = None,
     catalog: Annotated[
         str | None,
-        typer.Option(help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."),
+        typer.Option(
+            help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."
+        ),
     ] = None,
     detector: Detector = None,
     centroider: Centroider = None,
@@ -61,7 +71,9 @@ def solve(
     from skysim.core.io import files
     from skysim.core.io.images import grab_frame
 
-    stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
+    stages = selected_stages(
+        detector=detector, centroider=centroider, identifier=identifier, solver=solver
+    )
     settings = plate_solver.make_solver(fov, camera, datetime_from_iso(time), stages, catalog)
     files.make_folder(out)
     paths = plate_solver.pictures_in(images or ())
@@ -71,7 +83,12 @@ def solve(
     if not paths:
         raise InputError("", "no images", "files, folders, or --live CAMERA")
     annotated = plate_solver.annotated_paths(out, paths)
-    jobs = progress(list(zip(paths, annotated, strict=True)), len(paths), "solving", quiet=json or len(paths) == 1)
+    jobs = progress(
+        list(zip(paths, annotated, strict=True)),
+        len(paths),
+        "solving",
+        quiet=json or len(paths) == 1,
+    )
     results = [plate_solver.solve_file(path, settings, image) for path, image in jobs]
     errors = [result["status"] for result in results if result.pop("bad_input")]
     warnings = [warning for result in results if (warning := result.pop("warning"))]

@@ -22,21 +22,32 @@ HOST = "127.0.0.1"
 def stream(
     scene: SceneArg,
     folder: Annotated[
-        Path | None, typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame.")
+        Path | None,
+        typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
     ] = None,
     http: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port.")
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."
+        ),
     ] = None,
     host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = HOST,
     pipe: Annotated[
         str | None,
-        typer.Option(help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."),
+        typer.Option(
+            help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
+        ),
     ] = None,
     frames: Frames = None,
     endless: Annotated[
-        bool, typer.Option("--endless", help="Stream until Ctrl-C. Otherwise a stream lasts one day at most.")
+        bool,
+        typer.Option(
+            "--endless", help="Stream until Ctrl-C. Otherwise a stream lasts one day at most."
+        ),
     ] = False,
-    speed: Annotated[float, typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible.")
+    ] = 1.0,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
@@ -51,7 +62,9 @@ def stream(
     if folder is None and http is None and pipe is None:
         raise InputError("", "no output", "--folder DIR, --http PORT or --pipe PATH")
     if http is None and host != HOST:
-        raise InputError(f"--host {host}", "has no effect without --http", f"--http PORT --host {host}")
+        raise InputError(
+            f"--host {host}", "has no effect without --http", f"--http PORT --host {host}"
+        )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
@@ -60,7 +73,8 @@ def stream(
         sinks.append(Sink("folder", folder_writer(folder)))
     if pipe is not None:
         sinks.append(Sink("pipe", pipe_writer(pipe)))
-    stats, pace = sender.SenderStats(), Pace(speed, flight.lab.scene.exposure.rate_hz)
+    stats = sender.SenderStats()
+    pace = Pace(speed, flight.lab.scene.exposure.rate_hz)
     with serving(http, host, lambda: stats.statistics(sinks)) as hub:
         try:
             sender.send(flight, pace, sinks, stats, hub.publish if hub else None)

@@ -34,7 +34,10 @@ if TYPE_CHECKING:
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
 
-app = typer.Typer(invoke_without_command=True, help="Run Monte Carlo studies: many trials of a scene with varied keys.")
+app = typer.Typer(
+    invoke_without_command=True,
+    help="Run Monte Carlo studies: many trials of a scene with varied keys.",
+)
 
 StudyArg = Annotated[
     str,
@@ -44,8 +47,12 @@ StudyArg = Annotated[
         autocompletion=complete_study,
     ),
 ]
-Workers = Annotated[int | None, typer.Option(min=1, help="Number of worker processes; default: number of cores.")]
-EngineName = Annotated[str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Number of worker processes; default: number of cores.")
+]
+EngineName = Annotated[
+    str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")
+]
 Scheduler = Annotated[str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
 
 
@@ -59,7 +66,9 @@ def studies(context: typer.Context, json: Json = False) -> None:
     print_titles(STUDIES, json)
 
 
-@app.command(help="Run all trials of a study and write its report. After Ctrl-C, `resume` continues.")
+@app.command(
+    help="Run all trials of a study and write its report. After Ctrl-C, `resume` continues."
+)
 def run(
     context: typer.Context,
     study: StudyArg,
@@ -86,7 +95,9 @@ def run(
         raise InputError(plan.path, "has no key optimize", "skysim study run")
     if not search and plan.study.optimize is not None:
         raise InputError(plan.path, "has the key optimize", "skysim study optimize")
-    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json, open_)
+    run_and_report(
+        plan, study, out, create_engine(engine, workers, scheduler), overrides, json, open_
+    )
 
 
 @app.command()
@@ -110,7 +121,9 @@ def resume(
     study, out = located(study, out)
     plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
-    run_and_report(plan, study, out, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed)
+    run_and_report(
+        plan, study, out, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed
+    )
 
 
 @app.command()
@@ -143,7 +156,8 @@ def export(
     to: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILES", help="Output files: .csv or .parquet (a row per trial), .zarr (the responses)."
+            metavar="FILES",
+            help="Output files: .csv or .parquet (a row per trial), .zarr (the responses).",
         ),
     ],
     out: Out = None,
@@ -163,7 +177,10 @@ def export(
 def replay(
     study: StudyArg,
     trial: Annotated[
-        int, typer.Argument(metavar="TRIAL", help="Number of the trial, as in the report and in `status`.")
+        int,
+        typer.Argument(
+            metavar="TRIAL", help="Number of the trial, as in the report and in `status`."
+        ),
     ],
     out: Out = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first image.")] = False,
@@ -208,7 +225,9 @@ def worst(
     ] = "",
     where: Annotated[
         list[str] | None,
-        typer.Option(metavar="FACTOR=LEVEL", help="Only points at this level; may be given several times."),
+        typer.Option(
+            metavar="FACTOR=LEVEL", help="Only points at this level; may be given several times."
+        ),
     ] = None,
     count: Annotated[int, typer.Option(min=1, max=100, help="Number of attitudes.")] = 3,
     out: Out = None,
@@ -225,7 +244,9 @@ def worst(
         metrics.response(name, "response")
     with open_store(study, out) as stored:
         points = stored.points()
-        found = analysis.worst_of_levels(plan.study, stored, name, chosen_levels(where or []), count)
+        found = analysis.worst_of_levels(
+            plan.study, stored, name, chosen_levels(where or []), count
+        )
     rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
     repeat = command(study, out, "replay")
     if json:
@@ -239,12 +260,16 @@ def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
     from skysim.core.io.yaml_reader import parse_overrides, parse_yaml
 
-    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "where", "FACTOR=LEVEL").items()}
+    return {
+        key: parse_yaml(text)[1]
+        for key, text in parse_overrides(words, "where", "FACTOR=LEVEL").items()
+    }
 
 
 # Registered last, so that it is the last in `skysim study --help`.
 SEARCH_HELP = (
-    "Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."
+    "Search a study's factors for the best point, or the Pareto front of two objectives."
+    " `resume` continues it."
 )
 app.command("optimize", help=SEARCH_HELP)(run)
 
@@ -268,7 +293,8 @@ def run_and_report(
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.execution import runner, store
 
-    path, total = folder_of(study, out) / store.STORE, plan.study.trial_count(len(plan.points))
+    path = folder_of(study, out) / store.STORE
+    total = plan.study.trial_count(len(plan.points))
     resume_command = command(study, out, "resume")
     with store.writing(path) as stored, interruptible(resume_command, stored), closing(engine):
         runner.prepare_store(plan, stored, resumed, overrides)
@@ -282,7 +308,9 @@ def run_and_report(
                 finished = progress.done == progress.trials
         counts = stored.counts()
     if not finished:
-        print_error(f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}")
+        print_error(
+            f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}"
+        )
     if counts["failed"]:
         print_error(f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}")
     write_report(plan, study, out, json, open_)
@@ -318,7 +346,12 @@ def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bo
         print(f"report: {path}")
         return
     columns = table.to_columns(table.select_responses(found.lines, plan.study.responses))
-    told = {"report": str(path), "points": columns, "answers": found.answers, "findings": found.about.findings}
+    told = {
+        "report": str(path),
+        "points": columns,
+        "answers": found.answers,
+        "findings": found.about.findings,
+    }
     print_json(progress | told | (search.front_columns(found.result) if found.result else {}))
 
 
@@ -331,12 +364,18 @@ def located(study: str, out: Path | None) -> tuple[str, Path | None]:
     with store.open_store(Path(study) / store.STORE) as stored:
         file = stored.meta("file")
     if not Path(file).is_file():
-        raise InputError(study, f"no such file as its study, {file or 'not stored'}", f"STUDY --out {study}")
+        raise InputError(
+            study, f"no such file as its study, {file or 'not stored'}", f"STUDY --out {study}"
+        )
     return file, Path(study)
 
 
 def load_stored_plan(
-    study: str, out: Path | None, program: list[str] | None = None, set_: list[str] | None = None, grows: bool = False
+    study: str,
+    out: Path | None,
+    program: list[str] | None = None,
+    set_: list[str] | None = None,
+    grows: bool = False,
 ) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
@@ -353,10 +392,15 @@ def load_stored_plan(
 
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)
-        plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
-        kept, path = runner.stored_replicates(plan, stored), stored.path
+        plan = loader.load(
+            study, overrides, None if program is None else process.program_commands(program)
+        )
+        kept = runner.stored_replicates(plan, stored)
+        path = stored.path
     if not kept or (kept < plan.study.replicates and not grows):
-        raise InputError(path, "contains another study or an earlier version of this one", "another store")
+        raise InputError(
+            path, "contains another study or an earlier version of this one", "another store"
+        )
     return plan, overrides
 
 
@@ -375,9 +419,13 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     if name not in ENGINES:
         raise InputError("--engine", *unknown_name("engine", name, ENGINES))
     if workers is not None and name != "pool":
-        raise InputError(f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool")
+        raise InputError(
+            f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool"
+        )
     if (name == "dask") != bool(scheduler):
-        raise InputError("--scheduler", "required with --engine dask and only then", "tcp://HOST:PORT")
+        raise InputError(
+            "--scheduler", "required with --engine dask and only then", "tcp://HOST:PORT"
+        )
     return ENGINES[name](workers, scheduler)
 
 

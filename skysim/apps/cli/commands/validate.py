@@ -51,7 +51,9 @@ def validate(
         ),
     ] = None,
     program: Programs = None,
-    schema: Annotated[str | None, typer.Option(help="Print the JSON Schema of a kind of file: scene or study.")] = None,
+    schema: Annotated[
+        str | None, typer.Option(help="Print the JSON Schema of a kind of file: scene or study.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
@@ -83,7 +85,9 @@ def validate(
         raise typer.Exit(2)
 
 
-def check(scene: SceneArg, program: Programs = None, set_: Overrides = None, json: Json = False) -> None:
+def check(
+    scene: SceneArg, program: Programs = None, set_: Overrides = None, json: Json = False
+) -> None:
     """Check a plan before its run: field, lights in it, image size, saturation, smear, focus, expected error, warnings.
 
     Nothing is simulated or rendered; everything is computed at sampled attitudes.
@@ -109,7 +113,9 @@ def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -
         return Verdict(str(path), fault=str(error))
 
 
-def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> tuple[str, tuple[str, ...]]:
+def describe_file(
+    path: Path, programs: Mapping[str, str] = MappingProxyType({})
+) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.io.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
@@ -163,7 +169,9 @@ def find_shipped(path: Path) -> Path:
     from skysim.core.paths import DATA, SCENES, STUDIES
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
-    return next((file for file in names if file.is_file()), None) or find_file(str(path), SCENES, "scene")
+    return next((file for file in names if file.is_file()), None) or find_file(
+        str(path), SCENES, "scene"
+    )
 
 
 def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
@@ -180,7 +188,8 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
         findings = check_plan(lab).findings
     except InputError as error:
         raise loader.located(error, str(path), {}) from None
-    count, frames = len(lab.camera.sources.id), scene.exposure.frames
+    count = len(lab.camera.sources.id)
+    frames = scene.exposure.frames
     described = f"a scene of {count} lights and {frames} frames"
     return described, tuple(with_location(finding, (str(path), {})) for finding in findings)
 

@@ -58,9 +58,14 @@ class Palette:
         self.commands = commands
         self.found: list[Command] = []
         self.chosen = 0
-        with ui.dialog().props("position=top no-shake") as self.dialog, ui.card().classes("lab-palette"):
+        with (
+            ui.dialog().props("position=top no-shake") as self.dialog,
+            ui.card().classes("lab-palette"),
+        ):
             self.field = ui.input(placeholder="type an action", on_change=self.filter)
-            self.field.props('dense borderless autofocus aria-label="Action"').classes("w-full").mark("palette")
+            self.field.props('dense borderless autofocus aria-label="Action"').classes(
+                "w-full"
+            ).mark("palette")
             self.field.on("keydown.down.prevent", lambda: self.choose(self.chosen + 1))
             self.field.on("keydown.up.prevent", lambda: self.choose(self.chosen - 1))
             self.field.on("keydown.enter.prevent", self.enter)
@@ -85,8 +90,12 @@ class Palette:
             if not self.found:
                 ui.label("No such action.").classes("quiet")
             for n, command in enumerate(self.found):
-                row = ui.element("div").props(f'role="option" aria-selected="{str(n == self.chosen).lower()}"')
-                row.classes("lab-command" + " chosen" * (n == self.chosen)).on("click", lambda n=n: self.do(n))
+                row = ui.element("div").props(
+                    f'role="option" aria-selected="{str(n == self.chosen).lower()}"'
+                )
+                row.classes("lab-command" + " chosen" * (n == self.chosen)).on(
+                    "click", lambda n=n: self.do(n)
+                )
                 with row:
                     ui.label(command.name).classes("ellipsis")
                     if command.key:
@@ -133,13 +142,20 @@ class Actions:
     def commands(self) -> list[Command]:
         """Every action with its key."""
         by_key = [key for key in keys.KEYS if key.action in self.performers]
-        return [Command(key.help, key.label, partial(self.perform, key.action)) for key in by_key] + [*self.others]
+        return [
+            Command(key.help, key.label, partial(self.perform, key.action)) for key in by_key
+        ] + [*self.others]
 
     async def key(self, event: KeyEventArguments) -> None:
         """Do what a pressed key is for, unless a dialog is open."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
         action = keys.ACTION_BY_KEY.get(name)
-        if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
+        if (
+            not event.action.keydown
+            or action is None
+            or event.modifiers.ctrl
+            or event.modifiers.meta
+        ):
             return
         if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
             return

@@ -81,7 +81,11 @@ class Arrangement:
 
         kind : side (the column of panels) or space (the 3-D view)
         """
-        line = ui.element("div").classes(f"lab-split {orientation}").props(f'role="separator" data-split="{kind}"')
+        line = (
+            ui.element("div")
+            .classes(f"lab-split {orientation}")
+            .props(f'role="separator" data-split="{kind}"')
+        )
         line.props(f'aria-orientation="{orientation}" tabindex="0" aria-label="{label}"')
         line.props(f'title="{label}: drag, or arrow keys; double-click: as at first"')
 
@@ -96,7 +100,9 @@ class Arrangement:
 
     def toggle(self) -> None:
         self.set_dark(not self.dark.value)
-        ui.run_javascript(f'localStorage.setItem("skysim.theme", "{"dark" if self.dark.value else "light"}")')
+        ui.run_javascript(
+            f'localStorage.setItem("skysim.theme", "{"dark" if self.dark.value else "light"}")'
+        )
 
     def set_dark(self, dark: bool) -> None:
         """Change the theme; charts take their colors from it when they are drawn."""

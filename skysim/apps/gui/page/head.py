@@ -27,18 +27,26 @@ class Head:
         self.message_text = ""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
-            self.picker = ui.select(self.scenes(), value=page.state.scene, on_change=self.scene_picked)
-            self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark("scene")
+            self.picker = ui.select(
+                self.scenes(), value=page.state.scene, on_change=self.scene_picked
+            )
+            self.picker.props('dense borderless options-dense aria-label="Scene"').classes(
+                "w-44"
+            ).mark("scene")
             self.picker.on("popup-hide", js_handler=keys.BLUR_JS)
             self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
-            self.live_button = ui.button("Live", on_click=self.go_live).props("dense outline size=sm").mark("live")
+            self.live_button = (
+                ui.button("Live", on_click=self.go_live).props("dense outline size=sm").mark("live")
+            )
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
             self.busy = ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             self.latency = LiveText(contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
-            self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props("dense size=xs")
+            self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
+                "dense size=xs"
+            )
             self.identify = ui.switch("identify", value=True).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
                 for name in export.FILE_BY_ITEM:
@@ -97,7 +105,9 @@ class Head:
         """Render with the camera's noise, or each pixel's expected value; the attitude is kept."""
         info = self.page.scene_info
         if info and info.noise != self.noise.value:
-            await self.page.apply_overrides({"camera.detector.noise": str(bool(self.noise.value)).lower()})
+            await self.page.apply_overrides(
+                {"camera.detector.noise": str(bool(self.noise.value)).lower()}
+            )
             info = self.page.scene_info
             self.noise.set_value(info.noise if info else True)
 
@@ -112,5 +122,9 @@ class Head:
         elif name in files:
             ui.download(files[name], name)
         else:
-            reason = "no solution yet: press 1" if name == "solution.json" else "not known of an image from elsewhere"
+            reason = (
+                "no solution yet: press 1"
+                if name == "solution.json"
+                else "not known of an image from elsewhere"
+            )
             self.page.show_message(f"{item}: {reason}")

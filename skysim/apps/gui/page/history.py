@@ -78,7 +78,10 @@ class History:
 
     async def read(self) -> str:
         """The query of the page's address, or else of the stored view."""
-        return str(await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10) or "")
+        return str(
+            await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10)
+            or ""
+        )
 
     def write(self) -> None:
         """Timer: write a changed view; a movement that goes on replaces the address, other changes add a step."""

@@ -44,7 +44,9 @@ class LogPanel:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
-        self.button = ui.button("CSV of the identifications", on_click=self.download).props("dense flat size=sm")
+        self.button = ui.button("CSV of the identifications", on_click=self.download).props(
+            "dense flat size=sm"
+        )
         self.button.mark("log-csv").set_enabled(False)
         self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
@@ -69,8 +71,12 @@ def line(view: FrameView, info: SceneInfo) -> str:
     if result is None or result.angles_deg is None:
         return f"identify {noise} noise: {result.status if result else 'no result'}"
     counts = f"{result.identified} of {len(result.detections)}"
-    angles = "  ".join(f"{name} {angle:.4f}°" for name, angle in zip(info.names, result.angles_deg, strict=True))
-    errors = f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
+    angles = "  ".join(
+        f"{name} {angle:.4f}°" for name, angle in zip(info.names, result.angles_deg, strict=True)
+    )
+    errors = (
+        f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
+    )
     return f"identify {noise} noise: {result.status}, {counts}; {angles}; {errors}"
 
 
@@ -79,7 +85,25 @@ def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
     result = view.result
     assert result is not None
     found = result.angles_deg or (None,) * 3
-    errors = (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec) if result.solved else (None,) * 4
+    errors = (
+        (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec)
+        if result.solved
+        else (None,) * 4
+    )
     counts = len(result.detections), result.identified
-    names = info.scene, info.noise, info.stages["detector"], info.stages["identifier"], result.status
-    return (time.strftime("%H:%M:%S"), *names, *counts, *view.angles_deg, *found, *errors, result.wrong)
+    names = (
+        info.scene,
+        info.noise,
+        info.stages["detector"],
+        info.stages["identifier"],
+        result.status,
+    )
+    return (
+        time.strftime("%H:%M:%S"),
+        *names,
+        *counts,
+        *view.angles_deg,
+        *found,
+        *errors,
+        result.wrong,
+    )

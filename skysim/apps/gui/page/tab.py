@@ -59,7 +59,9 @@ class Tab:
     session: Session
     new_session: Callable[[], Session | None]
 
-    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
+    def __init__(
+        self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = ""
+    ) -> None:
         self.id = secrets.token_hex(8)
         self.user = user
         self.folder = folder
@@ -93,7 +95,9 @@ class Tab:
         session = self.new_session()
         await asyncio.to_thread(lost.close)
         if session is None:
-            self.show_message("the worker of this page has stopped, and all others are in use: reload to wait for one")
+            self.show_message(
+                "the worker of this page has stopped, and all others are in use: reload to wait for one"
+            )
             return
         self.use(session)
         self.view = None
@@ -125,11 +129,15 @@ class Tab:
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
                     if key.description:
-                        ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
+                        ui.html(
+                            f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False
+                        )
         await asyncio.sleep(PAUSE_S)
         self.history = History(self, self.state.scene, self.show_query, self.is_settling)
         self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
-        self.actions = Actions(self, self.sensor, self.run_panel.step, self.performers(), self.commands())
+        self.actions = Actions(
+            self, self.sensor, self.run_panel.step, self.performers(), self.commands()
+        )
         # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
         ui.timer(lights.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo.POLL_S, self.study_panel.poll)
@@ -144,7 +152,9 @@ class Tab:
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
-            with ui.tab_panels(self.tabs, value=PANELS[0], animated=False, keep_alive=True).classes("lab-panels"):
+            with ui.tab_panels(self.tabs, value=PANELS[0], animated=False, keep_alive=True).classes(
+                "lab-panels"
+            ):
                 with ui.tab_panel("Lights"):
                     self.lights = LightsPanel(self.sensor)
                 with ui.tab_panel("Scene"):
@@ -197,9 +207,14 @@ class Tab:
             Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
             Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
             Command("change between the dark and the light theme", "", self.arrangement.toggle),
-            Command("give frame, 3-D view and panels their first sizes", "", self.arrangement.reset),
+            Command(
+                "give frame, 3-D view and panels their first sizes", "", self.arrangement.reset
+            ),
             *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
-            *(Command(f"export: {name}", "", partial(self.head.export, name)) for name in export.FILE_BY_ITEM),
+            *(
+                Command(f"export: {name}", "", partial(self.head.export, name))
+                for name in export.FILE_BY_ITEM
+            ),
         ]
 
     async def identify(self) -> None:
@@ -250,7 +265,10 @@ class Tab:
     async def restore(self, wanted: View) -> None:
         """Show a view again: open its scene if it is another, point there, then fly or replay."""
         now = self.state
-        is_shown = self.view is not None and (now.scene, now.overrides) == (wanted.scene, wanted.overrides)
+        is_shown = self.view is not None and (now.scene, now.overrides) == (
+            wanted.scene,
+            wanted.overrides,
+        )
         if not is_shown or wanted.angles_deg is None:
             if not await self.open(wanted.scene, wanted.overrides, wanted.angles_deg):
                 return
@@ -273,7 +291,10 @@ class Tab:
     # The scene.
 
     async def open(
-        self, scene: str, overrides: Mapping[str, str] | None = None, angles_deg: Triple | None = None
+        self,
+        scene: str,
+        overrides: Mapping[str, str] | None = None,
+        angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
         self.stop_playback()
@@ -284,18 +305,24 @@ class Tab:
             self.sensor.show_setting_up(scene)
         path = forms.absolute_path(scene)
         activity = f"setting up {name} …" if self.view else ""
-        result = await self.run_task("open", path, overrides, self.solving, angles_deg, activity=activity)
+        result = await self.run_task(
+            "open", path, overrides, self.solving, angles_deg, activity=activity
+        )
         if result is None:
             self.head.picker.set_value(self.state.scene)
             if self.view is None:
-                self.sensor.show_waiting(f"{name} cannot be set up:", self.message_text, in_vain=True)
+                self.sensor.show_waiting(
+                    f"{name} cannot be set up:", self.message_text, in_vain=True
+                )
             return False
         self.scene_info, view = result
         control = (await asyncio.to_thread(load, path, overrides)).motion.control
         self.set_state(scene=scene, overrides=overrides)
         self.set_scene(self.scene_info, control.feedback if control else None)
         self.show_live_view(view)
-        self.scene_panel.shown = self.tracker_panel.shown = None  # the file may be another one under the same name
+        self.scene_panel.shown = self.tracker_panel.shown = (
+            None  # the file may be another one under the same name
+        )
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
@@ -310,7 +337,9 @@ class Tab:
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
 
-    async def apply_overrides(self, overrides: Mapping[str, str], dropped: Collection[str] = ()) -> None:
+    async def apply_overrides(
+        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+    ) -> None:
         """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""
         async with self.editing:
             kept = {key: text for key, text in self.state.overrides.items() if key not in dropped}
@@ -318,7 +347,10 @@ class Tab:
 
     async def fill_form(self) -> None:
         """Show the keys of the current scene in the panel of them that is open; it takes a while, so not in others."""
-        panels: dict[str, ScenePanel | TrackerPanel] = {"Scene": self.scene_panel, "Tracker": self.tracker_panel}
+        panels: dict[str, ScenePanel | TrackerPanel] = {
+            "Scene": self.scene_panel,
+            "Tracker": self.tracker_panel,
+        }
         panel = panels.get(str(self.tabs.value))
         async with self.filling:
             while panel and self.view and self.is_open and panel.shown != self.opened:

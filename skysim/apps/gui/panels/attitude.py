@@ -42,13 +42,19 @@ class AttitudeCard:
 
     def angle_input(self, n: int) -> LiveInput:
         field = LiveInput(self.contents, "text").props(f'aria-label="angle {n + 1}"')
-        return field.classes("mono lab-angle").mark(f"angle-{n}").on("keydown.enter", self.point, js_handler=ANGLES_JS)
+        return (
+            field.classes("mono lab-angle")
+            .mark(f"angle-{n}")
+            .on("keydown.enter", self.point, js_handler=ANGLES_JS)
+        )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
         """Take over a new scene: angle names and algorithms."""
         self.set_headers(scene_info.names)
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
-        self.stages.props["title"] = ", ".join(f"{stage} {name}" for stage, name in scene_info.stages.items())
+        self.stages.props["title"] = ", ".join(
+            f"{stage} {name}" for stage, name in scene_info.stages.items()
+        )
 
     def set_headers(self, names: tuple[str, str, str]) -> None:
         for head, name in zip(self.heads, names, strict=True):
@@ -86,7 +92,9 @@ class AttitudeCard:
         self.shows_photo = True
         self.set_headers(photo.names)
         self.set_placeholder("unknown")
-        texts = [format_angle(angle) for angle in photo.true_deg] if photo.true_deg else ["", "", ""]
+        texts = (
+            [format_angle(angle) for angle in photo.true_deg] if photo.true_deg else ["", "", ""]
+        )
         for field, text in zip(self.inputs, texts, strict=True):
             field.set_value(text)
         self.show_result(photo.result)
@@ -105,9 +113,15 @@ class AttitudeCard:
             for label, angle in zip(self.estimates, result.angles_deg, strict=True):
                 label.set_text(format_angle(angle))
             cross, roll = result.sigma_arcsec
-            self.errors[0].set_text("–" if math.isnan(result.cross_arcsec) else f"cross {result.cross_arcsec:.2f}″")
-            self.errors[1].set_text("–" if math.isnan(result.roll_arcsec) else f"roll {result.roll_arcsec:+.1f}″")
-            self.errors[2].set_text("–" if math.isnan(cross) else f"σ {format_number(cross)}″ {format_number(roll)}″")
+            self.errors[0].set_text(
+                "–" if math.isnan(result.cross_arcsec) else f"cross {result.cross_arcsec:.2f}″"
+            )
+            self.errors[1].set_text(
+                "–" if math.isnan(result.roll_arcsec) else f"roll {result.roll_arcsec:+.1f}″"
+            )
+            self.errors[2].set_text(
+                "–" if math.isnan(cross) else f"σ {format_number(cross)}″ {format_number(roll)}″"
+            )
         color, text = status_line(result)
         self.status.set_text(text, color)
 

@@ -36,7 +36,9 @@ class LightsPanel:
             return
         self.sent = sensor.sent_number
         detections = sensor.result.detections if sensor.result else ()
-        self.table.run_method("show", HEADS, list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name)))
+        self.table.run_method(
+            "show", HEADS, list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name))
+        )
 
 
 def rows(
@@ -70,7 +72,13 @@ def rows(
 
 def cells(light: Light, spot: Detection | None, name: Callable[[int], str]) -> list[str]:
     magnitude = "" if math.isnan(light.magnitude) else f"{light.magnitude:.2f}"
-    texts = [name(light.id), magnitude, f"{light.electrons:.4g}", f"{light.x:.2f}", f"{light.y:.2f}"]
+    texts = [
+        name(light.id),
+        magnitude,
+        f"{light.electrons:.4g}",
+        f"{light.x:.2f}",
+        f"{light.y:.2f}",
+    ]
     if spot is None:
         return [*texts, "", ""]
     error_px = math.hypot(spot.x - light.x, spot.y - light.y)

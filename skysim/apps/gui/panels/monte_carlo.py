@@ -57,27 +57,47 @@ class MonteCarloPanel:
         self.stopped = False
         self.starting = False
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.study_select = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
+            self.study_select = ui.select({}, value=None).props(
+                'dense outlined options-dense aria-label="Study"'
+            )
             self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
             self.study_select.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.button = ui.button("Start", on_click=self.start_or_stop).props("dense outline size=sm")
+            self.button = ui.button("Start", on_click=self.start_or_stop).props(
+                "dense outline size=sm"
+            )
             self.button.mark("monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props("dense outlined")
+            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props(
+                "dense outlined"
+            )
             self.count.mark("runs")
-            self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props("dense outlined options-dense")
+            self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props(
+                "dense outlined options-dense"
+            )
             self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props("dense outlined")
+            self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props(
+                "dense outlined"
+            )
             self.noise.on_value_change(self.show_noise)
-            self.magnitude = ui.number("noise, mag", value=0.25, min=0, max=5, step=0.05).props("dense outlined")
-            self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props("dense outlined")
+            self.magnitude = ui.number("noise, mag", value=0.25, min=0, max=5, step=0.05).props(
+                "dense outlined"
+            )
+            self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props(
+                "dense outlined"
+            )
             self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
             self.field.on("keydown.enter", self.set_field_of_view)
         with ui.row().classes("w-full no-wrap items-center gap-3") as self.model:
-            self.with_noise = ui.checkbox("with noise", value=True).props("dense size=xs").mark("with-noise")
+            self.with_noise = (
+                ui.checkbox("with noise", value=True).props("dense size=xs").mark("with-noise")
+            )
             self.noise_text = ui.label().classes("quiet").mark("noise-text")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
-        self.note = ui.label("No study has been run yet: press 2.").classes("quiet").style("margin-top: 6px")
+        self.note = (
+            ui.label("No study has been run yet: press 2.")
+            .classes("quiet")
+            .style("margin-top: 6px")
+        )
         self.note.mark("trials-note")
         self.chart = ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
         self.table = ui.element("div").classes("mono w-full").mark("figures")
@@ -89,7 +109,9 @@ class MonteCarloPanel:
 
     def set_scene(self) -> None:
         options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
-        options |= {path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
+        options |= {
+            path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))
+        }
         self.study_select.set_options(options, value=self.study_select.value or "")
         info = self.page.scene_info
         if info:
@@ -112,7 +134,9 @@ class MonteCarloPanel:
         state = self.page.state
         field_deg = float(self.field.value or 0)
         try:
-            change = await run.io_bound(forms.field_override, state.scene, state.overrides, field_deg)
+            change = await run.io_bound(
+                forms.field_override, state.scene, state.overrides, field_deg
+            )
         except InputError as error:
             self.page.show_message(for_page(error))
             return
@@ -160,16 +184,24 @@ class MonteCarloPanel:
         except InputError as error:
             self.page.show_message(for_page(error))
             return False
-        self.process = StudyProcess(path.parent if not self.study_select.value else self.out / path.stem)
+        self.process = StudyProcess(
+            path.parent if not self.study_select.value else self.out / path.stem
+        )
         self.process.total = study.trials
         self.bar.set_value(0)
         self.button.set_text("Stop")
         self.stopped = False
         self.note.set_text("starting …")
         self.page.log(f"study {path.stem}: {study.trials} trials")
-        unused = [] if self.study_select.value else sorted(self.page.state.overrides.keys() - study.spec.base.keys())
+        unused = (
+            []
+            if self.study_select.value
+            else sorted(self.page.state.overrides.keys() - study.spec.base.keys())
+        )
         if unused:
-            self.page.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
+            self.page.show_message(
+                f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet"
+            )
         self.page.set_state(study=self.process.folder.name)
         await self.process.start(path)
         if not self.page.is_open:  # closed meanwhile, when there was no process to end
@@ -186,7 +218,10 @@ class MonteCarloPanel:
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
             noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
-            trial |= {name: float(field.value or 0) * bool(self.with_noise.value) for name, field in noise.items()}
+            trial |= {
+                name: float(field.value or 0) * bool(self.with_noise.value)
+                for name, field in noise.items()
+            }
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs", "", "1 to 100000")
@@ -194,11 +229,17 @@ class MonteCarloPanel:
         settings = scene, self.effective_overrides(scene, trial), trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
         before = self.process.folder / "monte_carlo.yaml"
-        if self.stopped and before.is_file() and before.read_text() == monte_carlo(*settings, self.run_number):
+        if (
+            self.stopped
+            and before.is_file()
+            and before.read_text() == monte_carlo(*settings, self.run_number)
+        ):
             return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
-        folder = files.make_folder(self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}")
+        folder = files.make_folder(
+            self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}"
+        )
         files.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
 
@@ -283,7 +324,10 @@ class MonteCarloPanel:
         self.table.clear()
         with self.table:
             ui.label(f"{'':16s}{'value':>8s}   95 % interval").classes("mono quiet")
-            lines = [f"{RESPONSES[name]:16s}{format_interval(*value)}" for name, value in results.statistics.items()]
+            lines = [
+                f"{RESPONSES[name]:16s}{format_interval(*value)}"
+                for name, value in results.statistics.items()
+            ]
             ui.label("\n".join(lines)).classes("mono")
         if results.failed == self.failed:
             return
@@ -291,18 +335,28 @@ class MonteCarloPanel:
         self.failures.clear()
         with self.failures:
             if results.failed:
-                ui.label("Failed trials, the first of them").classes("quiet").style("margin-top: 8px")
+                ui.label("Failed trials, the first of them").classes("quiet").style(
+                    "margin-top: 8px"
+                )
             for number, reason in results.failed:
                 with ui.row().classes("items-center gap-2 no-wrap"):
                     ui.label(f"trial {number}: {reason}").classes("mono warn ellipsis")
-                    ui.button("replay", on_click=lambda number=number: self.replay(number)).props("dense flat size=sm")
+                    ui.button("replay", on_click=lambda number=number: self.replay(number)).props(
+                        "dense flat size=sm"
+                    )
 
     async def replay(self, number: int) -> None:
         """Repeat a failed trial and show its frame in the sensor view."""
-        study = next(iter(self.process.folder.glob("*.yaml")), STUDIES / f"{self.study_select.value}.yaml")
+        study = next(
+            iter(self.process.folder.glob("*.yaml")), STUDIES / f"{self.study_select.value}.yaml"
+        )
         self.page.stop_playback()
         photo = await self.page.run_task(
-            "replay", str(study), str(self.process.folder), number, activity=f"replaying trial {number} …"
+            "replay",
+            str(study),
+            str(self.process.folder),
+            number,
+            activity=f"replaying trial {number} …",
         )
         if photo:
             self.page.show_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
@@ -313,10 +367,14 @@ class MonteCarloPanel:
         with self.reports:
             folders = finished(self.out, self.user)
             for folder in folders[:12]:
-                done = time.strftime("%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime))
+                done = time.strftime(
+                    "%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime)
+                )
                 with ui.row().classes("w-full no-wrap gap-3"):
                     ui.label(done).classes("mono quiet flex-none")
-                    link = ui.link(report_title(folder), f"/report/{quote(folder.name)}", new_tab=True)
+                    link = ui.link(
+                        report_title(folder), f"/report/{quote(folder.name)}", new_tab=True
+                    )
                     link.classes("ellipsis").props["title"] = folder.name
             if not folders:
                 ui.label("none yet").classes("quiet")
@@ -358,5 +416,12 @@ def options() -> dict[str, Any]:
         "xAxis": axis | x_name | {"type": "category", "data": []},
         "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
         "tooltip": TOOLTIP,
-        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": CURVE_COLORS[0]}}],
+        "series": [
+            {
+                "type": "bar",
+                "data": [],
+                "barCategoryGap": "8%",
+                "itemStyle": {"color": CURVE_COLORS[0]},
+            }
+        ],
     }

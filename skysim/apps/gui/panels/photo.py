@@ -45,18 +45,32 @@ class PhotoPanel:
             on_upload=weak_handler(self.uploaded),
             on_rejected=weak_handler(self.rejected),
         )
-        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style("margin: 10px 0")
+        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style(
+            "margin: 10px 0"
+        )
         self.upload.mark("upload")
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.source = ui.select(list(cameras), label="live camera", value=next(iter(cameras), None))
+            self.source = ui.select(
+                list(cameras), label="live camera", value=next(iter(cameras), None)
+            )
             self.source.props("dense outlined options-dense").classes("flex-grow")
-            self.button = ui.button("Watch", on_click=self.watch).props("dense outline size=sm").mark("camera")
+            self.button = (
+                ui.button("Watch", on_click=self.watch)
+                .props("dense outline size=sm")
+                .mark("camera")
+            )
             if not cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label("No live camera is offered here. Cameras are named when the lab is started.").classes("quiet")
-        self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
-        self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
+                ui.label(
+                    "No live camera is offered here. Cameras are named when the lab is started."
+                ).classes("quiet")
+        self.result_text = ui.label(
+            "No image yet. Images are solved lost in space; uncertain matches are rejected."
+        )
+        self.result_text.classes("mono quiet").style(
+            "margin-top: 10px; white-space: pre-wrap"
+        ).mark("facts")
 
     def rejected(self, _: Any) -> None:
         self.page.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB")

@@ -67,12 +67,22 @@ class PlanPanel:
         self.fields = ui.column().classes("w-full gap-1").mark("map-result")
         with self.part():
             self.begin = self.survey_button("Plan", self.plan_survey, "begin a new survey")
-            self.frames = ui.number(value=FRAMES, min=2, step=1, label="frames").props("dense outlined").classes("w-24")
-            self.fly = self.survey_button("Fly", self.fly_plan, "fly the vehicle to these attitudes")
-            self.adjust_button = self.survey_button(
-                "Adjust", self.adjust, "adjust LEDs, lever and lens to the frames of the last flight and those before"
+            self.frames = (
+                ui.number(value=FRAMES, min=2, step=1, label="frames")
+                .props("dense outlined")
+                .classes("w-24")
             )
-            self.save_map = self.survey_button("Map file", self.download_map, "save the LEDs for tracker.map")
+            self.fly = self.survey_button(
+                "Fly", self.fly_plan, "fly the vehicle to these attitudes"
+            )
+            self.adjust_button = self.survey_button(
+                "Adjust",
+                self.adjust,
+                "adjust LEDs, lever and lens to the frames of the last flight and those before",
+            )
+            self.save_map = self.survey_button(
+                "Map file", self.download_map, "save the LEDs for tracker.map"
+            )
         self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
         self.set_scene()
 
@@ -145,12 +155,16 @@ class PlanPanel:
             with ui.element("div").classes("lab-facts"):
                 for name, lines in found.facts:
                     ui.label(name).classes("quiet")
-                    ui.label("\n".join(lines)).style("white-space: pre-line; overflow-wrap: anywhere")
+                    ui.label("\n".join(lines)).style(
+                        "white-space: pre-line; overflow-wrap: anywhere"
+                    )
 
     # The ambiguity map.
 
     async def map(self) -> None:
-        found: AmbiguityMap | None = await self.page.run_task("ambiguity", activity="comparing the fields …")
+        found: AmbiguityMap | None = await self.page.run_task(
+            "ambiguity", activity="comparing the fields …"
+        )
         if found is None:
             return
         self.fields.clear()
@@ -159,9 +173,12 @@ class PlanPanel:
             with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
                 ui.label(f"{100 * found.least:.0f} % or less").classes("quiet")
                 colors = ", ".join(
-                    f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
+                    f"rgb({r:.0f} {g:.0f} {b:.0f})"
+                    for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
                 )
-                ui.element("div").style(f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})")
+                ui.element("div").style(
+                    f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
+                )
                 ui.label("100 % of the LEDs coincide; drawn in the 3-D view").classes("quiet")
         self.color("map", found.ids, (found.fraction - found.least) / (1 - found.least))
 
@@ -210,7 +227,9 @@ class PlanPanel:
             with ui.element("div").classes("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
-                for number, (angles, leds) in enumerate(zip(plan.angles_deg, plan.shown, strict=True), 1):
+                for number, (angles, leds) in enumerate(
+                    zip(plan.angles_deg, plan.shown, strict=True), 1
+                ):
                     button = ui.button(str(number), on_click=partial(self.point, number - 1)).props(
                         "dense flat size=sm"
                     )
@@ -230,7 +249,9 @@ class PlanPanel:
         scene = self.page.state.scene
         with self.working():
             try:
-                overrides = await run.io_bound(survey_flight, scene, self.page.state.overrides, self.plan.angles_deg)
+                overrides = await run.io_bound(
+                    survey_flight, scene, self.page.state.overrides, self.plan.angles_deg
+                )
             except InputError as error:
                 self.page.show_message(for_page(error))
                 return
@@ -271,13 +292,21 @@ def ambiguity_text(found: AmbiguityMap) -> str:
 
 def prediction_text(plan: SurveyPlan) -> str:
     """What a survey is predicted to reach with the attitudes of its plan."""
-    steps = [f"after {frames} frames {measured} LEDs to {mm:.2g} mm rms" for frames, measured, mm in plan.steps if mm]
+    steps = [
+        f"after {frames} frames {measured} LEDs to {mm:.2g} mm rms"
+        for frames, measured, mm in plan.steps
+        if mm
+    ]
     return f"Predicted of the {plan.leds} LEDs: {'; '.join(steps) or 'none measured, the frames are too few'}."
 
 
 def survey_lines(found: SurveyFound) -> list[str]:
     """What the frames of a survey have measured, and the faults of the dome."""
-    missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."] if found.missed else []
+    missed = (
+        [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
+        if found.missed
+        else []
+    )
     unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
     if found.refusal:
         return [
@@ -311,10 +340,17 @@ def survey_flight(
     for angles in angles_deg:
         attitude = stops.from_angles(np.array([angles]))[0]
         if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:
-            legs += [slew((0.0, 0.0, yaw_deg)) for yaw_deg in (float(at.as_euler("ZYX", degrees=True)[0]), angles[2])]
+            legs += [
+                slew((0.0, 0.0, yaw_deg))
+                for yaw_deg in (float(at.as_euler("ZYX", degrees=True)[0]), angles[2])
+            ]
         legs += [slew(angles), {"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"}]
         at = attitude
-    flown = {**overrides, "motion.maneuver": forms.yaml_line(legs), "exposure.rate_hz": f"{rate_hz:g}"}
+    flown = {
+        **overrides,
+        "motion.maneuver": forms.yaml_line(legs),
+        "exposure.rate_hz": f"{rate_hz:g}",
+    }
     flown["exposure.first"] = "0 s"
     if before.motion.control is None:
         flown["motion.control"] = PRESCRIBED
@@ -325,10 +361,17 @@ def survey_flight(
 def slew(angles_deg: Sequence[float]) -> dict[str, object]:
     """A slew to roll, pitch and yaw, as a maneuver of a scene."""
     names = "roll_deg", "pitch_deg", "yaw_deg"
-    return {"kind": "slew", **{name: round(angle, 3) for name, angle in zip(names, angles_deg, strict=True)}}
+    return {
+        "kind": "slew",
+        **{name: round(angle, 3) for name, angle in zip(names, angles_deg, strict=True)},
+    }
 
 
 def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
     """Greatest tilt of the vehicle between two attitudes lab_from_body, along the rotation about one axis."""
     share = np.linspace(0, 1, TILT_STEPS)[:, None]
-    return float(multibody.tilt_deg(first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())).max())
+    return float(
+        multibody.tilt_deg(
+            first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
+        ).max()
+    )

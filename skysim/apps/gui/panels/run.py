@@ -70,23 +70,41 @@ class RunPanel:
 
     def build(self) -> None:
         with ui.row().classes("w-full no-wrap items-center gap-1"):
-            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props("dense outline size=sm")
+            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props(
+                "dense outline size=sm"
+            )
             self.simulate_button.mark("fly")
-            self.back = self.player_button("skip_previous", "Previous frame", partial(self.step, -1))
+            self.back = self.player_button(
+                "skip_previous", "Previous frame", partial(self.step, -1)
+            )
             self.play = self.player_button("play_arrow", "Play", self.toggle)
             self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
-            self.speed = ui.select(list(SPEEDS), value="real time").props('dense borderless aria-label="Speed"')
-            self.speed.classes("w-24").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(self.resync)
-            self.loop = ui.select({}, on_change=self.close_loop).props("dense borderless options-dense")
-            self.loop.props('aria-label="Feedback"').mark("feedback").on("popup-hide", js_handler=keys.BLUR_JS)
+            self.speed = ui.select(list(SPEEDS), value="real time").props(
+                'dense borderless aria-label="Speed"'
+            )
+            self.speed.classes("w-24").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(
+                self.resync
+            )
+            self.loop = ui.select({}, on_change=self.close_loop).props(
+                "dense borderless options-dense"
+            )
+            self.loop.props('aria-label="Feedback"').mark("feedback").on(
+                "popup-hide", js_handler=keys.BLUR_JS
+            )
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
-            self.seek = LiveInput(self.contents, "range").props('min=0 step=1 aria-label="Frame of the flight"')
-            self.seek.classes("lab-seek").on("input", self.slid, js_handler="event => emit(event.target.value)")
+            self.seek = LiveInput(self.contents, "range").props(
+                'min=0 step=1 aria-label="Frame of the flight"'
+            )
+            self.seek.classes("lab-seek").on(
+                "input", self.slid, js_handler="event => emit(event.target.value)"
+            )
             self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
-            self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
+            self.csv_button = (
+                ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
+            )
         self.strips = StripChart(self.contents)
         self.enable()
 
@@ -140,14 +158,26 @@ class RunPanel:
         feedback = str(self.loop.value or "")
         if self.closed_scene != state.scene or feedback == (self.feedback or ""):
             return
-        others = {key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)}
-        controls = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
-        maneuver = {key: value for key, value in controls.items() if feedback and key.startswith("motion.maneuver")}
+        others = {
+            key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)
+        }
+        controls = {
+            key: value
+            for key, value in self.closed_overrides.items()
+            if key.startswith(CONTROL_KEYS)
+        }
+        maneuver = {
+            key: value
+            for key, value in controls.items()
+            if feedback and key.startswith("motion.maneuver")
+        }
         control = loop_overrides(state.scene, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
         await self.page.open(state.scene, others | maneuver | control)
         if self.page.is_open:
-            self.loop.set_value(self.feedback or "")  # the old value, if the scene refused the change
+            self.loop.set_value(
+                self.feedback or ""
+            )  # the old value, if the scene refused the change
             self.loop.enable()
 
     # Computing.
@@ -212,7 +242,9 @@ class RunPanel:
         self.drawn_s = time.monotonic()
         ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
         lights = () if self.computing else self.residuals  # which are many, and sent once
-        self.strips.draw(strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name)
+        self.strips.draw(
+            strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name
+        )
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
 
@@ -280,7 +312,9 @@ class RunPanel:
         """Show the frame nearest to a time of the flight."""
         if self.rows and not self.computing:
             self.pause()
-            await self.show_index(min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s)))
+            await self.show_index(
+                min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s))
+            )
 
     async def slid(self, event: Any) -> None:
         """The slider is dragged: show the frame at its place, of several the newest."""
@@ -329,4 +363,6 @@ class RunPanel:
         await self.sensor.wait_drawn()
 
     def download(self) -> None:
-        ui.download(csv_table(FrameRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv")
+        ui.download(
+            csv_table(FrameRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv"
+        )

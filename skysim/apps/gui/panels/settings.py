@@ -51,7 +51,9 @@ class KeyForm:
     rows, labels, inputs : by key its elements;  expansions : by group
     """
 
-    def __init__(self, page: PageContext, label: Callable[[forms.Field], str], opens: str = "") -> None:
+    def __init__(
+        self, page: PageContext, label: Callable[[forms.Field], str], opens: str = ""
+    ) -> None:
         self.page = page
         self.label = label
         self.opens = opens
@@ -95,12 +97,18 @@ class KeyForm:
 
     def row(self, field: forms.Field) -> None:
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
-            head = ui.label(self.label(field)).classes("mono w-48 flex-none ellipsis").style("padding-top: 6px")
+            head = (
+                ui.label(self.label(field))
+                .classes("mono w-48 flex-none ellipsis")
+                .style("padding-top: 6px")
+            )
             head.tooltip(field.key).classes(self.style_class(field))
             if field.allowed_values:
                 selected = field.shown if field.shown in field.allowed_values else None
                 entry: ui.input | ui.select = ui.select(list(field.allowed_values), value=selected)
-                entry.props("dense outlined options-dense").on_value_change(partial(self.edit, field.key))
+                entry.props("dense outlined options-dense").on_value_change(
+                    partial(self.edit, field.key)
+                )
                 entry.on("popup-hide", js_handler=keys.BLUR_JS)
                 if len(field.allowed_values) == 1:
                     entry.props("readonly hide-dropdown-icon")
@@ -108,7 +116,9 @@ class KeyForm:
                 entry = ui.input(value=field.shown).props(f'dense outlined suffix="{field.unit}"')
                 leave = partial(self.edit, field.key)
                 entry.on("keydown.enter", leave).on("blur", leave)
-            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(f"key-{field.key}")
+            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(
+                f"key-{field.key}"
+            )
             entry.props(f'hide-bottom-space aria-label="{field.key}"')
         self.rows[field.key] = box
         self.inputs[field.key] = entry
@@ -116,13 +126,17 @@ class KeyForm:
 
     def style_class(self, field: forms.Field) -> str:
         """Style class of a key: changed by the user, set in a file, or default."""
-        changed = any(field.key == key or field.key.startswith(f"{key}.") for key in self.page.state.overrides)
+        changed = any(
+            field.key == key or field.key.startswith(f"{key}.") for key in self.page.state.overrides
+        )
         return "warn" if changed else "given" if field.is_set else "quiet"
 
     def update_field(self, field: forms.Field, before: forms.Field) -> None:
         """Update a field after the scene has changed; text typed since then is kept."""
         self.labels[field.key].classes(remove="warn given quiet", add=self.style_class(field))
-        if field.shown != before.shown and (not field.allowed_values or field.shown in field.allowed_values):
+        if field.shown != before.shown and (
+            not field.allowed_values or field.shown in field.allowed_values
+        ):
             self.last_typed[field.key] = field.shown
             self.inputs[field.key].set_value(field.shown)
             self.show_error(field.key, "")
@@ -176,10 +190,18 @@ class ScenePanel:
         with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
-            self.name = ui.input(placeholder="new-name").props('dense outlined aria-label="Name of the new scene"')
+            self.name = ui.input(placeholder="new-name").props(
+                'dense outlined aria-label="Name of the new scene"'
+            )
             self.name.classes("w-36").mark("save-name")
-            ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark("save")
-            self.undo = ui.button("Undo all", on_click=self.revert).props("dense flat no-wrap size=sm").mark("revert")
+            ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark(
+                "save"
+            )
+            self.undo = (
+                ui.button("Undo all", on_click=self.revert)
+                .props("dense flat no-wrap size=sm")
+                .mark("revert")
+            )
         self.no_match = ui.label("No key contains this text.").classes("w-full empty")
         self.no_match.set_visibility(False)
         self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
@@ -187,7 +209,9 @@ class ScenePanel:
     def set_scene(self, fields: Sequence[forms.Field]) -> None:
         """Show the fields of the current scene."""
         sections = dict.fromkeys(field.section for field in fields)
-        self.form.show({name: [field for field in fields if field.section == name] for name in sections})
+        self.form.show(
+            {name: [field for field in fields if field.section == name] for name in sections}
+        )
         self.undo.set_visibility(bool(self.page.state.overrides))
         self.filter()
 
@@ -206,7 +230,11 @@ class ScenePanel:
         self.filter()
         expansions = self.form.expansions.values()
         first = next((item for item in expansions if item.visible), None)
-        if self.find.value and first and not any(item.value and item.visible for item in expansions):
+        if (
+            self.find.value
+            and first
+            and not any(item.value and item.visible for item in expansions)
+        ):
             first.open()
 
     async def save(self) -> None:
@@ -216,7 +244,9 @@ class ScenePanel:
         title = f"{title_before}, changed" if title_before else name
         state = self.page.state
         try:
-            path = await run.io_bound(forms.save, self.folder, name, state.scene, state.overrides, title)
+            path = await run.io_bound(
+                forms.save, self.folder, name, state.scene, state.overrides, title
+            )
         except InputError as error:
             self.page.show_message(for_page(error))
             return
@@ -248,24 +278,36 @@ class TrackerPanel:
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
         ui.label(MODEL).classes("quiet").style("margin: 10px 0 4px")
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.arcsec = ui.number("noise, ″ an axis", min=0, step=1).props("dense outlined").mark("noise-arcsec")
+            self.arcsec = (
+                ui.number("noise, ″ an axis", min=0, step=1)
+                .props("dense outlined")
+                .mark("noise-arcsec")
+            )
             self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
-            magnitude = ui.number("noise, magnitudes", min=0, max=5, step=0.05).props("dense outlined")
+            magnitude = ui.number("noise, magnitudes", min=0, max=5, step=0.05).props(
+                "dense outlined"
+            )
             magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
-            ui.checkbox("with noise").props("dense size=xs").bind_value(study.with_noise).mark("model-noise")
+            ui.checkbox("with noise").props("dense size=xs").bind_value(study.with_noise).mark(
+                "model-noise"
+            )
         study.noise.on_value_change(self.show_noise)
 
     def set_scene(self, fields: Sequence[forms.Field]) -> None:
         """Show the fields of the current scene."""
         offered = {field.key: field for field in fields if not field.no_effect}
-        self.form.show({group: [offered[key] for key in NAMES[group] if key in offered] for group in NAMES})
+        self.form.show(
+            {group: [offered[key] for key in NAMES[group] if key in offered] for group in NAMES}
+        )
         self.show_noise()
 
     def show_noise(self) -> None:
         """Show the noise of a centroid, which is in pixels, as an angle in the middle of the frame."""
         info = self.page.scene_info
         if info:
-            self.arcsec.set_value(float(f"{float(self.study.noise.value or 0) * info.pixel_arcsec:.4g}"))
+            self.arcsec.set_value(
+                float(f"{float(self.study.noise.value or 0) * info.pixel_arcsec:.4g}")
+            )
 
     def typed(self) -> None:
         """Take over a typed angle."""
@@ -280,6 +322,8 @@ class TrackerPanel:
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()
-            entry = self.form.inputs.get(f"tracker.{'detector' if group == SENSOR else 'identifier'}")
+            entry = self.form.inputs.get(
+                f"tracker.{'detector' if group == SENSOR else 'identifier'}"
+            )
             if entry:
                 ui.timer(FOCUS_S, partial(keys.focus, entry), once=True)

@@ -84,7 +84,9 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
     """Dots over a strip, implemented in strips.js."""
 
 
-def strips(rows: Sequence[FrameRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()) -> list[Strip]:
+def strips(
+    rows: Sequence[FrameRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
+) -> list[Strip]:
     """The strips of a flight that have something to show. residuals : see `FlightStep`"""
 
     def of_frames(value: Callable[[FrameRow], float]) -> Points:
@@ -93,7 +95,9 @@ def strips(rows: Sequence[FrameRow], log: MotionLog, residuals: Sequence[tuple[f
 
     def of_motion(name: str) -> Curve:
         values = log.curves.get(name, ())
-        return Curve(name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)])
+        return Curve(
+            name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)]
+        )
 
     found = [
         Strip(
@@ -189,33 +193,61 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     rule = {"lineStyle": {":color": chart_color("line")}}
     title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
     title = {"padding": 0, "left": 0, "textStyle": title_text}
-    legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
+    legend = {
+        "textStyle": text,
+        "itemWidth": 14,
+        "itemHeight": 7,
+        "itemGap": 10,
+        "right": 10,
+        "padding": 0,
+    }
     tops = [n * STRIP_PX for n in range(len(drawn))]
     grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
     last = len(drawn) - 1
     return {
         "animation": False,
-        "title": [title | {"text": one.title, "top": top + 3} for one, top in zip(drawn, tops, strict=True)],
+        "title": [
+            title | {"text": one.title, "top": top + 3}
+            for one, top in zip(drawn, tops, strict=True)
+        ],
         "legend": [
             legend | {"top": top + 3, "data": [curve.name for curve in one.drawn]}
             for one, top in zip(drawn, tops, strict=True)
         ],
         "tooltip": TOOLTIP,
-        "axisPointer": {"link": [{"xAxisIndex": "all"}], "lineStyle": {":color": chart_color("text")}},
+        "axisPointer": {
+            "link": [{"xAxisIndex": "all"}],
+            "lineStyle": {":color": chart_color("text")},
+        },
         "dataZoom": [
-            {"type": "inside", "xAxisIndex": "all", "zoomOnMouseWheel": "ctrl", "moveOnMouseMove": "shift"}
+            {
+                "type": "inside",
+                "xAxisIndex": "all",
+                "zoomOnMouseWheel": "ctrl",
+                "moveOnMouseMove": "shift",
+            }
             | {"moveOnMouseWheel": False, "filterMode": "none"}
         ],
         "grid": [grid | {"top": top + HEAD_PX} for top in tops],
         "xAxis": [
             x_axis
-            | {"gridIndex": n, "axisLabel": text | {"show": n == last, "formatter": "{value} s"}, "axisTick": rule}
+            | {
+                "gridIndex": n,
+                "axisLabel": text | {"show": n == last, "formatter": "{value} s"},
+                "axisTick": rule,
+            }
             for n in range(len(drawn))
         ],
-        "yAxis": [y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)],
+        "yAxis": [
+            y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)
+        ],
         "series": [
-            *(series(curve, n, k) for n, one in enumerate(drawn) for k, curve in enumerate(one.drawn)),
+            *(
+                series(curve, n, k)
+                for n, one in enumerate(drawn)
+                for k, curve in enumerate(one.drawn)
+            ),
         ],
     }
 
@@ -224,7 +256,9 @@ def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
     if strip.dots:
         return axis | {"min": 0, "max": round_up(max(dot[1] for dot in strip.dots))}
-    return axis | (decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {})
+    return axis | (
+        decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {}
+    )
 
 
 def round_up(value: float) -> float:
@@ -244,13 +278,26 @@ def decades(values: list[float]) -> dict[str, float]:
 def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
     """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
     color = CURVE_COLORS[k % len(CURVE_COLORS)]
-    look: dict[str, Any] = {"itemStyle": {"color": color}, "symbolSize": 5, "showSymbol": curve.kind == "dots"}
+    look: dict[str, Any] = {
+        "itemStyle": {"color": color},
+        "symbolSize": 5,
+        "showSymbol": curve.kind == "dots",
+    }
     if curve.kind == "band":
         color = BAND_COLOR
-        look = {"areaStyle": {"color": color, "opacity": 0.22}, "showSymbol": False, "itemStyle": {"color": color}}
+        look = {
+            "areaStyle": {"color": color, "opacity": 0.22},
+            "showSymbol": False,
+            "itemStyle": {"color": color},
+        }
     line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
     kind = "scatter" if curve.kind == "dots" else "line"
-    return {"name": curve.name, "type": kind, "data": curve.points, "animation": False} | look | line | in_strip(n)
+    return (
+        {"name": curve.name, "type": kind, "data": curve.points, "animation": False}
+        | look
+        | line
+        | in_strip(n)
+    )
 
 
 def in_strip(n: int) -> dict[str, int]:

@@ -46,11 +46,16 @@ class Asked(Protocol):
         """Show the frame of the live scene that a task renders."""
 
     async def open(
-        self, scene: str, overrides: Mapping[str, str] | None = None, angles_deg: Triple | None = None
+        self,
+        scene: str,
+        overrides: Mapping[str, str] | None = None,
+        angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
 
-    async def apply_overrides(self, overrides: Mapping[str, str], dropped: Collection[str] = ()) -> None:
+    async def apply_overrides(
+        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+    ) -> None:
         """Reopen the scene with further overrides and without some."""
 
 

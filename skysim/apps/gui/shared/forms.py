@@ -42,7 +42,17 @@ DISPLAY_UNITS = {
     "px_s": "px/s",
 }
 UNIT_SUFFIX = re.compile(rf"_({'|'.join(sorted(DISPLAY_UNITS, key=len, reverse=True))})$")
-SECTIONS = ("vehicle", "motion", "site", "light", "background", "camera", "exposure", "filter", "tracker")
+SECTIONS = (
+    "vehicle",
+    "motion",
+    "site",
+    "light",
+    "background",
+    "camera",
+    "exposure",
+    "filter",
+    "tracker",
+)
 NO_SECTION = "none"  # the kind of a section that is left out
 # Values of the keys that a kind of section requires, when it is chosen. A kind without them, as of a file, is not
 # offered; nor is another kind of light, which requires another start of the motion.
@@ -126,7 +136,9 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
     return sorted(form_fields, key=lambda item: order.index(item.section))
 
 
-def section_fields(model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()) -> Iterator[Field]:
+def section_fields(
+    model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()
+) -> Iterator[Field]:
     """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
 
     kinds : that the section could have instead of its own
@@ -153,7 +165,11 @@ def section_fields(model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, .
 
 def short_path(value: Any) -> Any:
     """Shorten the path of a shipped file to its name in scenes/."""
-    return str(Path(value).relative_to(SCENES)) if isinstance(value, str) and value.startswith(str(SCENES)) else value
+    return (
+        str(Path(value).relative_to(SCENES))
+        if isinstance(value, str) and value.startswith(str(SCENES))
+        else value
+    )
 
 
 def display_unit(file_key: str) -> str:
@@ -169,7 +185,9 @@ def allowed_values(annotation: Any) -> tuple[str, ...]:
     if get_origin(annotation) is Literal:
         return tuple(str(item) for item in get_args(annotation))
     parts = [item for item in get_args(annotation) if item is not type(None)]
-    return allowed_values(parts[0]) if len(parts) == 1 and get_origin(annotation) is not tuple else ()
+    return (
+        allowed_values(parts[0]) if len(parts) == 1 and get_origin(annotation) is not tuple else ()
+    )
 
 
 def models(annotation: Any) -> dict[str, type[BaseModel]]:
@@ -178,7 +196,9 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
         kind = annotation.model_fields.get("kind")
         return dict.fromkeys(allowed_values(kind.annotation), annotation) if kind else {}
     found: dict[str, type[BaseModel]] = {}
-    for part in get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ():
+    for part in (
+        get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+    ):
         found |= models(part)
     return found
 
@@ -186,14 +206,24 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
 @cache
 def offered_kinds(annotation: Any) -> tuple[str, ...]:
     """The kinds that a section may be given by a choice, with NO_SECTION if it may be left out; () if there is none."""
-    found = tuple(kind for kind, model in models(annotation).items() if first_section(model, kind) is not None)
+    found = tuple(
+        kind for kind, model in models(annotation).items() if first_section(model, kind) is not None
+    )
     return (NO_SECTION, *found) if found and NoneType in get_args(annotation) else found
 
 
-def first_section(model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+def first_section(
+    model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None
+) -> dict[str, Any] | None:
     """A section of a kind with the keys that it requires and others that are kept; None if their values are unknown."""
-    required = [info.alias or name for name, info in model.model_fields.items() if info.is_required()]
-    section = {"kind": kind} | {key: FIRST_VALUES[key] for key in required if key in FIRST_VALUES} | dict(kept or {})
+    required = [
+        info.alias or name for name, info in model.model_fields.items() if info.is_required()
+    ]
+    section = (
+        {"kind": kind}
+        | {key: FIRST_VALUES[key] for key in required if key in FIRST_VALUES}
+        | dict(kept or {})
+    )
     try:
         model.model_validate(section)
     except ValidationError:
@@ -207,9 +237,13 @@ def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> 
     The kind of a section replaces the section.
     """
     section = key.removesuffix(".kind")
-    changed = with_kind(name, overrides, section, text) if section != key else {**overrides, key: text}
+    changed = (
+        with_kind(name, overrides, section, text) if section != key else {**overrides, key: text}
+    )
     scene = load(name, changed, refuses_unused=False)
-    kept = {one: value for one, value in changed.items() if one == key or not unused.reason(one, scene)}
+    kept = {
+        one: value for one, value in changed.items() if one == key or not unused.reason(one, scene)
+    }
     validated_scene(name, kept)
     return kept
 
@@ -219,7 +253,11 @@ def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) 
 
     Keys that both kinds have keep their values.
     """
-    rest = {key: text for key, text in overrides.items() if key != section and not key.startswith(f"{section}.")}
+    rest = {
+        key: text
+        for key, text in overrides.items()
+        if key != section and not key.startswith(f"{section}.")
+    }
     info, in_file = section_at(load(name, rest, refuses_unused=False), section)
     if kind == getattr(in_file, "kind", NO_SECTION):
         return rest
@@ -230,7 +268,9 @@ def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) 
     kept = {
         info.alias or field: file_value(getattr(now, field), si_unit(field))
         for field, info in (type(now).model_fields.items() if isinstance(now, BaseModel) else ())
-        if field != "kind" and field in now.model_fields_set and same_field(model, field, info.annotation)
+        if field != "kind"
+        and field in now.model_fields_set
+        and same_field(model, field, info.annotation)
     }
     found = first_section(model, kind, kept) or first_section(model, kind)
     return rest | {section: yaml_line(found)}
@@ -269,7 +309,9 @@ def yaml_line(value: Any) -> str:
     """Format a value as one line of YAML; strings are returned unchanged."""
     if isinstance(value, str):
         return value
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False)
+    text = yaml.safe_dump(
+        value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False
+    )
     return text.strip().removesuffix("...").strip()
 
 
@@ -314,7 +356,9 @@ def field_override(name: str, overrides: Mapping[str, str], field_deg: float) ->
     if not 0.5 <= field_deg <= 120:
         raise InputError("field", "", "0.5 to 120 deg")
     camera = load(name, overrides).camera
-    focal_m = camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
+    focal_m = (
+        camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
+    )
     return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
 
 

@@ -29,15 +29,39 @@ MOVES = {  # right, up, roll clockwise, in steps of a key press
     "r": (0, 0, 1),
 }
 KEYS = (
-    Key(tuple(MOVES)[:4], "← ↑ ↓ →", "move", "move", "move the boresight by a fiftieth of the field of view"),
-    Key(("e", "r"), "E R", "move", "roll", "roll the camera by a degree: E counterclockwise, R clockwise"),
+    Key(
+        tuple(MOVES)[:4],
+        "← ↑ ↓ →",
+        "move",
+        "move",
+        "move the boresight by a fiftieth of the field of view",
+    ),
+    Key(
+        ("e", "r"),
+        "E R",
+        "move",
+        "roll",
+        "roll the camera by a degree: E counterclockwise, R clockwise",
+    ),
     Key(("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"),
     Key(("1",), "1", "identify", "identify", "render a new frame and solve it"),
     Key(("n",), "N", "noise", "noise", "render without the camera's noise, or with it again"),
-    Key(("2",), "2", "monte_carlo", "Monte Carlo", "start a Monte Carlo study; F8 sets its number of trials"),
+    Key(
+        ("2",),
+        "2",
+        "monte_carlo",
+        "Monte Carlo",
+        "start a Monte Carlo study; F8 sets its number of trials",
+    ),
     Key(("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"),
     Key(("F6",), "F6", "sensor", "sensor", "set up image processing and the sensor's noise"),
-    Key(("F7",), "F7", "identifier", "identifier", "set up star identification: algorithm, tolerance, magnitudes"),
+    Key(
+        ("F7",),
+        "F7",
+        "identifier",
+        "identifier",
+        "set up star identification: algorithm, tolerance, magnitudes",
+    ),
     Key(("F8",), "F8", "runs", "runs, field", "set the number of runs and the field of view"),
     Key(("p",), "P", "play", "", "play the flight, or pause"),
     Key((",", "."), ", .", "step", "", "show the previous or the next frame of the flight"),
@@ -82,7 +106,9 @@ def help_dialog() -> ui.dialog:
             "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
             " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
         )
-        with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
+        with ui.element("div").style(
+            "display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"
+        ):
             for key in KEYS:
                 label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
                 ui.html(label, sanitize=False)

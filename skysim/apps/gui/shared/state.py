@@ -41,10 +41,16 @@ class View:
 
     def query(self) -> str:
         """The view as the query of an address, without what has its default."""
-        pairs = [("scene", self.scene), *(("set", f"{key}={value}") for key, value in self.overrides.items())]
+        pairs = [
+            ("scene", self.scene),
+            *(("set", f"{key}={value}") for key, value in self.overrides.items()),
+        ]
         optional = (
             ("view", self.kind if self.kind != "live" else ""),
-            ("at", ",".join(f"{angle:.6f}" for angle in self.angles_deg) if self.angles_deg else ""),
+            (
+                "at",
+                ",".join(f"{angle:.6f}" for angle in self.angles_deg) if self.angles_deg else "",
+            ),
             ("t", f"{self.t_s:.4f}" if self.kind == "flight" else ""),
             ("study", self.study),
             ("trial", str(self.trial) if self.kind == "replay" else ""),
@@ -63,7 +69,9 @@ class View:
         if "scene" not in one:
             return None
         if one["scene"] not in scenes:
-            raise InputError("link", f"scene {one['scene']!r} is not offered here; choose one from the list")
+            raise InputError(
+                "link", f"scene {one['scene']!r} is not offered here; choose one from the list"
+            )
         kind = one.get("view", "live")
         if kind not in KINDS:
             raise InputError("link", f"view {kind!r}", ", ".join(KINDS))

@@ -22,7 +22,9 @@ COLORS = {
 KINDS = tuple(COLORS)
 MAX_LABELS = 40  # most names; the brightest lights get them
 MAX_TRUTH_MARKS = 400  # most marks of true lights
-UNSOLVED_TICKS = 60  # of the brightest true lights of a frame without detections; fainter ones are dots
+UNSOLVED_TICKS = (
+    60  # of the brightest true lights of a frame without detections; fainter ones are dots
+)
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
 Points = list[list[float]]  # to a tenth of a pixel, for a short message
@@ -43,7 +45,8 @@ def marks(
     is_identified = np.array(ids, np.int64) >= 0
     visible = lights[:MAX_TRUTH_MARKS]
     near_x, near_y = (
-        np.abs(np.subtract.outer(*pair)) < NEAR_PX for pair in zip(lights.xy_px.T, found_px.T, strict=True)
+        np.abs(np.subtract.outer(*pair)) < NEAR_PX
+        for pair in zip(lights.xy_px.T, found_px.T, strict=True)
     )
     near = near_x & near_y  # of each true light and each detection
     bright = bright_count(visible, ids, near[: len(visible)])

@@ -113,7 +113,9 @@ class Sensor:
                 box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
-            self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props("dense size=xs")
+            self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props(
+                "dense size=xs"
+            )
             self.grid.mark("grid")
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
@@ -252,7 +254,9 @@ class Sensor:
         detections = self.result.detections if self.result else ()
         spot = nearest(np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2))
         light = nearest(self.lights.xy_px)
-        return None if spot is None else detections[spot], None if light is None else self.lights[light]
+        return None if spot is None else detections[spot], None if light is None else self.lights[
+            light
+        ]
 
     def light_text(self, detection: Detection | None, light: Light | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
@@ -263,11 +267,19 @@ class Sensor:
             lines += [f"           {brightness}{light.electrons:.4g} e-"]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            lines += [f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"]
-            residual = "" if math.isnan(detection.residual_px) else f"   residual {detection.residual_px:.3f} px"
+            lines += [
+                f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"
+            ]
+            residual = (
+                ""
+                if math.isnan(detection.residual_px)
+                else f"   residual {detection.residual_px:.3f} px"
+            )
             lines += [f"           {identity}", f"           flux {detection.flux:.4g}{residual}"]
             if light:
-                lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
+                lines += [
+                    f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"
+                ]
         return "\n".join(lines)
 
 

@@ -105,7 +105,11 @@ class TabFrames:
             while True:
                 number = await asyncio.wait_for(waiting.get(), IDLE_S)
                 frame = self.newest.get(number)
-                data = await frame.response(frame.source.display or display, whole=False) if frame else None
+                data = (
+                    await frame.response(frame.source.display or display, whole=False)
+                    if frame
+                    else None
+                )
                 if data is not None:
                     yield struct.pack("<II", len(data), number) + data
         except TimeoutError:
@@ -113,7 +117,9 @@ class TabFrames:
         finally:
             if self.waiting is waiting:
                 self.waiting = None
-                if self.drawn < max(self.newest, default=0):  # the connection was lost before the browser got it
+                if self.drawn < max(
+                    self.newest, default=0
+                ):  # the connection was lost before the browser got it
                     self.announce(max(self.newest))
 
 

@@ -68,7 +68,9 @@ class Scene3D:
     def set_scene(self, scene_info: SceneInfo) -> None:
         lab = scene_info.geometry
         outside = lab.views["outside"]
-        distance_m = sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True)) ** 0.5
+        distance_m = (
+            sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True)) ** 0.5
+        )
         self.canvas.run_method(
             "build",
             {
@@ -117,7 +119,9 @@ class PushControl:
     before : attitude before the push, deg;  motion : of which frames are being computed; None if there is none
     """
 
-    def __init__(self, page: PageContext, sensor: Sensor, canvas: ui.element, moved: Callable[[], None]) -> None:
+    def __init__(
+        self, page: PageContext, sensor: Sensor, canvas: ui.element, moved: Callable[[], None]
+    ) -> None:
         self.page = page
         self.sensor = sensor
         self.moved = moved
@@ -130,7 +134,9 @@ class PushControl:
         with ui.element("div").classes("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
             button = (
-                ui.button("reset", color=None, on_click=self.reset).props("dense outline size=xs").mark("push-reset")
+                ui.button("reset", color=None, on_click=self.reset)
+                .props("dense outline size=xs")
+                .mark("push-reset")
             )
             button.props('title="back to the attitude before the push"')
         self.bar.set_visibility(False)

@@ -44,7 +44,9 @@ def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> d
         raise InputError("", "no frame has been rendered yet")
     with tempfile.TemporaryDirectory() as folder:
         frames.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
-        contents = {f"frame{path.suffix}": path.read_bytes() for path in sorted(Path(folder).iterdir())}
+        contents = {
+            f"frame{path.suffix}": path.read_bytes() for path in sorted(Path(folder).iterdir())
+        }
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
     if result := workbench.result:
@@ -63,7 +65,9 @@ def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
     return {
         "frame.fits": buffer.getvalue(),
         "frame.png": bytes(cv2.imencode(".png", image)[1]),
-        "figure.png": bytes(cv2.imencode(".png", annotate(image, detected, detected[identified]))[1]),
+        "figure.png": bytes(
+            cv2.imencode(".png", annotate(image, detected, detected[identified]))[1]
+        ),
         "solution.json": file_io.to_json(record).encode(),
     }
 

@@ -15,7 +15,16 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import NO_LIGHTS, NO_PIXELS, Lens, Lights, Pixels, Pose, TrackerResult, Triple
+from skysim.apps.gui.messages import (
+    NO_LIGHTS,
+    NO_PIXELS,
+    Lens,
+    Lights,
+    Pixels,
+    Pose,
+    TrackerResult,
+    Triple,
+)
 from skysim.apps.gui.worker.scene import lens as lenses
 from skysim.apps.gui.worker.workbench import (
     detection_views,
@@ -68,7 +77,9 @@ SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in ima
 Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and name
 
 
-def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
+def photo_from_file(
+    name: str, data: bytes, fov_deg: float | None, stages: Stages = ()
+) -> PhotoPixels:
     """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
@@ -99,7 +110,8 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
-    scene, (height, width) = setup.lab.scene, frame.image_dn.shape
+    scene = setup.lab.scene
+    (height, width) = frame.image_dn.shape
     photo = Photo(
         (width, height),
         result,
@@ -119,7 +131,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
 def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
     """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages), None))
+    return solved_photo(
+        image,
+        *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages), None),
+    )
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
@@ -127,7 +142,9 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     attitude = report.attitude
     detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))
     solution = plate_solver.solution_fields(report) if attitude.solved else {}
-    angles: Triple | None = (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
+    angles: Triple | None = (
+        (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
+    )
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf

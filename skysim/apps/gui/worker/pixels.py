@@ -23,7 +23,9 @@ from skysim.results import stretch
 
 LEVELS = 2**16 - 1
 HEADER_BYTES = 16
-SATURATED, SHADES = 255, 255  # the shade of saturated pixels, and the number of the others
+# the shade of saturated pixels, and the number of the others
+SATURATED = 255
+SHADES = 255
 WORTHWHILE = 0.95  # of the columns, above which all pixels are sent
 BINS = 80  # of the histogram
 AXIS_MARGIN = 0.3  # on either side of it, in units of its axis
@@ -51,7 +53,8 @@ def levels_of(image: NDArray) -> Levels:
     the least and the greatest value."""
     if image.dtype in (np.uint8, np.uint16):
         return Levels(image)
-    low, high = float(image.min()), float(image.max())
+    low = float(image.min())
+    high = float(image.max())
     step = (high - low) / LEVELS or 1.0
     return Levels(np.rint((image - low) / step).astype(np.uint16), low, step)
 
@@ -64,7 +67,9 @@ def levels_from(data: bytes, size_px: tuple[int, int]) -> Levels:
     """The levels that `Levels.data` has encoded. size_px : width and height"""
     offset, step = np.frombuffer(data, float, 2).tolist()
     kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16
-    return Levels(np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step)
+    return Levels(
+        np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step
+    )
 
 
 def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: int = 0) -> Pixels:
@@ -73,7 +78,8 @@ def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: i
 
     saturation_dn : from which a pixel is saturated;  number : of the image in its worker
     """
-    integers, (height, width) = levels.integers, levels.integers.shape
+    integers = levels.integers
+    (height, width) = levels.integers.shape
     limits = limits_of(levels, display.limits)
     saturation = (saturation_dn - levels.offset) / levels.step
     columns = columns_for(display, width, height)
@@ -95,7 +101,9 @@ def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: i
 
 def columns_for(display: Display, width: int, height: int) -> int:
     """The columns of the screen that an image fills; 0 if all pixels are needed."""
-    return math.floor(width * min(display.screen_px[0] / width, display.screen_px[1] / height) + 0.5)
+    return math.floor(
+        width * min(display.screen_px[0] / width, display.screen_px[1] / height) + 0.5
+    )
 
 
 def shades(
@@ -129,28 +137,43 @@ def _shade(integers: Any, table: Any, shaded: Any) -> None:
     """
     height, width = integers.shape
     rows, columns = shaded.shape
-    first, last = np.empty(columns, np.uint32), np.empty(columns, np.uint32)
-    head, tail = np.empty(columns, np.float32), np.empty(columns, np.float32)  # shares of the first and last pixel
+    first = np.empty(columns, np.uint32)
+    last = np.empty(columns, np.uint32)
+    # shares of the first and last pixel
+    head = np.empty(columns, np.float32)
+    tail = np.empty(columns, np.float32)
     for column in range(columns):
-        left, right = column * width, (column + 1) * width
-        first[column], last[column] = left // columns, (right - 1) // columns
+        left = column * width
+        right = (column + 1) * width
+        first[column] = left // columns
+        last[column] = (right - 1) // columns
         head[column] = (min(right, (left // columns + 1) * columns) - left) / width
-        tail[column] = (right - last[column] * columns) / width if last[column] > first[column] else 0.0
-    inner, last_level = float32(columns / width), int32(table.size - 1)
+        tail[column] = (
+            (right - last[column] * columns) / width if last[column] > first[column] else 0.0
+        )
+    inner = float32(columns / width)
+    last_level = int32(table.size - 1)
     for row in numba.prange(rows):
-        top, bottom = row * height, (row + 1) * height
-        total, mean = np.zeros(width, np.float32), np.empty(columns, np.float32)
+        top = row * height
+        bottom = (row + 1) * height
+        total = np.zeros(width, np.float32)
+        mean = np.empty(columns, np.float32)
         for y in range(top // rows, (bottom - 1) // rows + 1):
             share = float32((min(bottom, (y + 1) * rows) - max(top, y * rows)) / height)
             line = integers[y]
             for x in range(width):
                 total[x] += share * float32(line[x])
         for column in range(columns):
-            mean[column] = head[column] * total[uint64(first[column])] + tail[column] * total[uint64(last[column])]
+            mean[column] = (
+                head[column] * total[uint64(first[column])]
+                + tail[column] * total[uint64(last[column])]
+            )
             for x in range(uint64(first[column]) + uint64(1), uint64(last[column])):
                 mean[column] += inner * total[x]
         for column in range(columns):
-            shaded[row, column] = table[uint64(uint32(min(int32(mean[column] + float32(0.5)), last_level)))]
+            shaded[row, column] = table[
+                uint64(uint32(min(int32(mean[column] + float32(0.5)), last_level)))
+            ]
 
 
 @jit
@@ -161,8 +184,10 @@ def _mark(integers: Any, saturation: Any, shaded: Any) -> None:
     for y in range(height):
         for x in range(width):
             if integers[y, x] >= saturation:
-                top, bottom = y * rows // height, ((y + 1) * rows - 1) // height
-                left, right = x * columns // width, ((x + 1) * columns - 1) // width
+                top = y * rows // height
+                bottom = ((y + 1) * rows - 1) // height
+                left = x * columns // width
+                right = ((x + 1) * columns - 1) // width
                 shaded[top : bottom + 1, left : right + 1] = SATURATED
 
 
@@ -188,7 +213,8 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
     """
     sample = integers[:: 2 * stretch.SAMPLE_STRIDE, :: stretch.SAMPLE_STRIDE].astype(float)
-    low, high = float(integers.min()), float(integers.max())
+    low = float(integers.min())
+    high = float(integers.max())
     below, sky = np.percentile(sample, (25, 50))
     scatter = max(SIGMA_PER_MAD * float(sky - below), 1.0)
     first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)

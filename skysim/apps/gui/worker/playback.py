@@ -23,7 +23,9 @@ from skysim.simulation.timing import exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
-KEPT_BYTES = 2**28  # of frames in the file, beyond which they are rendered again when they are shown
+KEPT_BYTES = (
+    2**28
+)  # of frames in the file, beyond which they are rendered again when they are shown
 
 
 @dataclass
@@ -96,7 +98,8 @@ class Playback:
 
     def keep(self, frame: Frame) -> tuple[int, int] | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
-        data, begin = pixels.levels_of(frame.image_dn).data(), self.file.seek(0, 2)
+        data = pixels.levels_of(frame.image_dn).data()
+        begin = self.file.seek(0, 2)
         if begin + len(data) > KEPT_BYTES:
             return None
         self.file.write(data)
@@ -104,8 +107,10 @@ class Playback:
 
     def show(self, index: int) -> tuple[FrameView, pixels.Levels]:
         """The view of a kept frame and its pixels; the scene is seen from there from now on."""
-        kept, bench = self.frames[index], self.bench
-        self.shown, bench.frame = index, None
+        kept = self.frames[index]
+        bench = self.bench
+        self.shown = index
+        bench.frame = None
         bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
         if kept.place is None:
             self.render()
@@ -118,7 +123,8 @@ class Playback:
         """Render the shown frame with its truth, unless another frame of the scene has been rendered since."""
         if self.shown is None or self.bench.frame is not None:
             return
-        kept, bench = self.frames[self.shown], self.bench
+        kept = self.frames[self.shown]
+        bench = self.bench
         bench.frame, bench.truth = self.flight.render(self.shown)
         bench.report = kept.report
 
@@ -127,7 +133,17 @@ def frame_row(view: FrameView) -> FrameRow:
     """A frame of a flight in numbers."""
     result = view.result
     if result is None:
-        return FrameRow(view.t_s, NAN, NAN, NAN, NAN, len(view.lights), 0, view.filter_arcsec, view.innovation_arcsec)
+        return FrameRow(
+            view.t_s,
+            NAN,
+            NAN,
+            NAN,
+            NAN,
+            len(view.lights),
+            0,
+            view.filter_arcsec,
+            view.innovation_arcsec,
+        )
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     counts = len(view.lights), result.identified
@@ -143,11 +159,16 @@ def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
 
 def curves(log: Telemetry) -> MotionLog:
     """Curves of true and estimated attitude errors (arcsec), momentum (N m s) and rate (deg/s), decimated."""
-    attitudes = {"pointing": log.lab_from_ref, "IMU alone": log.lab_from_imu, "filter": log.lab_from_filter}
+    attitudes = {
+        "pointing": log.lab_from_ref,
+        "IMU alone": log.lab_from_imu,
+        "filter": log.lab_from_filter,
+    }
     values = {
         name: np.maximum(3600 * error_deg, FLOOR)
         for name, attitude in attitudes.items()
-        if (error_deg := telemetry_report.attitude_error_deg(attitude, log.lab_from_body)) is not None
+        if (error_deg := telemetry_report.attitude_error_deg(attitude, log.lab_from_body))
+        is not None
     }
     values["momentum"] = np.linalg.norm(log.momentum_nms, axis=1)
     values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
@@ -162,10 +183,14 @@ def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameVi
     if log.lab_from_filter is None:
         return view
     n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
-    error_arcsec = float((log.lab_from_filter[n].inv() * log.lab_from_body[n]).magnitude()) / ARCSEC_RAD
+    error_arcsec = (
+        float((log.lab_from_filter[n].inv() * log.lab_from_body[n]).magnitude()) / ARCSEC_RAD
+    )
     cam_from_lab = kept.report.attitude.cam_from_ref
     innovation_arcsec = math.nan
     if cam_from_lab is not None:
         lab_from_body = cam_from_lab.inv() * mount.cam_from_body
-        innovation_arcsec = float((lab_from_body.inv() * log.lab_from_filter[n]).magnitude()) / ARCSEC_RAD
+        innovation_arcsec = (
+            float((lab_from_body.inv() * log.lab_from_filter[n]).magnitude()) / ARCSEC_RAD
+        )
     return replace(view, filter_arcsec=error_arcsec, innovation_arcsec=innovation_arcsec)

@@ -20,7 +20,9 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
     from skysim.apps.gui.messages import Display
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
-SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
+SCENE = (
+    "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
+)
 STOPPED = "the worker of this page has stopped"
 QUEUE_S = 0.2  # between two looks for a free worker
 
@@ -80,7 +82,9 @@ class Session:
     async def run(self, task: str, *arguments: Any) -> Any:
         """Run a task and return its result. Raises InputError for a user error, WorkerLost if the worker has ended."""
         try:
-            return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
+            return await asyncio.get_running_loop().run_in_executor(
+                self.thread, self.call, task, arguments
+            )
         except (RuntimeError, asyncio.CancelledError) as error:
             if self in Session.alive:
                 raise
@@ -114,7 +118,8 @@ class Workers:
     """
 
     def __init__(self, limit: int) -> None:
-        self.limit, self.queue = limit, list[object]()
+        self.limit = limit
+        self.queue = list[object]()
 
     @staticmethod
     def prepare(scene: str) -> None:

@@ -51,7 +51,9 @@ class StudyResults(NamedTuple):
     failed: tuple[tuple[int, str], ...]
 
 
-def monte_carlo(scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int) -> str:
+def monte_carlo(
+    scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int
+) -> str:
     """YAML of a study with `count` random attitudes of a scene."""
     tree = {
         "schema": 1,
@@ -103,7 +105,10 @@ class StudyProcess:
         """Raise InputError if MAX_STUDIES run already."""
         cls.begun = {process for process in cls.begun if process.running}
         if len(cls.begun) >= MAX_STUDIES:
-            raise InputError("", f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended")
+            raise InputError(
+                "",
+                f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended",
+            )
 
     async def wait(self) -> str:
         """Wait for the process; return the last line of its standard error if it failed, else ""."""
@@ -126,7 +131,9 @@ class StudyProcess:
             return None
         try:
             with store.open_store(path) as stored:
-                counts, columns, raised = stored.counts(), stored.columns(failed=False), stored.failures()
+                counts = stored.counts()
+                columns = stored.columns(failed=False)
+                raised = stored.failures()
         except InputError:
             return None
         if not counts["done"]:
@@ -142,7 +149,9 @@ def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
     """(number, reason) of trials with a wrong frame, then of those with an unsolved one."""
     wrong = columns["wrong"] > 0
     refused = (columns["solved"] < columns["frames"]) & ~wrong
-    unsolved_trials = zip(columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True)
+    unsolved_trials = zip(
+        columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True
+    )
     return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *unsolved_trials]
 
 
@@ -150,7 +159,8 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
     """Bin centers and counts with logarithmic bins, because errors range from arc-seconds to degrees."""
     if not len(error_arcsec):
         return (), ()
-    low, high = max(float(error_arcsec.min()), 1e-3), max(float(error_arcsec.max()), 2e-3)
+    low = max(float(error_arcsec.min()), 1e-3)
+    high = max(float(error_arcsec.max()), 2e-3)
     edges = np.geomspace(low / 1.05, high * 1.05, BINS + 1)
     counts, _ = np.histogram(error_arcsec, edges)
     return tuple(np.sqrt(edges[1:] * edges[:-1]).tolist()), tuple(counts.tolist())
@@ -174,7 +184,9 @@ def is_shown(name: str, user: str) -> bool:
 
 def finished(folder: Path, user: str) -> list[Path]:
     """Folders of the studies that have a report and are shown to a user, the newest first."""
-    folders = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
+    folders = [
+        path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()
+    ]
     folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)
 

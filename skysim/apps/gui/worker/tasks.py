@@ -73,7 +73,9 @@ class Worker:
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
-        return replace(self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn))
+        return replace(
+            self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn)
+        )
 
     def show(self, levels: pixels.Levels, saturation_dn: float) -> Pixels:
         """Keep an image for the page, and return its pixels for the browser's display."""
@@ -111,14 +113,23 @@ class Worker:
         return pixels.pixels_for(display._replace(screen_px=(0, 0)), *self.shown[number], number)
 
     def open(
-        self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None
+        self,
+        scene: str,
+        overrides: Mapping[str, str],
+        solve: bool,
+        angles_deg: Triple | None = None,
     ) -> tuple[SceneInfo, FrameView]:
         """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
+            bench.lab_from_body = pointing.from_angles(
+                bench.scene, bench.lab.camera.mount, angles_deg
+            )
         self.current = bench
-        self.scene, self.overrides, self.flight, self.pushed = scene, dict(overrides), None, None
+        self.scene = scene
+        self.overrides = dict(overrides)
+        self.flight = None
+        self.pushed = None
         surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
         return replace(bench.scene_info, surveyed=surveyed), self.render(solve)
 
@@ -151,7 +162,9 @@ class Worker:
         view = bench.render(bench.next_run().camera, self.pushed.seen(), solve)
         view = self.show_frame(view, self.levels)
         rate_rad_s = np.linalg.norm(self.pushed.simulation.rate_body_rad_s)
-        return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
+        return PushedView(
+            view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s)
+        )
 
     def check(self) -> PlanCheck:
         return planning.check(self.workbench.lab)
@@ -204,14 +217,20 @@ class Worker:
             self.flight.render()
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
-    def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
+    def solve_file(
+        self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()
+    ) -> photo.Photo:
         return self.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
 
-    def solve_camera(self, source: str, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
+    def solve_camera(
+        self, source: str, fov_deg: float | None, stages: photo.Stages = ()
+    ) -> photo.Photo:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, stages))
+        return self.show_photo(
+            photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, stages)
+        )
 
     def release(self) -> None:
         """Close the live camera."""

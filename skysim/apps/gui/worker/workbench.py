@@ -15,7 +15,15 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import (
+    Detection,
+    FrameView,
+    LabGeometry,
+    Lens,
+    Lights,
+    SceneInfo,
+    TrackerResult,
+)
 from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
@@ -56,7 +64,9 @@ class Workbench:
     magnitude: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
+    def open(
+        cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None
+    ) -> Workbench:
         """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
         kept; if tracker or camera, its attitude.
 
@@ -69,10 +79,16 @@ class Workbench:
             lab = before.lab.with_scene(scene)
             return replace(before, scene=scene, lab=lab, estimator=warm_tracker(lab))
         lab = build_lab(scene)
-        same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
+        same = (
+            before
+            and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera})
+            == scene
+        )
         lab_from_body = before.lab_from_body if before and same else lab.start
         views = lens.scene_lens(lab), geometry.lab_geometry(lab)
-        return cls(scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab))
+        return cls(
+            scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab)
+        )
 
     @property
     def stages(self) -> dict[str, str]:
@@ -83,7 +99,8 @@ class Workbench:
     @property
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
-        scene, camera = self.scene, self.scene.camera
+        scene = self.scene
+        camera = self.scene.camera
         return SceneInfo(
             scene.name,
             scene.title,
@@ -102,7 +119,9 @@ class Workbench:
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
         camera = self.next_run().camera
-        return self.render(camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve)
+        return self.render(
+            camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve
+        )
 
     def next_run(self) -> Lab:
         """The lab in a run with its own noise."""
@@ -124,7 +143,9 @@ class Workbench:
         clock.lap("all")
         return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
 
-    def frame_view(self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float) -> FrameView:
+    def frame_view(
+        self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float
+    ) -> FrameView:
         """The view of a frame of this scene for the page, without its pixels."""
         height, width = frame.image_dn.shape
         return FrameView(
@@ -155,20 +176,27 @@ def id_prefix(lab: Lab) -> str:
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
-    sources, of_bodies = truth.sources, {body.id: body.v_mag for body in truth.bodies}
+    sources = truth.sources
+    of_bodies = {body.id: body.v_mag for body in truth.bodies}
     of_bodies |= {satellite.id: satellite.v_mag for satellite in truth.satellites}
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    return Lights(ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float))
+    return Lights(
+        ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float)
+    )
 
 
 def magnitude_by_id(lab: Lab) -> dict[int, float]:
     """V magnitude by a light's number; NaN for an LED."""
-    return dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
+    return dict(
+        zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+    )
 
 
-def tracker_result(lab: Lab, estimator: factory.Estimator, frame: Frame, truth: Truth, report: Report) -> TrackerResult:
+def tracker_result(
+    lab: Lab, estimator: factory.Estimator, frame: Frame, truth: Truth, report: Report
+) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
     row = scoring.row(lab.camera, frame, truth, report)
     return TrackerResult(
@@ -184,16 +212,23 @@ def tracker_result(lab: Lab, estimator: factory.Estimator, frame: Frame, truth: 
     )
 
 
-def detection_views(report: Report, names: Mapping[int, tuple[int, float]]) -> tuple[Detection, ...]:
+def detection_views(
+    report: Report, names: Mapping[int, tuple[int, float]]
+) -> tuple[Detection, ...]:
     """Detections with id and residual of their matched lights. names : (id, residual in pixels) by centroid row"""
     centroids = report.centroids
-    rows = zip(centroids.xy_px.tolist(), centroids.sigma_px.tolist(), centroids.flux.tolist(), strict=True)
+    rows = zip(
+        centroids.xy_px.tolist(), centroids.sigma_px.tolist(), centroids.flux.tolist(), strict=True
+    )
     return tuple(
-        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan))) for n, ((x, y), sigma, flux) in enumerate(rows)
+        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan)))
+        for n, ((x, y), sigma, flux) in enumerate(rows)
     )
 
 
-def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -> tuple[NDArray[np.int64], Floats]:
+def predicted_lights(
+    estimator: DomeTracker | StarTracker, attitude: Attitude
+) -> tuple[NDArray[np.int64], Floats]:
     """(N,) ids and (N, 2) predicted pixels of all lights on the tracker's map, for its attitude and camera model.
 
     If the solution has its own camera (the field of view was fitted), that camera is used.
@@ -207,17 +242,28 @@ def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -
     return estimator.stars.id, camera.pixels(attitude.cam_from_ref.apply(estimator.stars.vectors))
 
 
-def matches_by_row(estimator: factory.Estimator, attitude: Attitude, xy_px: Floats) -> dict[int, tuple[int, float]]:
+def matches_by_row(
+    estimator: factory.Estimator, attitude: Attitude, xy_px: Floats
+) -> dict[int, tuple[int, float]]:
     """By centroid row: (id of the matched light, distance from its predicted position in pixels)."""
-    if attitude.match is None or attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
+    if (
+        attitude.match is None
+        or attitude.cam_from_ref is None
+        or isinstance(estimator, factory.UserTracker)
+    ):
         return {}
     ids, predicted_px = predicted_lights(estimator, attitude)
-    rows, star = attitude.match.observed, attitude.match.star
+    rows = attitude.match.observed
+    star = attitude.match.star
     residual_px = np.hypot(*(predicted_px[star] - xy_px[rows]).T)
-    return dict(zip(rows.tolist(), zip(ids[star].tolist(), residual_px.tolist(), strict=True), strict=True))
+    return dict(
+        zip(rows.tolist(), zip(ids[star].tolist(), residual_px.tolist(), strict=True), strict=True)
+    )
 
 
-def search_windows_px(estimator: factory.Estimator, attitude: Attitude) -> tuple[tuple[float, float], ...]:
+def search_windows_px(
+    estimator: factory.Estimator, attitude: Attitude
+) -> tuple[tuple[float, float], ...]:
     """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
     if attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
         return ()

@@ -26,7 +26,8 @@ from skysim.dynamics.multibody.actuators.kind import (
 )
 from skysim.scene.sections.vehicle import CmgsConfig
 
-GIMBAL, ROTOR = "gimbal_", "rotor_"
+GIMBAL = "gimbal_"
+ROTOR = "rotor_"
 
 # Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
 DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
@@ -94,7 +95,8 @@ STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
 @jit
 def rotor_axles(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
     """Rotor axles (3, n) at the gimbal angles, s cos + t sin, and their derivative (3, n) by the gimbal angles."""
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    cosine = np.cos(angle_rad)
+    sine = np.sin(angle_rad)
     return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
 
 
@@ -116,10 +118,12 @@ def vscmg_commands(
     """
     gram = jacobian @ jacobian.T
     determinant = gram_determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
-    gimbal_weight, rotor_weight = rate_limit**2, torque_limit**2 * math.exp(-DAMPING_DECAY * determinant)
+    gimbal_weight = rate_limit**2
+    rotor_weight = torque_limit**2 * math.exp(-DAMPING_DECAY * determinant)
     # Weighted minimum norm: x = W B^T (B W B^T)^-1 dh/dt with B = [jacobian, axle] and W = diag(limits^2).
     multiplier = solve_gram(gimbal_weight * gram + rotor_weight * (axle @ axle.T), momentum_rate_nm)
-    rate, torque = gimbal_weight * (jacobian.T @ multiplier), rotor_weight * (axle.T @ multiplier)
+    rate = gimbal_weight * (jacobian.T @ multiplier)
+    torque = rotor_weight * (axle.T @ multiplier)
     scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
     return rate * scale, torque * scale
 
@@ -153,7 +157,9 @@ class CmgSet:
         if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
             raise InputError("rotor axes", "", "one for each gimbal, at right angles to its axis")
         if self.steering not in STEERING:
-            raise InputError("cmgs.steering", *unknown_name("steering law", self.steering, STEERING))
+            raise InputError(
+                "cmgs.steering", *unknown_name("steering law", self.steering, STEERING)
+            )
         arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
@@ -175,7 +181,8 @@ class CmgSet:
         sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of the
         rotors' size and number. 0 with the rotors at rest. (..., n) -> (...).
         """
-        angle, spin = np.asarray(angle_rad)[..., None, :], np.asarray(rotor_rad_s)[..., None, :]
+        angle = np.asarray(angle_rad)[..., None, :]
+        spin = np.asarray(rotor_rad_s)[..., None, :]
         cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
         jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
         gram = jacobian @ jacobian.swapaxes(-1, -2)
@@ -230,7 +237,8 @@ class CmgActuator:
         )
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        angle, spin = inputs.angles_rad[self.gimbals.qpos], inputs.speeds_rad_s[self.rotors.dof]
+        angle = inputs.angles_rad[self.gimbals.qpos]
+        spin = inputs.speeds_rad_s[self.rotors.dof]
         rate, torque = self.model.drive(torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s)
         control[self.gimbals.motor] = rate
         achieved_nm = -self.model.jacobian(angle, spin) @ rate
@@ -240,8 +248,12 @@ class CmgActuator:
         return achieved_nm
 
     def command_map(self) -> tuple[Floats, float]:
-        jacobian = self.model.jacobian(np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s))
-        return np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.model.gimbal_rate_limit_rad_s
+        jacobian = self.model.jacobian(
+            np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)
+        )
+        return np.asarray(
+            np.linalg.pinv(jacobian), dtype=np.float64
+        ), self.model.gimbal_rate_limit_rad_s
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
@@ -253,7 +265,9 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
-            raise InputError(path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
+            raise InputError(
+                path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own"
+            )
     if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
         raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
@@ -266,12 +280,18 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     a damper alone would not hold it.
     """
     tau_s = cmgs.gimbal_time_constant_s
-    for joint, inertia in zip(joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True):
-        servo = spec.add_actuator(name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
+    for joint, inertia in zip(
+        joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True
+    ):
+        servo = spec.add_actuator(
+            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
+        )
         servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
-            add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm)
+            add_motor(
+                spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm
+            )
 
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
@@ -284,4 +304,6 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
 
 
-CMGS = ActuatorKind("cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs)
+CMGS = ActuatorKind(
+    "cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs
+)

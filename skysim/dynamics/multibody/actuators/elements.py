@@ -41,7 +41,9 @@ class Hinges:
         mujoco.mj_forward(model, data)
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        names = sorted(name for name in all_names(model.joint, model.njnt) if name.startswith(prefix))
+        names = sorted(
+            name for name in all_names(model.joint, model.njnt) if name.startswith(prefix)
+        )
         ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
         dof = model.jnt_dofadr[ids].astype(np.int64)
         actuators = all_names(model.actuator, model.nu)
@@ -66,12 +68,16 @@ def all_names(element: Any, count: int) -> list[str]:
 
 def joints(spec: Any, prefix: str) -> list[Any]:
     """The joints of a spec whose name begins with prefix, in the order of their names."""
-    return sorted((j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name)
+    return sorted(
+        (j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name
+    )
 
 
 def sites(spec: Any, prefix: str) -> list[Any]:
     """The sites of a spec whose name begins with prefix, in the order of their names."""
-    return sorted((site for site in spec.sites if site.name.startswith(prefix)), key=lambda site: site.name)
+    return sorted(
+        (site for site in spec.sites if site.name.startswith(prefix)), key=lambda site: site.name
+    )
 
 
 def add_motor(

@@ -67,9 +67,12 @@ class FanSet:
     thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
 
     def __post_init__(self) -> None:
-        axes, positions = unit_columns(self.force_axes, "fan axes"), np.asarray(self.positions_m, dtype=float)
+        axes = unit_columns(self.force_axes, "fan axes")
+        positions = np.asarray(self.positions_m, dtype=float)
         if positions.shape != axes.shape:
-            raise InputError("fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes")
+            raise InputError(
+                "fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes"
+            )
         arms = np.cross(positions, axes, axis=0)
         object.__setattr__(self, "torque_per_thrust_m", arms)
         object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))
@@ -122,7 +125,9 @@ class Desaturator:
     def torque(self, momentum_nms: Floats) -> Floats:
         """Torque (3,) that the fans should give on the body: zero until |h| > start, then -h / time down to stop."""
         magnitude = math.sqrt(float(momentum_nms @ momentum_nms))
-        self.running = magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
+        self.running = (
+            magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
+        )
         return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
 
 
@@ -131,7 +136,8 @@ class MomentumDump:
 
     def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
         assert isinstance(fans, FanActuator)
-        self.fans, self.desaturator = fans, desaturator
+        self.fans = fans
+        self.desaturator = desaturator
         self.fan_torque_nm = np.zeros(3)
 
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
@@ -139,7 +145,9 @@ class MomentumDump:
         present_nm = self.fan_torque_nm
         commanded_nm = self.fans.allocate(control, self.desaturator.torque(momentum_nms), inputs)
         # First-order lag of the fans over one period; the torque at its start is the one that acts now.
-        self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(-inputs.period_s / self.fans.lag_s)
+        self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
+            -inputs.period_s / self.fans.lag_s
+        )
         return present_nm
 
 
@@ -147,7 +155,9 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
     """A force at each fan, along its site's z, which follows the command with a first-order lag."""
     for site in sites(spec, FAN):
         limit = config.thrust_limit_n
-        fan = add_motor(spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, limit, [0, 0, 1, 0, 0, 0])
+        fan = add_motor(
+            spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, limit, [0, 0, 1, 0, 0, 0]
+        )
         # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
         fan.dynprm[0] = config.time_constant_s

@@ -13,7 +13,9 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 
-RANK_TOLERANCE = 1e-6  # directions with a smaller fraction of the largest singular value get no torque
+RANK_TOLERANCE = (
+    1e-6  # directions with a smaller fraction of the largest singular value get no torque
+)
 
 
 class ControlInput(NamedTuple):

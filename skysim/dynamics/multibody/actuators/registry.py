@@ -108,14 +108,18 @@ def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> Non
     if not found:
         raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
     if any(joint.type != wanted for joint in found):
-        raise InputError(path, f"joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}")
+        raise InputError(
+            path, f"joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}"
+        )
     for joint in found:
         check_bare(joint, path)
 
 
 def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
     """An addition to the problem of a model that does not compile, if it refers to a joint that was deleted."""
-    named = {sensor.objname for sensor in spec.sensors} | {actuator.target for actuator in spec.actuators}
+    named = {sensor.objname for sensor in spec.sensors} | {
+        actuator.target for actuator in spec.actuators
+    }
     named |= {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
     names = [name for name in locked if name in named]
     return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
@@ -126,7 +130,9 @@ def check_names(spec: Any, path: Path) -> None:
     for element in (*spec.joints, *spec.sites):
         prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
-            raise InputError(path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word")
+            raise InputError(
+                path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word"
+            )
 
 
 def check_bare(joint: Any, path: Path) -> None:
@@ -143,4 +149,6 @@ def check_bare(joint: Any, path: Path) -> None:
     }
     for name, value in attributes.items():
         if np.any(value):
-            raise InputError(path, f"joint {joint.name}: {name} is set by the scene; remove it from the file")
+            raise InputError(
+                path, f"joint {joint.name}: {name} is set by the scene; remove it from the file"
+            )

@@ -46,7 +46,9 @@ class WheelSet:
     inertia_kg_m2: Floats
     torque_limit_nm: float
     speed_limit_rad_s: float
-    motor_from_torque: Floats = field(init=False, repr=False)  # (n, 3) minus the pseudo-inverse of the axes
+    motor_from_torque: Floats = field(
+        init=False, repr=False
+    )  # (n, 3) minus the pseudo-inverse of the axes
 
     def __post_init__(self) -> None:
         axes = unit_columns(self.axes, "wheel axes")
@@ -82,7 +84,9 @@ class WheelActuator:
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.joints = hinges = Hinges.from_model(model, WHEEL)
         limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
-        self.model = WheelSet(hinges.axes, hinges.inertia_kg_m2, config.torque_limit_nm, limit_rad_s)
+        self.model = WheelSet(
+            hinges.axes, hinges.inertia_kg_m2, config.torque_limit_nm, limit_rad_s
+        )
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         motor = self.model.drive(torque_nm, inputs.speeds_rad_s[self.joints.dof], inputs.period_s)
@@ -107,7 +111,9 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
     """Set the wheels' speeds at the start."""
     hinges = Hinges.from_model(model, WHEEL)
-    data.qvel[hinges.dof] = member_values(config.start_rpm, len(hinges), "vehicle.wheels.start_rpm") * RPM_RAD_S
+    data.qvel[hinges.dof] = (
+        member_values(config.start_rpm, len(hinges), "vehicle.wheels.start_rpm") * RPM_RAD_S
+    )
 
 
 WHEELS = ActuatorKind("wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels)

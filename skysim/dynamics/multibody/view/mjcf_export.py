@@ -31,7 +31,9 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Ellipsoid, Plane, Surface
 
-GROUP_LIGHTS, GROUP_FIELD, GROUP_HIDDEN = 1, 2, 4
+GROUP_LIGHTS = 1
+GROUP_FIELD = 2
+GROUP_HIDDEN = 4
 MAX_PX = (1920, 1440)  # width, height of the largest picture
 FOVY_DEG = 38.0
 
@@ -39,11 +41,17 @@ SKY_RADIUS_M = 5.0
 SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
 MAX_STARS = 300
 LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pixel
-LEVELS, DIM = 12, 0.15  # steps of brightness, and the darkest over the brightest
+# steps of brightness, and the darkest over the brightest
+LEVELS = 12
+DIM = 0.15
 RIM_M = 0.03
-SECTORS, RINGS = 72, 24  # of the dome's mesh
-FLOOR_BELOW_M, VEHICLE_BELOW_M = 0.95, 0.6
-LIT_RGB, FIELD_RGB = np.array([1.0, 0.93, 0.78]), np.array([0.25, 0.75, 1.0])
+# of the dome's mesh
+SECTORS = 72
+RINGS = 24
+FLOOR_BELOW_M = 0.95
+VEHICLE_BELOW_M = 0.6
+LIT_RGB = np.array([1.0, 0.93, 0.78])
+FIELD_RGB = np.array([0.25, 0.75, 1.0])
 
 
 def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
@@ -54,13 +62,17 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
     The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
     has a camera named `lab`.
     """
-    spec, mount = vehicle.spec.copy(), camera_mount(vehicle)
+    spec = vehicle.spec.copy()
+    mount = camera_mount(vehicle)
     if spec.camera(LAB_CAMERA):
         raise InputError(
-            scene.vehicle.model, f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it"
+            scene.vehicle.model,
+            f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it",
         )
     on_earth = vehicle.config.mount == "air_bearing"
-    inside = surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
+    inside = (
+        surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
+    )
     hide_tilt_stop(spec)
     inline_meshes(spec, vehicle.model)
     add_backdrop(spec, on_earth)
@@ -97,20 +109,30 @@ def inline_meshes(spec: Any, model: Any) -> None:
         if not mesh.file:
             continue
         compiled_mesh = model.mesh(mesh.name or Path(mesh.file).stem)
-        first, count = int(compiled_mesh.vertadr[0]), int(compiled_mesh.vertnum[0])
-        begin, faces = int(compiled_mesh.faceadr[0]), int(compiled_mesh.facenum[0])
-        file_from_compiled = Rotation.from_quat(model.mesh_quat[compiled_mesh.id], scalar_first=True)
-        mesh.name, mesh.file, mesh.scale = compiled_mesh.name, "", [1.0, 1.0, 1.0]
-        mesh.refpos, mesh.refquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+        first = int(compiled_mesh.vertadr[0])
+        count = int(compiled_mesh.vertnum[0])
+        begin = int(compiled_mesh.faceadr[0])
+        faces = int(compiled_mesh.facenum[0])
+        file_from_compiled = Rotation.from_quat(
+            model.mesh_quat[compiled_mesh.id], scalar_first=True
+        )
+        mesh.name = compiled_mesh.name
+        mesh.file = ""
+        mesh.scale = [1.0, 1.0, 1.0]
+        mesh.refpos = [0.0, 0.0, 0.0]
+        mesh.refquat = [1.0, 0.0, 0.0, 0.0]
         mesh.uservert = (
-            file_from_compiled.apply(model.mesh_vert[first : first + count]) + model.mesh_pos[compiled_mesh.id]
+            file_from_compiled.apply(model.mesh_vert[first : first + count])
+            + model.mesh_pos[compiled_mesh.id]
         ).ravel()
         mesh.userface = model.mesh_face[begin : begin + faces].ravel()
 
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:
     """A dim room or black space as background, and a lamp."""
-    top, bottom = ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+    top, bottom = (
+        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+    )
     spec.add_texture(
         name="stage_backdrop",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -146,11 +168,21 @@ def add_room(spec: Any) -> None:
         width=256,
         height=256,
     )
-    tiles = spec.add_material(name="stage_tiles", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.08)
+    tiles = spec.add_material(
+        name="stage_tiles", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.08
+    )
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_tiles"
-    plane, cylinder = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CYLINDER
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
     bottom = -FLOOR_BELOW_M
-    add_visual_geom(spec.worldbody, "stage_floor", plane, size=[6, 6, 0.1], pos=[0, 0, bottom], material="stage_tiles")
+    add_visual_geom(
+        spec.worldbody,
+        "stage_floor",
+        plane,
+        size=[6, 6, 0.1],
+        pos=[0, 0, bottom],
+        material="stage_tiles",
+    )
     for name, radius, low, high in (
         ("foot", 0.30, bottom, bottom + 0.04),
         ("column", 0.10, bottom, -0.35),
@@ -189,18 +221,24 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     if isinstance(inside, Plane):
-        radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[:, None, None]
+        radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[
+            :, None, None
+        ]
         half_m = np.append(inside.half_m, np.inf)
         return np.asarray(
-            inside.center_m + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
+            inside.center_m
+            + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
         )
     upright = inside.lab_from_own.magnitude() == 0
     if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
         return visible_shell_m(inside, around)
-    middle, half = inside.center_m[2], inside.semi_axes_m[2]
+    middle = inside.center_m[2]
+    half = inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
     polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
-    return np.asarray(inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up))
+    return np.asarray(
+        inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up)
+    )
 
 
 def visible_shell_m(inside: Surface, around: Floats) -> Floats:
@@ -218,25 +256,38 @@ def visible_shell_m(inside: Surface, around: Floats) -> Floats:
     polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
     height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
     on_surface = height_m > 0.35 * height_m.max()
-    first, last = on_surface.argmax(axis=0), 399 - on_surface[::-1].argmax(axis=0)
+    first = on_surface.argmax(axis=0)
+    last = 399 - on_surface[::-1].argmax(axis=0)
     fraction = np.linspace(0, 1, RINGS)[:, None]
     return points_at(polar[first, 0] * (1 - fraction) + polar[last, 0] * fraction)
 
 
-def add_sheet(spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]) -> None:
+def add_sheet(
+    spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
+) -> None:
     """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
 
     rings_m : (K, n, 3) each counterclockwise seen from above, every one beneath or around the previous one
     """
     index = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
-    a, d = index[:-1].ravel(), index[1:].ravel()
-    b, c = np.roll(index, -1, axis=1)[:-1].ravel(), np.roll(index, -1, axis=1)[1:].ravel()
+    a = index[:-1].ravel()
+    d = index[1:].ravel()
+    b = np.roll(index, -1, axis=1)[:-1].ravel()
+    c = np.roll(index, -1, axis=1)[1:].ravel()
     inwards = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     for side, faces, rgba in (
         ("inside", inwards, inside_rgba),
         ("outside", inwards[:, ::-1], outside_rgba),
     ):
-        add_mesh(spec, spec.worldbody, f"{name}_{side}", rings_m.reshape(-1, 3), faces, rgba, GROUP_LIGHTS)
+        add_mesh(
+            spec,
+            spec.worldbody,
+            f"{name}_{side}",
+            rings_m.reshape(-1, 3),
+            faces,
+            rgba,
+            GROUP_LIGHTS,
+        )
 
 
 def add_mesh(
@@ -250,9 +301,13 @@ def add_mesh(
     **more: Any,
 ) -> None:
     """A mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
-    mesh = spec.add_mesh(name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel())
+    mesh = spec.add_mesh(
+        name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
+    )
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    add_visual_geom(body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more)
+    add_visual_geom(
+        body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more
+    )
 
 
 def add_lights(spec: Any, sources: Sources) -> None:
@@ -273,7 +328,9 @@ def add_lights(spec: Any, sources: Sources) -> None:
         vertices, faces = octahedra(position_m[level == step], radius_m[level == step])
         rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
         name = f"stage_{'stars' if stars else 'leds'}_{step}"
-        add_mesh(spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name)
+        add_mesh(
+            spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name
+        )
 
 
 def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -284,10 +341,14 @@ def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.
     odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored: reverse the order, to face outwards
     faces[odd] = faces[odd][:, ::-1]
     vertices = position_m[:, None, :] + radius_m[:, None, None] * corners
-    return vertices.reshape(-1, 3), (6 * np.arange(len(position_m))[:, None, None] + faces).reshape(-1, 3)
+    return vertices.reshape(-1, 3), (6 * np.arange(len(position_m))[:, None, None] + faces).reshape(
+        -1, 3
+    )
 
 
-def field_corners(camera: CameraConfig, mount: Mount, lab_from_body: Rotation, inside: Surface) -> Floats:
+def field_corners(
+    camera: CameraConfig, mount: Mount, lab_from_body: Rotation, inside: Surface
+) -> Floats:
     """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, at a given attitude.
 
     A ray that misses a flat panel, or meets it far away, ends at the distance of the sky.
@@ -304,7 +365,8 @@ def field_corners(camera: CameraConfig, mount: Mount, lab_from_body: Rotation, i
 
 def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     """The star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
-    bus, tip = spec.body("bus"), mount.camera_body_m
+    bus = spec.body("bus")
+    tip = mount.camera_body_m
     sides = np.array(
         [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
     )  # open, so that it does not block the camera's own view
@@ -331,12 +393,18 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
 
     The eye's distance makes dome and vehicle fill a picture of 4:3; the rim's near side is the widest.
     """
-    wide, top = np.hypot(*rings_m[-1, :, :2].T).max(), rings_m[..., 2].max()
+    wide = np.hypot(*rings_m[-1, :, :2].T).max()
+    top = rings_m[..., 2].max()
     size = (top + VEHICLE_BELOW_M) / 2
     tangent = np.tan(np.radians(FOVY_DEG / 2))
     distance = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
     middle = np.array([0.0, 0.0, top - size])
-    return middle + distance * direction(-62.0, 8.0), middle, np.array([0.0, 0.0, 1.0]), 0.55 * distance
+    return (
+        middle + distance * direction(-62.0, 8.0),
+        middle,
+        np.array([0.0, 0.0, 1.0]),
+        0.55 * distance,
+    )
 
 
 def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
@@ -359,14 +427,20 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
     lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
-    spec.worldbody.add_camera(name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG)
-    spec.stat.center, spec.stat.extent = middle_m, size_m
-    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 50.0
+    spec.worldbody.add_camera(
+        name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG
+    )
+    spec.stat.center = middle_m
+    spec.stat.extent = size_m
+    spec.visual.map.znear = 0.01
+    spec.visual.map.zfar = 50.0
     spec.visual.global_.azimuth = float(np.degrees(np.arctan2(-back[1], -back[0])))
     spec.visual.global_.elevation = float(-np.degrees(np.arcsin(back[2])))
 
 
-def add_start_keyframe(spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation) -> None:
+def add_start_keyframe(
+    spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation
+) -> None:
     """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
     simulation = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
     data = simulation.data

@@ -26,7 +26,9 @@ from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 Picture = NDArray[np.uint8]
 
 LAB_CAMERA = "lab"  # the MJCF's camera that sees everything
-PICTURE_PX, FILM_PX = (960, 720), (480, 360)  # width, height
+# width, height
+PICTURE_PX = (960, 720)
+FILM_PX = (480, 360)
 NO_OPENGL = (
     "no picture of the lab: {why}; MuJoCo draws with OpenGL by EGL: apt-get install libegl1 libgl1-mesa-dri"
     " (or libosmesa6, and MUJOCO_GL=osmesa)"
@@ -71,7 +73,9 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
                 for _ in range(len(qpos)):
                     raw = renderer.stdout.read(height * width * 3) if renderer.stdout else b""
                     if len(raw) < height * width * 3:
-                        raise NoPicture(NO_OPENGL.format(why=failure_reason(renderer.wait(), errors)))
+                        raise NoPicture(
+                            NO_OPENGL.format(why=failure_reason(renderer.wait(), errors))
+                        )
                     yield np.frombuffer(raw, np.uint8).reshape(height, width, 3)
             finally:
                 renderer.kill()  # a caller may stop before the last picture
@@ -109,7 +113,9 @@ def render_task() -> None:
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # a driver's output must not reach the pictures
         with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
-            text, states, (width, height) = str(task["mjcf"]), task["qpos"], task["size_px"].tolist()
+            text = str(task["mjcf"])
+            states = task["qpos"]
+            (width, height) = task["size_px"].tolist()
             model = mujoco.MjModel.from_xml_string(text)
             data = mujoco.MjData(model)
             with mujoco.Renderer(model, height, width) as renderer:

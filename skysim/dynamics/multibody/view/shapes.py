@@ -65,7 +65,8 @@ def laboratory(mjcf: str) -> Laboratory:
 
 
 def is_shown(model: mujoco.MjModel, n: int) -> bool:
-    kind, name = mujoco.mjtGeom(model.geom_type[n]), model.geom(n).name
+    kind = mujoco.mjtGeom(model.geom_type[n])
+    name = model.geom(n).name
     return kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
 
 
@@ -91,7 +92,9 @@ def color(model: mujoco.MjModel, n: int) -> Floats:
     """(4,) of a geom: its own, or its material's if it has none of its own."""
     material = model.geom_matid[n]
     unset = (model.geom_rgba[n] == (0.5, 0.5, 0.5, 1.0)).all()
-    return np.asarray(model.mat_rgba[material] if material >= 0 and unset else model.geom_rgba[n], float)
+    return np.asarray(
+        model.mat_rgba[material] if material >= 0 and unset else model.geom_rgba[n], float
+    )
 
 
 def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:

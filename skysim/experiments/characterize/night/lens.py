@@ -29,11 +29,16 @@ from skysim.experiments.characterize.sensor.photon_transfer import BLACK, GAIN, 
 from skysim.scene.sections.camera import CameraConfig
 from skysim.tracking.onboard_model import calibration, onboard_catalog
 
-CATALOG, DEFAULT_EPOCH_YR = "gaia_v8.0", 2020.0
+CATALOG = "gaia_v8.0"
+DEFAULT_EPOCH_YR = 2020.0
 STARS_A_FIELD = 300.0  # of the catalog, on average
 FOCAL_UNCERTAINTY = 0.05  # of the focal length in the camera's file
-LEAST_SNR, MAX_PEAK = 40.0, 0.8  # of a star whose image is measured; its peak over saturation
-LEAST_STARS, LEAST_FRAMES, LEAST_TRAILED = 20, 3, 3
+# of a star whose image is measured; its peak over saturation
+LEAST_SNR = 40.0
+MAX_PEAK = 0.8
+LEAST_STARS = 20
+LEAST_FRAMES = 3
+LEAST_TRAILED = 3
 MEDIAN_COST = 1.25  # standard error of a median over that of a mean
 MAX_STRETCH = 0.25  # of the images, over their variance
 LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
@@ -58,7 +63,9 @@ class NightFrame(NamedTuple):
     date_utc: datetime.datetime | None
 
 
-def measure_night(config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float) -> Night:
+def measure_night(
+    config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float
+) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that do not tell."""
     frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)]
     still = [without_trail(one.stars) for one in frames]
@@ -77,35 +84,50 @@ def measure_night(config: CameraConfig, folder: Path, transfer: Transfer, satura
     if size is None:
         raise InputError(folder, "no star's image is a Gaussian", "stars in focus, not trailed")
     if size.left_out > 0.5 * len(stars.chi2):
-        remarks.append(f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out")
+        remarks.append(
+            f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out"
+        )
     identified = int(lens.report.tied.sum()) if lens else 0
     return Night(size, lens, len(frames), identified, remarks)
 
 
-def read_frame(path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float) -> NightFrame:
+def read_frame(
+    path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float
+) -> NightFrame:
     """Detect and fit the stars of a frame. Raises InputError for one of another camera."""
     picture = images.read_picture(path)
     numbers = raw_numbers(path, picture.pixels)
     if numbers.shape != (config.height_px, config.width_px):
         size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
-        raise InputError(path, size, f"{config.width_px} x {config.height_px}, as the camera has them")
+        raise InputError(
+            path, size, f"{config.width_px} x {config.height_px}, as the camera has them"
+        )
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
     try:
-        centroids = detect_and_centroid(numbers, calibration(config), settings_of(transfer, saturation_dn), Clock())
+        centroids = detect_and_centroid(
+            numbers, calibration(config), settings_of(transfer, saturation_dn), Clock()
+        )
     except ImageError as error:
         raise InputError(path, error) from None
     signal = transfer.linear_dn(numbers - transfer.values[BLACK])
     chosen = measurable(numbers, centroids, transfer, saturation_dn)
-    gain, read = float(transfer.values[GAIN]), float(transfer.values[READ])
-    return NightFrame(path, centroids, star_images.fit_images(signal, chosen, gain, read), picture.date_utc)
+    gain = float(transfer.values[GAIN])
+    read = float(transfer.values[READ])
+    return NightFrame(
+        path, centroids, star_images.fit_images(signal, chosen, gain, read), picture.date_utc
+    )
 
 
 def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
     """Settings of the tracker for this camera."""
-    return Settings(gain_e_dn=float(1 / transfer.values[GAIN]), saturation=saturation_dn, centroid_sigma_px=0.02)
+    return Settings(
+        gain_e_dn=float(1 / transfer.values[GAIN]), saturation=saturation_dn, centroid_sigma_px=0.02
+    )
 
 
-def measurable(numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float) -> Floats:
+def measurable(
+    numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float
+) -> Floats:
     """(N, 2) pixels of stars that are bright, not saturated, away from the border and from other stars."""
     xy = centroids.xy_px
     if not len(xy):
@@ -116,12 +138,17 @@ def measurable(numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, 
     x, y = np.rint(xy).astype(int).T
     background = float(np.median(numbers))
     peak = numbers[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
-    dark_e2 = (background - transfer.values[BLACK]) / transfer.values[GAIN] + transfer.values[READ] / transfer.values[
-        GAIN
-    ] ** 2
+    dark_e2 = (background - transfer.values[BLACK]) / transfer.values[GAIN] + transfer.values[
+        READ
+    ] / transfer.values[GAIN] ** 2
     flux_e = centroids.flux / transfer.values[GAIN]
     snr = flux_e / np.sqrt(np.maximum(flux_e + 12 * max(dark_e2, 0.0), 1.0))
-    kept = inside & (near > HALF_PX * math.sqrt(2)) & (peak < MAX_PEAK * saturation_dn) & (snr > LEAST_SNR)
+    kept = (
+        inside
+        & (near > HALF_PX * math.sqrt(2))
+        & (peak < MAX_PEAK * saturation_dn)
+        & (snr > LEAST_SNR)
+    )
     return np.asarray(xy[kept])
 
 
@@ -136,7 +163,11 @@ def trail_px2(stars: StarImages) -> tuple[float, float]:
 def without_trail(stars: StarImages) -> StarImages:
     """The images without what a common trail adds to their mean variance: half of the stretch, less its own error."""
     count = max(len(stars.chi2), 1)
-    noise2 = float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count if count > 1 else 0.0
+    noise2 = (
+        float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count
+        if count > 1
+        else 0.0
+    )
     added = math.sqrt(max(math.hypot(*trail_px2(stars)) ** 2 - noise2, 0.0)) / 2
     return stars._replace(variance_px2=stars.variance_px2 - added)
 
@@ -147,9 +178,12 @@ def check_trails(frames: list[NightFrame]) -> None:
         if not len(one.stars.chi2):
             continue
         along, across = trail_px2(one.stars)
-        stretch, variance = math.hypot(along, across), float(np.median(one.stars.variance_px2))
+        stretch = math.hypot(along, across)
+        variance = float(np.median(one.stars.variance_px2))
         if stretch > MAX_STRETCH * variance:
-            trail_px = math.sqrt(12 * stretch)  # a uniform streak of length L has the variance L^2 / 12
+            trail_px = math.sqrt(
+                12 * stretch
+            )  # a uniform streak of length L has the variance L^2 / 12
             angle_deg = math.degrees(math.atan2(across, along)) / 2
             raise InputError(
                 one.path,
@@ -164,24 +198,37 @@ def find_lens(
     """The lens by stars that are identified, from the focal length in the camera's file; or why it is unknown."""
     if len(frames) < LEAST_FRAMES:
         lacking = LEAST_FRAMES - len(frames)
-        return None, [f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"]
-    camera, settings = calibration(config), settings_of(transfer, saturation_dn)
+        return None, [
+            f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"
+        ]
+    camera = calibration(config)
+    settings = settings_of(transfer, saturation_dn)
     stars = onboard_catalog("characterize.night", CATALOG)
-    narrow_sr = config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
+    narrow_sr = (
+        config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
+    )
     stars = stars.take(stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD))
     dates = [one.date_utc for one in frames if one.date_utc is not None]
     vectors = (
-        catalog.apparent(stars, catalog.on_earth(dates[0])) if dates else catalog.at_epoch(stars, DEFAULT_EPOCH_YR)
+        catalog.apparent(stars, catalog.on_earth(dates[0]))
+        if dates
+        else catalog.at_epoch(stars, DEFAULT_EPOCH_YR)
     )
 
     def tracker(model: Camera, uncertainty: float) -> StarTracker:
         return StarTracker(model, stars, vectors, settings, uncertainty)
 
     try:
-        found = self_calibrate([one.centroids for one in frames], tracker, camera, FOCAL_UNCERTAINTY)
+        found = self_calibrate(
+            [one.centroids for one in frames], tracker, camera, FOCAL_UNCERTAINTY
+        )
     except ValueError as error:
-        return None, [f"focal length, distortion: {error}; the camera's file states {camera.focal_px:.5g} px, to 5 %"]
-    return found, [] if dates else ["date: no frame has one; allowed: DATE-OBS in a FITS header, for aberration to 20″"]
+        return None, [
+            f"focal length, distortion: {error}; the camera's file states {camera.focal_px:.5g} px, to 5 %"
+        ]
+    return found, [] if dates else [
+        "date: no frame has one; allowed: DATE-OBS in a FITS header, for aberration to 20″"
+    ]
 
 
 def lens_estimates(config: CameraConfig, found: Calibration) -> dict[str, Estimate]:
@@ -194,9 +241,12 @@ def lens_estimates(config: CameraConfig, found: Calibration) -> dict[str, Estima
     camera = found.camera
     image_m = camera.focal_px * config.pixel_m
     focal_m = 1 / (1 / image_m + 1 / config.focus_m)
-    focal = Estimate.normal(1e3 * focal_m, 1e3 * float(errors[0]) * config.pixel_m * (focal_m / image_m) ** 2)
+    focal = Estimate.normal(
+        1e3 * focal_m, 1e3 * float(errors[0]) * config.pixel_m * (focal_m / image_m) ** 2
+    )
     values = [*camera.center_px, *camera.distortion]
     rest = {
-        name: Estimate.normal(value, error) for name, value, error in zip(LENS[1:], values, errors[1:], strict=True)
+        name: Estimate.normal(value, error)
+        for name, value, error in zip(LENS[1:], values, errors[1:], strict=True)
     }
     return {"focal_length_mm": focal, **rest}

@@ -25,11 +25,15 @@ from skysim.experiments.characterize.sensor.photon_transfer import ROUNDING_DN2
 
 HALF_PX = 7  # half of a star's window
 X, Y, FLUX, SKY, LN_SX, LN_SY = range(6)
-STEPS, CONVERGED = 30, 1e-3  # of the fit; a step in standard deviations
+# of the fit; a step in standard deviations
+STEPS = 30
+CONVERGED = 1e-3
 START_SIGMA_PX = 1.0
 MAX_STEP = 0.5  # pixels, and of the logarithms
 OUTLIER_SIGMAS = 4.0  # of a chi-square, and of a size
-ROUNDS, SETTLED = 12, 1e-4  # of leaving out outliers, and the change of the errors at their end
+# of leaving out outliers, and the change of the errors at their end
+ROUNDS = 12
+SETTLED = 1e-4
 LEAST_VARIANCE_PX2 = 1e-3
 
 
@@ -65,8 +69,11 @@ def windows(image_dn: Floats, xy_px: Floats) -> tuple[Floats, Floats]:
     """(N, M) pixels of each star's window, and (N, 2) their upper left corners; stars are HALF_PX from the border."""
     corner = np.rint(xy_px).astype(int) - HALF_PX
     span = np.arange(2 * HALF_PX + 1)
-    rows, columns = corner[:, 1, None, None] + span[:, None], corner[:, 0, None, None] + span[None, :]
-    return np.asarray(image_dn[rows, columns].reshape(len(xy_px), -1), dtype=np.float64), corner.astype(np.float64)
+    rows = corner[:, 1, None, None] + span[:, None]
+    columns = corner[:, 0, None, None] + span[None, :]
+    return np.asarray(
+        image_dn[rows, columns].reshape(len(xy_px), -1), dtype=np.float64
+    ), corner.astype(np.float64)
 
 
 def integrals(center: Floats, ln_sigma: Floats) -> tuple[Floats, Floats, Floats]:
@@ -84,7 +91,8 @@ def model(p: Floats) -> tuple[Floats, Floats]:
     def plane(by_y: Floats, by_x: Floats) -> Floats:
         return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1))
 
-    flux, image = p[:, FLUX, None], plane(gy, gx)
+    flux = p[:, FLUX, None]
+    image = plane(gy, gx)
     slopes = [flux * plane(gy, dx), flux * plane(dy, gx), image, np.ones_like(image)]
     slopes += [flux * plane(gy, wx), flux * plane(wy, gx)]
     return p[:, SKY, None] + flux * image, np.stack(slopes, axis=2)
@@ -106,7 +114,11 @@ def fit_images(image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: floa
         chi2 = np.sum(weight * residual**2, axis=1)
         normal = np.einsum("nmi,nm,nmj->nij", slopes, weight, slopes, optimize=True)
         gradient = np.einsum("nmi,nm->ni", slopes, weight * residual)
-        damped = normal + np.eye(6) * (damping[:, None] * np.diagonal(normal, axis1=1, axis2=2) + 1e-12)[:, None, :]
+        damped = (
+            normal
+            + np.eye(6)
+            * (damping[:, None] * np.diagonal(normal, axis1=1, axis2=2) + 1e-12)[:, None, :]
+        )
         step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
         limited = np.clip(step[:, [X, Y, LN_SX, LN_SY]], -MAX_STEP, MAX_STEP)
         step[:, [X, Y, LN_SX, LN_SY]] = limited
@@ -122,32 +134,47 @@ def fit_images(image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: floa
     return summary(p, corner, pixels - expected, normal, chi2)
 
 
-def summary(p: Floats, corner: Floats, residual: Floats, normal: Floats, chi2: Floats) -> StarImages:
+def summary(
+    p: Floats, corner: Floats, residual: Floats, normal: Floats, chi2: Floats
+) -> StarImages:
     """What is used of the fits."""
     covariance = np.linalg.inv(normal)
-    sx2, sy2 = np.exp(2 * p[:, LN_SX]), np.exp(2 * p[:, LN_SY])
+    sx2 = np.exp(2 * p[:, LN_SX])
+    sy2 = np.exp(2 * p[:, LN_SY])
     slope = np.zeros((len(p), 6))
-    slope[:, LN_SX], slope[:, LN_SY] = sx2, sy2  # of (s_x^2 + s_y^2) / 2
+    # of (s_x^2 + s_y^2) / 2
+    slope[:, LN_SX] = sx2
+    slope[:, LN_SY] = sy2
     error = np.sqrt(np.einsum("ni,nij,nj->n", slope, covariance, slope))
     # A tilt leaves residuals F c g (x - x0)(y - y0) / (s_x^2 s_y^2), c the covariance, to first order.
     span = np.arange(2 * HALF_PX + 1)
-    u, v = (span - p[:, X, None]) / sx2[:, None], (span - p[:, Y, None]) / sy2[:, None]
-    gx, gy = integrals(p[:, X], p[:, LN_SX])[0], integrals(p[:, Y], p[:, LN_SY])[0]
+    u = (span - p[:, X, None]) / sx2[:, None]
+    v = (span - p[:, Y, None]) / sy2[:, None]
+    gx = integrals(p[:, X], p[:, LN_SX])[0]
+    gy = integrals(p[:, Y], p[:, LN_SY])[0]
     tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(len(p), -1)
     covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(np.sum(tilt**2, axis=1), 1e-300)
     stretch = np.column_stack([sx2 - sy2, 2 * covariance_px2])
     freedom = residual.shape[1] - 6
-    return StarImages(corner + p[:, [X, Y]], p[:, FLUX], (sx2 + sy2) / 2, error, stretch, chi2 / freedom)
+    return StarImages(
+        corner + p[:, [X, Y]], p[:, FLUX], (sx2 + sy2) / 2, error, stretch, chi2 / freedom
+    )
 
 
-def image_size(stars: StarImages, center_px: tuple[float, float], corner_px: float) -> ImageSize | None:
+def image_size(
+    stars: StarImages, center_px: tuple[float, float], corner_px: float
+) -> ImageSize | None:
     """The law of the size over the field; None for fewer than three stars that are Gaussians."""
     freedom = (2 * HALF_PX + 1) ** 2 - 6
-    sound = np.isfinite(stars.variance_sigma_px2) & (stars.chi2 < 1 + OUTLIER_SIGMAS * np.sqrt(2 / freedom) + 0.2)
+    sound = np.isfinite(stars.variance_sigma_px2) & (
+        stars.chi2 < 1 + OUTLIER_SIGMAS * np.sqrt(2 / freedom) + 0.2
+    )
     rho2 = np.sum((stars.xy_px - np.array(center_px)) ** 2, axis=1) / corner_px**2
     design = np.column_stack([np.ones(len(rho2)), rho2])
     # A star's relative error, times the law's size: its own error would give images that came out small more weight.
-    kept, relative, expected = sound, stars.variance_sigma_px2 / stars.variance_px2, stars.variance_px2
+    kept = sound
+    relative = stars.variance_sigma_px2 / stars.variance_px2
+    expected = stars.variance_px2
     for _ in range(ROUNDS):
         if kept.sum() < 3:
             return None
@@ -157,8 +184,13 @@ def image_size(stars: StarImages, center_px: tuple[float, float], corner_px: flo
         found = normal @ ((design.T * weight) @ stars.variance_px2)
         expected = np.maximum(design @ found, LEAST_VARIANCE_PX2)
         pull = (stars.variance_px2 - expected) / (relative * expected)
-        again = sound & (np.abs(pull) < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA))
-        is_settled = np.array_equal(again, kept) and np.allclose(error, relative * expected, rtol=SETTLED)
+        again = sound & (
+            np.abs(pull)
+            < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA)
+        )
+        is_settled = np.array_equal(again, kept) and np.allclose(
+            error, relative * expected, rtol=SETTLED
+        )
         kept = again
         if is_settled:
             break

@@ -25,11 +25,20 @@ from skysim.core.types import Floats
 from skysim.experiments.characterize.sensor.estimate import Estimate
 
 LEAST_HOT = 10  # hot pixels for a fit of their scatter
-CORE_BINS, TAIL_BINS, TAIL = 160, 60, 0.01  # quantiles; the tail is the upper hundredth
-NODES, SPAN = 301, 6.0  # of the lognormal's normal variable
-STEPS, CONVERGED = 60, 1e-3  # scoring steps, and a step in standard deviations
+# quantiles; the tail is the upper hundredth
+CORE_BINS = 160
+TAIL_BINS = 60
+TAIL = 0.01
+# of the lognormal's normal variable
+NODES = 301
+SPAN = 6.0
+# scoring steps, and a step in standard deviations
+STEPS = 60
+CONVERGED = 1e-3
 DIFFERENCE = 1e-4
-RESOLVED, MEDIAN_COST = 5.0, 1.65  # sigmas; standard error of a variance from medians over that from squares
+# sigmas; standard error of a variance from medians over that from squares
+RESOLVED = 5.0
+MEDIAN_COST = 1.65
 HOT_SIGMAS = 8.0  # above the core's width: where hot pixels begin, for the start of the fit
 
 
@@ -77,14 +86,23 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     counts = np.bincount(np.searchsorted(edges, kept), minlength=len(edges) + 1).astype(np.float64)
     theta, covariance = maximize(start if enough else start[:2], edges, counts, noise)
     sigma = np.sqrt(np.diag(covariance))
-    values = [Estimate.lognormal(math.exp(one), math.exp(one) * error) for one, error in zip(theta, sigma, strict=True)]
+    values = [
+        Estimate.lognormal(math.exp(one), math.exp(one) * error)
+        for one, error in zip(theta, sigma, strict=True)
+    ]
     if enough:
         fraction = Estimate.logistic(theta[2], sigma[2])
     else:
-        low, high = stats.beta.ppf([0.025, 0.975], [max(hot, 1e-9), hot + 1], [rates.size - hot + 1, rates.size - hot])
-        fraction = Estimate(hot / rates.size, math.sqrt(max(hot, 1)) / rates.size, float(low), float(high))
+        low, high = stats.beta.ppf(
+            [0.025, 0.975], [max(hot, 1e-9), hot + 1], [rates.size - hot + 1, rates.size - hot]
+        )
+        fraction = Estimate(
+            hot / rates.size, math.sqrt(max(hot, 1)) / rates.size, float(low), float(high)
+        )
     expected = counts.sum() * probabilities(theta, edges, noise)
-    return DarkCurrent(values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected)
+    return DarkCurrent(
+        values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected
+    )
 
 
 def median_and_spread(values: Floats) -> tuple[float, float]:
@@ -108,7 +126,8 @@ def bin_edges(rates: Floats, greatest: float) -> Floats:
 
 def probabilities(theta: Floats, edges: Floats, noise: RateNoise) -> Floats:
     """Probability of each bin, those below the first and above the last edge included."""
-    mean, dsnu = math.exp(theta[0]), math.exp(theta[1])
+    mean = math.exp(theta[0])
+    dsnu = math.exp(theta[1])
     width = math.sqrt(math.log1p(dsnu**2))
     z = np.linspace(-SPAN, SPAN, NODES)
     weight = np.exp(-(z**2) / 2)
@@ -118,25 +137,34 @@ def probabilities(theta: Floats, edges: Floats, noise: RateNoise) -> Floats:
     normal = (edges[:, None] - u) / s
     below = special.ndtr(normal)
     if len(theta) == 4:
-        share, excess = special.expit(theta[2]), math.exp(theta[3])
-        tail = np.exp(s**2 / (2 * excess**2) - (edges[:, None] - u) / excess + special.log_ndtr(normal - s / excess))
+        share = special.expit(theta[2])
+        excess = math.exp(theta[3])
+        tail = np.exp(
+            s**2 / (2 * excess**2)
+            - (edges[:, None] - u) / excess
+            + special.log_ndtr(normal - s / excess)
+        )
         below -= share * tail
     cumulative = np.concatenate([[0.0], below @ weight, [1.0]])
     return np.maximum(np.diff(cumulative), 1e-15)
 
 
-def maximize(start: Floats, edges: Floats, counts: Floats, noise: RateNoise) -> tuple[Floats, Floats]:
+def maximize(
+    start: Floats, edges: Floats, counts: Floats, noise: RateNoise
+) -> tuple[Floats, Floats]:
     """The parameters of the greatest likelihood and their covariance, by Fisher's scoring with halved steps."""
-    theta, total = start, counts.sum()
+    theta = start
+    total = counts.sum()
     p = probabilities(theta, edges, noise)
     for _ in range(STEPS):
         slope = np.empty((len(theta), p.size))
         for n in range(len(theta)):
             moved = np.zeros(len(theta))
             moved[n] = DIFFERENCE
-            slope[n] = (probabilities(theta + moved, edges, noise) - probabilities(theta - moved, edges, noise)) / (
-                2 * DIFFERENCE
-            )
+            slope[n] = (
+                probabilities(theta + moved, edges, noise)
+                - probabilities(theta - moved, edges, noise)
+            ) / (2 * DIFFERENCE)
         information = total * (slope / p) @ slope.T
         score = slope @ (counts / p)
         step = np.linalg.solve(information, score)
@@ -146,7 +174,8 @@ def maximize(start: Floats, edges: Floats, counts: Floats, noise: RateNoise) -> 
             trial_p = probabilities(trial, edges, noise)
             if counts @ np.log(trial_p) >= likelihood - 1e-9 * abs(likelihood):
                 break
-        theta, p = trial, trial_p
+        theta = trial
+        p = trial_p
         if step @ information @ step < CONVERGED**2:
             break
     return theta, np.linalg.inv(information)
@@ -163,4 +192,6 @@ def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
     hot = rates[rates > limit]
     excess = max(float(hot.mean()) - limit, spread) if hot.size else spread
     share = max(hot.size, 1) / rates.size * math.exp(min((limit - core) / excess, 3.0))
-    return np.array([math.log(core), math.log(dsnu), special.logit(min(share, 0.5)), math.log(excess)]), hot.size
+    return np.array(
+        [math.log(core), math.log(dsnu), special.logit(min(share, 0.5)), math.log(excess)]
+    ), hot.size

@@ -38,7 +38,9 @@ class Estimate(NamedTuple):
     @classmethod
     def logistic(cls, logit: float, sigma: float) -> Estimate:
         """An estimate of a fraction whose logit is normal."""
-        low, value, high = (float(special.expit(logit + sign * SIGMAS_95 * sigma)) for sign in (-1, 0, 1))
+        low, value, high = (
+            float(special.expit(logit + sign * SIGMAS_95 * sigma)) for sign in (-1, 0, 1)
+        )
         return cls(value, value * (1 - value) * float(sigma), low, high)
 
     @classmethod
@@ -49,7 +51,9 @@ class Estimate(NamedTuple):
         return cls(value, sigma / (2 * value) if value else high / SIGMAS_95, low, high)
 
 
-def propagate(function: Callable[[Floats], float], at: Floats, covariance: Floats) -> tuple[float, float]:
+def propagate(
+    function: Callable[[Floats], float], at: Floats, covariance: Floats
+) -> tuple[float, float]:
     """Value and standard error of a function of parameters, by central differences of a fraction of their errors."""
     step = STEP * np.sqrt(np.diag(covariance))
     slope = np.zeros(len(at))

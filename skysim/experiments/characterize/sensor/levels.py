@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from skysim.core.types import Floats
 
 Mask = NDArray[np.bool_]
-TRIM, SAMPLES = 5.0, 100_000  # interquartile ranges, and pixels from which these are taken
+# interquartile ranges, and pixels from which these are taken
+TRIM = 5.0
+SAMPLES = 100_000
 
 
 class Moments(NamedTuple):
@@ -60,7 +62,9 @@ class Level:
         """Mean and variance over the used pixels. Standard errors are empirical, from the scatter of the pixels'
         variances, since hot pixels have more noise."""
         variance = self.variance_dn2[used].astype(np.float64)
-        mean = (self.first_dn[used].mean(dtype=np.float64) + self.second_dn[used].mean(dtype=np.float64)) / 2
+        mean = (
+            self.first_dn[used].mean(dtype=np.float64) + self.second_dn[used].mean(dtype=np.float64)
+        ) / 2
         return Moments(
             float(mean),
             float(np.sqrt(variance.mean() / self.count / variance.size)),
@@ -77,7 +81,8 @@ class LevelBuilder:
         self.first: NDArray | None = None
         self.sums: list[NDArray[np.float32]] = []
         self.difference_dn2 = 0.0
-        self.least_dn, self.greatest_dn = np.iinfo(np.int64).max, 0
+        self.least_dn = np.iinfo(np.int64).max
+        self.greatest_dn = 0
 
     def add(self, frame: NDArray) -> None:
         """Add a frame of digital numbers; every second one completes a pair."""
@@ -101,7 +106,8 @@ class LevelBuilder:
         """The level of the pairs so far, of which there must be one; an odd last frame is left out."""
         pairs = self.frames // 2
         first, second, squares = (
-            total / np.float32(divisor) for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
+            total / np.float32(divisor)
+            for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
         )
         drift_dn2 = self.difference_dn2 / pairs
         return Level(
@@ -113,7 +119,9 @@ class LevelBuilder:
 
 def trimmed_mean(difference: NDArray[np.float32]) -> float:
     """Mean of the pixels within TRIM interquartile ranges of the median: without those that a particle hit."""
-    low, middle, high = np.quantile(difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75))
+    low, middle, high = np.quantile(
+        difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)
+    )
     inside = np.abs(difference - np.float32(middle)) <= TRIM * (high - low) + 1
     return float(difference[inside].mean(dtype=np.float64))
 

@@ -77,7 +77,9 @@ class Transfer(NamedTuple):
     @property
     def light_e_s(self) -> Estimate:
         """Electrons that the lamp gives a pixel in a second."""
-        return Estimate.normal(*propagate(lambda p: p[LIGHT] / p[GAIN], self.values, self.covariance))
+        return Estimate.normal(
+            *propagate(lambda p: p[LIGHT] / p[GAIN], self.values, self.covariance)
+        )
 
     def linear_dn(self, signal_dn: Floats) -> Floats:
         """The signal x that a linear amplifier would give, from the measured x (1 - c x)."""
@@ -92,9 +94,11 @@ def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
 
 def model(points: Sequence[Point], values: Floats) -> tuple[Floats, Floats]:
     """Means and variances of the levels."""
-    t_s, lit = np.array([one.exposure_s for one in points]), np.array([one.lit for one in points])
+    t_s = np.array([one.exposure_s for one in points])
+    lit = np.array([one.lit for one in points])
     rate = lit * values[LIGHT] + values[FIRST_DARK + np.array([one.dark for one in points])]
-    x, slope = rate * t_s, 1 - 2 * values[CURVATURE] * rate * t_s
+    x = rate * t_s
+    slope = 1 - 2 * values[CURVATURE] * rate * t_s
     mean = values[BLACK] + x - values[CURVATURE] * x**2
     return mean, slope**2 * (values[GAIN] * x + values[READ]) + ROUNDING_DN2
 
@@ -105,16 +109,22 @@ def fit(points: Sequence[Point], flicker: float) -> Transfer:
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
     black = min(mean)
     lit = np.array([one.lit for one in kept])
-    mean_sigma = np.hypot(mean_sigma, lit * flicker * (mean - black) / np.sqrt(2))  # of a pair at least
+    mean_sigma = np.hypot(
+        mean_sigma, lit * flicker * (mean - black) / np.sqrt(2)
+    )  # of a pair at least
     start = start_values(kept)
 
     def residuals(values: Floats) -> Floats:
         expected_mean, expected_variance = model(kept, values)
-        return np.concatenate([(mean - expected_mean) / mean_sigma, (variance - expected_variance) / variance_sigma])
+        return np.concatenate(
+            [(mean - expected_mean) / mean_sigma, (variance - expected_variance) / variance_sigma]
+        )
 
     scale = np.maximum(np.abs(start), 1e-9)
     scale[CURVATURE] = 0.01 / max(mean.max() - black, 1.0)
-    found = least_squares(lambda p: residuals(p * scale), start / scale, x_scale="jac", method="lm", xtol=1e-12)
+    found = least_squares(
+        lambda p: residuals(p * scale), start / scale, x_scale="jac", method="lm", xtol=1e-12
+    )
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(scale, scale)
     misfit = 2 * found.cost / max(2 * len(kept) - len(start), 1)
     return Transfer(found.x * scale, covariance, flicker, misfit, kept)
@@ -122,8 +132,12 @@ def fit(points: Sequence[Point], flicker: float) -> Transfer:
 
 def start_values(points: Sequence[Point]) -> Floats:
     """Slope of the variance against the mean over all levels, and rates from the longest exposures."""
-    mean, variance = (np.array([getattr(one.moments, name) for one in points]) for name in ("mean_dn", "variance_dn2"))
-    darkest, brightest = int(np.argmin(mean)), int(np.argmax(mean))
+    mean, variance = (
+        np.array([getattr(one.moments, name) for one in points])
+        for name in ("mean_dn", "variance_dn2")
+    )
+    darkest = int(np.argmin(mean))
+    brightest = int(np.argmax(mean))
     gain = (variance[brightest] - variance[darkest]) / max(mean[brightest] - mean[darkest], 1e-9)
     black = mean[darkest]
     temperatures = 1 + max(one.dark for one in points)
@@ -144,11 +158,15 @@ def unsaturated(points: Sequence[Point], black_dn: float) -> list[bool]:
 def saturated(points: Sequence[Point]) -> list[bool]:
     """Which flats are beyond the turnover of the variance, with a variance that has collapsed."""
     variance = np.array([one.moments.variance_dn2 for one in points])
-    brighter = np.array([one.exposure_s for one in points]) > points[int(np.argmax(variance))].exposure_s
+    brighter = (
+        np.array([one.exposure_s for one in points]) > points[int(np.argmax(variance))].exposure_s
+    )
     return [bool(one) for one in brighter & (variance < COLLAPSED * variance.max())]
 
 
-def lamp_flicker(points: Sequence[Point], difference_dn2: Sequence[float], black_dn: float, pixels: int) -> float:
+def lamp_flicker(
+    points: Sequence[Point], difference_dn2: Sequence[float], black_dn: float, pixels: int
+) -> float:
     """Relative flicker from frame to frame: of the means' differences in pairs, what their noise does not explain.
 
     The frames of a pair are independent, so the mean square difference is 2 (flicker signal)^2 + 2 variance / pixels.

@@ -51,7 +51,8 @@ def some_fields(sheet: Sheet, fields: slice) -> Sheet:
 
 def agreements(sheet: Sheet) -> list[Agreement]:
     """The agreement of each half of the fields with the other, at the rates of the sequences, from rest on."""
-    even, odd = some_fields(sheet, slice(0, None, 2)), some_fields(sheet, slice(1, None, 2))
+    even = some_fields(sheet, slice(0, None, 2))
+    odd = some_fields(sheet, slice(1, None, 2))
     rates = sheet.levels("sequence", "rate_deg_s")
     return [
         agreement(of_one_unit(fitted), other, rate, name)
@@ -73,13 +74,23 @@ def agreement(model: ErrorModel, sheet: Sheet, rate_deg_s: float, fitted: str) -
     drawn = turning(model, rate_deg_s) if rate_deg_s else at_rest(model)
     p_values = [float(stats.ks_2samp(*pair).pvalue) for pair in zip(first, drawn.T, strict=True)]
     centered = errors - model.mean[:, None, None]
-    found, expected = [], []
+    found = []
+    expected = []
     for one in range(len(steps)):
         for two in range(one + 1, len(steps)):
             angle_deg = rate_deg_s * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
-            found.append(mean_known(centered[:, one] * centered[:, two], 1) / mean_known(centered**2, (1, 2)))
+            found.append(
+                mean_known(centered[:, one] * centered[:, two], 1) / mean_known(centered**2, (1, 2))
+            )
             expected.append(model.correlation(angle_deg, rate_deg_s))
-    return Agreement(fitted, rate_deg_s, first.shape[1], p_values, float(np.mean(found)), float(np.mean(expected)))
+    return Agreement(
+        fitted,
+        rate_deg_s,
+        first.shape[1],
+        p_values,
+        float(np.mean(found)),
+        float(np.mean(expected)),
+    )
 
 
 def turning(model: ErrorModel, rate_deg_s: float) -> Floats:

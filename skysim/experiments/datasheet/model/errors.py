@@ -50,7 +50,8 @@ class ErrorModel:
     def __init__(self, constants: dict[str, Any]) -> None:
         self.constants = constants
         self.mean, self.unit, self.field, self.pixel, self.scale = (
-            np.array(constants[name], dtype=float) for name in ("mean", "unit", "field", "pixel", "scale")
+            np.array(constants[name], dtype=float)
+            for name in ("mean", "unit", "field", "pixel", "scale")
         )
         self.rates_deg_s = np.array(constants["rates_deg_s"], dtype=float)
         self.noise = np.array(constants["noise"], dtype=float)
@@ -69,11 +70,19 @@ class ErrorModel:
         """
         bias = self.mean + (self.unit * rng.standard_normal(3) if unit else 0.0)
         axis_rad = float(rng.uniform(0, 2 * math.pi))
-        return State(rng.standard_normal(3), rng.standard_normal(3), float(rng.standard_normal()), bias, axis_rad)
+        return State(
+            rng.standard_normal(3),
+            rng.standard_normal(3),
+            float(rng.standard_normal()),
+            bias,
+            axis_rad,
+        )
 
     def noise_arcsec(self, rate_deg_s: Any) -> Any:
         """(N, 3) standard deviation of the noise at (N,) rates, without what is added about the rate's axis."""
-        return np.stack([np.interp(rate_deg_s, self.rates_deg_s, column) for column in self.noise.T], axis=-1)
+        return np.stack(
+            [np.interp(rate_deg_s, self.rates_deg_s, column) for column in self.noise.T], axis=-1
+        )
 
     def along_arcsec(self, rate_deg_s: Any) -> Any:
         """(N,) standard deviation of what is added about the rate's axis."""
@@ -88,7 +97,12 @@ class ErrorModel:
         return noise
 
     def draw(
-        self, rate_deg_s: Any, step_s: float, rng: Any, state: State | None = None, axis_rad: Any | None = None
+        self,
+        rate_deg_s: Any,
+        step_s: float,
+        rng: Any,
+        state: State | None = None,
+        axis_rad: Any | None = None,
     ) -> Any:
         """(N, 3) errors in arcseconds, at times step_s apart.
 
@@ -128,7 +142,8 @@ class ErrorModel:
         E[s_k s_l] = exp(-v^2 (1 - r) / 4) for lognormal scales whose normal numbers have the correlation r.
         """
         field, pixel, scale = (
-            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"]) for name in ("field", "pixel", "scale")
+            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"])
+            for name in ("field", "pixel", "scale")
         )
         noise = self.noise_arcsec(np.array([abs(rate_deg_s)]))[0]
         shared = self.field**2 * field + self.pixel**2 * pixel
@@ -149,7 +164,8 @@ def correlated(steps: Any, first: Any, rng: Any) -> Any:
     shape = (len(steps), *np.shape(first))
     left = np.exp(-np.asarray(steps)).reshape(-1, *[1] * np.ndim(first))
     values = np.sqrt(1 - left**2) * rng.standard_normal(shape)
-    values[0], left[0] = first, 0.0
+    values[0] = first
+    left[0] = 0.0
     shift = 1
     while shift < len(values) and left.any():
         values[shift:] += left[shift:] * values[:-shift]

@@ -9,7 +9,8 @@ from typing import Any
 from skysim.core.errors import InputError
 from skysim.core.io.files import make_folder, to_json, write_text
 
-MODULE, CONSTANTS = "tracker_error.py", "tracker_error.json"
+MODULE = "tracker_error.py"
+CONSTANTS = "tracker_error.json"
 HERE = Path(__file__).parent
 
 
@@ -24,7 +25,9 @@ def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
 def require_fmu_builder() -> None:
     """Raise InputError if the package that builds the units is not installed."""
     if find_spec("pythonfmu3") is None:
-        raise InputError("datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'")
+        raise InputError(
+            "datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'"
+        )
 
 
 def write_fmu(folder: Path) -> Path:
@@ -37,4 +40,8 @@ def write_fmu(folder: Path) -> Path:
 
     script = folder / "fmu_slave.py"
     write_text(script, (HERE / "fmu_slave.py").read_text(encoding="utf-8"))
-    return Path(FmuBuilder.build_FMU(script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]))
+    return Path(
+        FmuBuilder.build_FMU(
+            script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]
+        )
+    )

@@ -15,14 +15,18 @@ from skysim.experiments.datasheet.terms import GROUPS, term_errors
 from skysim.experiments.study.execution import setups, trials
 
 GRID = 60  # correlation angles that are tried
-LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
+LEAST_NOISE = (
+    0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
+)
 
 
 def constants(sheet: Sheet) -> dict[str, Any]:
     """The constants of `errors.ErrorModel` for the scene of a datasheet."""
     errors, _ = term_errors(sheet)
     found = [components(one) for one in errors]
-    field, pixel = (np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel"))
+    field, pixel = (
+        np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel")
+    )
     bias = [bias_terms(one) for one in errors]
     across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     mean = [one[0] for one in bias]
@@ -106,10 +110,14 @@ def along_square(sheet: Sheet, rate_deg_s: float, mean: list[float], errors: Flo
 
 def axes_rad(sheet: Sheet, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
-    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows("rate", rate_deg_s=rate_deg_s)
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows(
+        "rate", rate_deg_s=rate_deg_s
+    )
     setup = setups.prepared_setup(sheet.spec, sheet.cells[rows[0]].settings)
     seeds = sheet.column("seed", rows[:1])[0].tolist()
-    axes = np.array([trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds])
+    axes = np.array(
+        [trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds]
+    )
     return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
 
 
@@ -118,7 +126,9 @@ def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats, Floats]:
 
     (M,) each, the mean over the fields and the axes across the boresight, without the mean error; arcsec^2
     """
-    angles, products, squares = [], [], []
+    angles = []
+    products = []
+    squares = []
     for rate in sheet.levels("sequence", "rate_deg_s"):
         steps, errors = sequences(sheet, rate)
         errors = errors[:2] - np.array(mean)[:2, None, None]
@@ -139,13 +149,19 @@ def field_angle_deg(sheet: Sheet, field: Floats, pixel: Floats, mean: list[float
     units of the mean square at its rate, to which its error is proportional; between a pixel and four fields.
     """
     angles, products, squares = lagged(sheet, mean)
-    pixel_deg, weight = sheet.designer.pixel_deg, float(np.sum(field[:2] ** 2))
+    pixel_deg = sheet.designer.pixel_deg
+    weight = float(np.sum(field[:2] ** 2))
     total = weight + float(np.sum(pixel[:2] ** 2))
     trials_deg = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
     if not total:
         return float(trials_deg[-1])
-    found, left = products / squares, []
+    found = products / squares
+    left = []
     for angle in trials_deg:
-        shape = (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg)) / total / squares
+        shape = (
+            (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg))
+            / total
+            / squares
+        )
         left.append(float(np.sum((found - shape * (shape @ found) / (shape @ shape)) ** 2)))
     return float(trials_deg[int(np.argmin(left))])

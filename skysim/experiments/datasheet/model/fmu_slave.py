@@ -21,13 +21,20 @@ class TrackerError(Fmi3Slave):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.time, self.seed, self.rate_deg_s = 0.0, 1, 0.0
+        self.time = 0.0
+        self.seed = 1
+        self.rate_deg_s = 0.0
         self.x_arcsec = self.y_arcsec = self.roll_arcsec = 0.0
         self.model = ErrorModel.read(Path(self.resources) / "tracker_error.json")
         self.state: Any = None
-        independent = {"causality": Fmi3Causality.independent, "variability": Fmi3Variability.continuous}
+        independent = {
+            "causality": Fmi3Causality.independent,
+            "variability": Fmi3Variability.continuous,
+        }
         self.register_variable(Float64("time", **independent))
-        self.register_variable(Int32("seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed))
+        self.register_variable(
+            Int32("seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed)
+        )
         self.register_variable(Float64("rate_deg_s", causality=Fmi3Causality.input))
         for name in ("x_arcsec", "y_arcsec", "roll_arcsec"):
             self.register_variable(Float64(name, causality=Fmi3Causality.output))

@@ -34,7 +34,14 @@ ATTITUDES = "attitudes.csv"
 FRAME = "frame_{:04d}.fits"
 COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
 MIN_IMAGES = 3
-FORMATS = (".fits", ".fit", ".fits.gz", ".tif", ".tiff", ".png")  # of several images of one name the first is read
+FORMATS = (
+    ".fits",
+    ".fit",
+    ".fits.gz",
+    ".tif",
+    ".tiff",
+    ".png",
+)  # of several images of one name the first is read
 
 
 class SurveyImage(NamedTuple):
@@ -103,7 +110,9 @@ def pixels_of(path: Path, camera: Camera) -> NDArray:
 
 def read_attitudes(path: Path) -> dict[str, Rotation]:
     """lab_from_body of each image by its name, from a CSV file. Raises InputError with one line."""
-    refusal = InputError(path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used")
+    refusal = InputError(
+        path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used"
+    )
     files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
     return dict(zip(files, stops.from_angles(numbers), strict=True))
 
@@ -114,14 +123,19 @@ def write_attitudes(
     """Write attitudes as `read_attitudes` reads them; leds : number of LEDs in view, for a plan."""
     lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
     for n, (name, angles) in enumerate(zip(names, stops.angles_deg(lab_from_body), strict=True)):
-        cells = [name, *(f"{angle:.4f}" for angle in angles)] + ([f"{leds[n]}"] if leds is not None else [])
+        cells = [name, *(f"{angle:.4f}" for angle in angles)] + (
+            [f"{leds[n]}"] if leds is not None else []
+        )
         lines.append(",".join(cells))
     with atomic_file(path) as temporary:
         temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 def frames_with_attitude(
-    pictures: Sequence[SurveyImage], model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
+    pictures: Sequence[SurveyImage],
+    model: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    settings: Settings,
 ) -> list[SurveyFrame]:
     """The images whose attitude is known or is found by the tracker, lost in space, with this model."""
     tracker: DomeTracker | None = None
@@ -138,10 +152,14 @@ def frames_with_attitude(
     return out
 
 
-def lost_in_space(model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings) -> DomeTracker:
+def lost_in_space(
+    model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
+) -> DomeTracker:
     """A tracker that knows how uncertain the model is. Raises InputError for LEDs that it cannot use."""
     camera = replace(model.camera, focal_sigma=abs(uncertainty.focal_error))
-    leds: LedMap = replace(model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None)
+    leds: LedMap = replace(
+        model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None
+    )
     lever = Lever(model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m)
     try:
         return DomeTracker(camera, leds, lever, settings)

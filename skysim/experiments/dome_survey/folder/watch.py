@@ -53,7 +53,10 @@ class WatchedFolder:
     @property
     def pictures(self) -> list[SurveyImage]:
         """The images that were read."""
-        return [SurveyImage(name, self._lights[name], self._attitudes.get(name)) for name in sorted(self._lights)]
+        return [
+            SurveyImage(name, self._lights[name], self._attitudes.get(name))
+            for name in sorted(self._lights)
+        ]
 
     def arrivals(self, count: int, poll_s: float = POLL_S) -> Iterator[News]:
         """Yield after every look that finds something new, until `count` images are read."""
@@ -67,11 +70,13 @@ class WatchedFolder:
 
     def look(self) -> News:
         """Read the files that are complete and new. Raises InputError if there is no such folder."""
-        news, paths = News([], []), best_images(self.folder)
+        news = News([], [])
+        paths = best_images(self.folder)
         names = {path.name for path in paths}
         self._lights = {name: lights for name, lights in self._lights.items() if name in names}
         for path in [*paths, self.folder / ATTITUDES]:
-            stamp, before = stamp_of(path), self._seen.get(path.name)
+            stamp = stamp_of(path)
+            before = self._seen.get(path.name)
             if stamp is None:
                 continue
             self._seen[path.name] = stamp

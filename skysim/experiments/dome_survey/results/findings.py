@@ -15,7 +15,12 @@ from skysim.experiments.dome_survey import stops
 from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import Ints, match_by_imu
 from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, survey_model
-from skysim.experiments.dome_survey.survey_run import SurveyRun, identified, light_table, stray_lights
+from skysim.experiments.dome_survey.survey_run import (
+    SurveyRun,
+    identified,
+    light_table,
+    stray_lights,
+)
 from skysim.scene.scene import Scene
 
 
@@ -35,7 +40,11 @@ class Coverage:
     @property
     def measured(self) -> Mask:
         """(N,) LEDs that are surveyed."""
-        return np.zeros(len(self.model.leds.id), dtype=bool) if self.accuracy is None else self.accuracy.measured
+        return (
+            np.zeros(len(self.model.leds.id), dtype=bool)
+            if self.accuracy is None
+            else self.accuracy.measured
+        )
 
 
 def coverage(run: SurveyRun) -> Coverage:
@@ -46,7 +55,10 @@ def coverage(run: SurveyRun) -> Coverage:
 
 
 def coverage_before(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty, noise_px: float
+    frames: Sequence[SurveyFrame],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    noise_px: float,
 ) -> Coverage:
     """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and the accuracy predicted."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
@@ -64,10 +76,14 @@ class NextStops:
     accuracy: SurveyAccuracy | None
 
 
-def next_stops(scene: Scene, so_far: Coverage, margin_px: float, count: int, tilt_deg: float) -> NextStops:
+def next_stops(
+    scene: Scene, so_far: Coverage, margin_px: float, count: int, tilt_deg: float
+) -> NextStops:
     """Up to `count` attitudes after those held so far."""
     model = so_far.model
-    further = stops.planned_stops(scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen)
+    further = stops.planned_stops(
+        scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
+    )
     attitudes = Rotation.concatenate([so_far.held, further.inv()])
     seen = np.vstack([so_far.seen, model.visible(further.inv(), margin_px)])
     return NextStops(further, predicted(model, attitudes, seen))
@@ -113,9 +129,12 @@ class DomeFaults:
 
 def find_faults(run: SurveyRun) -> DomeFaults:
     """The faults that a survey shows."""
-    survey, leds = run.survey, run.listed
+    survey = run.survey
+    leds = run.listed
     table = light_table(run)
-    rows, sigma_m = survey_faults.displaced(leds.position_m, survey.leds.position_m, survey.led_covariance_m2)
+    rows, sigma_m = survey_faults.displaced(
+        leds.position_m, survey.leds.position_m, survey.led_covariance_m2
+    )
     off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
     # The time of a code that runs freely is unknown, and with it what each LED shows.
     code = run.prior.code
@@ -125,8 +144,14 @@ def find_faults(run: SurveyRun) -> DomeFaults:
         leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
         {int(leds.id[row]): float(off_m[row]) for row in rows},
         sigma_m,
-        [(int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist()) for x in exchanges],
-        {int(leds.id[row]): survey.leds.position_m[row].tolist() for row in (*rows, *(x.led for x in exchanges))},
+        [
+            (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
+            for x in exchanges
+        ],
+        {
+            int(leds.id[row]): survey.leds.position_m[row].tolist()
+            for row in (*rows, *(x.led for x in exchanges))
+        },
         [stray.position_m.tolist() for stray in stray_lights(run)],
         share,
     )
@@ -165,7 +190,11 @@ def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
     """Counts and errors of a coverage, one row for each LED."""
     frames = so_far.seen.sum(axis=0)
     measured = so_far.measured
-    sigma_m = so_far.accuracy.led_sigma_m if so_far.accuracy else np.full(len(measured), so_far.model.leds_sigma_m)
+    sigma_m = (
+        so_far.accuracy.led_sigma_m
+        if so_far.accuracy
+        else np.full(len(measured), so_far.model.leds_sigma_m)
+    )
     sigma_mm = (1e3 * sigma_m).tolist()
     columns = so_far.model.leds.id.tolist(), frames.tolist(), measured.tolist(), sigma_mm
     keys = ("led", "frames", "measured", "sigma_mm")
@@ -194,7 +223,11 @@ def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | in
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
     up = lab_from_body.apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
-    columns = *stops.angles_deg(lab_from_body).T.tolist(), tilt_deg.tolist(), shown.sum(axis=1).tolist()
+    columns = (
+        *stops.angles_deg(lab_from_body).T.tolist(),
+        tilt_deg.tolist(),
+        shown.sum(axis=1).tolist(),
+    )
     keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
     return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
 

@@ -29,13 +29,19 @@ PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
 VALUE_KEYS = ("what", "believed", "found", "sigma")
 
 
-def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> dict[str, float | int | None]:
+def error_statistics(
+    stops: int, errors_rad: list[tuple[float, float]]
+) -> dict[str, float | int | None]:
     """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
     statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
     errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
     for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
-        statistics[f"{name}_arcsec_median"] = float(np.median(error_arcsec)) if len(error_arcsec) else None
-        statistics[f"{name}_arcsec_worst"] = float(error_arcsec.max()) if len(error_arcsec) else None
+        statistics[f"{name}_arcsec_median"] = (
+            float(np.median(error_arcsec)) if len(error_arcsec) else None
+        )
+        statistics[f"{name}_arcsec_worst"] = (
+            float(error_arcsec.max()) if len(error_arcsec) else None
+        )
     return statistics
 
 
@@ -83,7 +89,8 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
     survey = run.survey
     sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
     columns = [
-        parameters(lens, lever) for lens, lever in ((before.camera, before.lever), (survey.camera, survey.lever))
+        parameters(lens, lever)
+        for lens, lever in ((before.camera, before.lever), (survey.camera, survey.lever))
     ]
     lever_sigma_mm = 1e3 * np.sqrt(np.diag(survey.lever_covariance_m2))
     sigma = [*lens_sigma(survey)[:7].tolist(), *lever_sigma_mm.tolist()]
@@ -98,7 +105,10 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
         "misfit": survey.misfit,
         "led_sigma_mm_median": float(np.median(sigma_mm)),
         "led_sigma_mm_worst": float(sigma_mm.max()),
-        "values": [dict(zip(VALUE_KEYS, row, strict=True)) for row in zip(PARAMETERS, *columns, sigma, strict=True)],
+        "values": [
+            dict(zip(VALUE_KEYS, row, strict=True))
+            for row in zip(PARAMETERS, *columns, sigma, strict=True)
+        ],
     }
 
 
@@ -120,7 +130,9 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
     return [float(lens.focal_px), *lens.center_px, *lens.distortion[:4], *lever_mm]
 
 
-def coverage_figure(so_far: Coverage, faults: DomeFaults | None, further: Rotation | None) -> NDArray[np.uint8]:
+def coverage_figure(
+    so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
+) -> NDArray[np.uint8]:
     """BGR image of the dome from above: how well each LED is measured, faults, and where to point the camera next."""
     fig, canvas = new_figure((8, 7))
     draw_coverage(fig.subplots(), so_far, faults, further)
@@ -128,12 +140,19 @@ def coverage_figure(so_far: Coverage, faults: DomeFaults | None, further: Rotati
 
 
 def survey_figure(
-    so_far: Coverage, faults: DomeFaults, further: Rotation | None, errors: LedErrors | None, shifts: LedErrors
+    so_far: Coverage,
+    faults: DomeFaults,
+    further: Rotation | None,
+    errors: LedErrors | None,
+    shifts: LedErrors,
 ) -> NDArray[np.uint8]:
     """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
     panels = [("found minus list", shifts.true_m, -shifts.before_m)]
     if errors is not None:
-        panels = [("error before the survey", errors.true_m, errors.before_m), ("after", errors.true_m, errors.after_m)]
+        panels = [
+            ("error before the survey", errors.true_m, errors.before_m),
+            ("after", errors.true_m, errors.after_m),
+        ]
     fig, canvas = new_figure((7 * (1 + len(panels)), 6.5))
     first, *rest = fig.subplots(1, 1 + len(panels))
     draw_coverage(first, so_far, faults, further)
@@ -157,21 +176,37 @@ def picture_of(canvas: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
 
 
-def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults | None, further: Rotation | None) -> None:
+def draw_coverage(
+    axes: Any, so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
+) -> None:
     """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
     from matplotlib.colors import LogNorm
 
-    leds, measured = so_far.model.leds, so_far.measured
+    leds = so_far.model.leds
+    measured = so_far.measured
     x_m, y_m, _ = leds.position_m.T
     once = so_far.seen.any(axis=0) & ~measured
     unseen = ~measured & ~once
-    axes.scatter(x_m[unseen], y_m[unseen], s=14, facecolor="none", edgecolor="0.6", label=f"not seen: {unseen.sum()}")
-    axes.scatter(x_m[once], y_m[once], s=14, color="0.75", label=f"seen, not measured: {once.sum()}")
+    axes.scatter(
+        x_m[unseen],
+        y_m[unseen],
+        s=14,
+        facecolor="none",
+        edgecolor="0.6",
+        label=f"not seen: {unseen.sum()}",
+    )
+    axes.scatter(
+        x_m[once], y_m[once], s=14, color="0.75", label=f"seen, not measured: {once.sum()}"
+    )
     if so_far.accuracy is not None:
         sigma_mm = 1e3 * so_far.accuracy.led_sigma_m[measured]
         label = f"measured: {measured.sum()}"
-        points = axes.scatter(x_m[measured], y_m[measured], s=14, c=sigma_mm, norm=LogNorm(), label=label)
-        axes.figure.colorbar(points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8)
+        points = axes.scatter(
+            x_m[measured], y_m[measured], s=14, c=sigma_mm, norm=LogNorm(), label=label
+        )
+        axes.figure.colorbar(
+            points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
+        )
     if faults is not None:
         marks = {
             "dark": (faults.dark, "x", "black"),
@@ -180,11 +215,19 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults | None, furthe
         }
         for name, (numbers, marker, color) in marks.items():
             rows = rows_of(numbers, leds.id)
-            colors = {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
+            colors = (
+                {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
+            )
             if len(rows):
                 axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
             for row in rows:
-                axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), textcoords="offset points", color=color)
+                axes.annotate(
+                    str(leds.id[row]),
+                    (x_m[row], y_m[row]),
+                    (6, 6),
+                    textcoords="offset points",
+                    color=color,
+                )
     if further is not None:
         lever = so_far.model.lever
         toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
@@ -192,7 +235,12 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults | None, furthe
             at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
             axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
     axes.legend(loc="upper left", fontsize="small")
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="coverage; blue: the attitudes to hold next")
+    axes.set(
+        xlabel="x [m]",
+        ylabel="y [m]",
+        aspect="equal",
+        title="coverage; blue: the attitudes to hold next",
+    )
 
 
 def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None:
@@ -200,7 +248,9 @@ def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None
     rms_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))
     scale_mm = 1e3 * float(np.quantile(np.linalg.norm(error_m, axis=1), 0.95)) or 1.0
     x_m, y_m, _ = place_m.T
-    arrows = axes.quiver(x_m, y_m, *(1e3 * error_m.T), angles="xy", scale=25 * scale_mm, cmap="coolwarm")
+    arrows = axes.quiver(
+        x_m, y_m, *(1e3 * error_m.T), angles="xy", scale=25 * scale_mm, cmap="coolwarm"
+    )
     arrows.set_clim(-scale_mm, scale_mm)
     axes.quiverkey(arrows, 0.9, 1.03, scale_mm, f"{scale_mm:.2g} mm", labelpos="E")
     axes.set_title(f"{title}: {rms_mm:.2g} mm rms an axis", loc="left")

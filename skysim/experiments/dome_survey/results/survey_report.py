@@ -12,7 +12,18 @@ from skysim.core.types import Floats
 from skysim.experiments.dome_survey.results.findings import accuracy_statistics, fault_lines
 from skysim.experiments.dome_survey.survey_run import SurveyRun, residuals_px
 from skysim.results.plots import INK, png
-from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
+from skysim.results.report import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Report,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 
 CELLS = 8  # across the chip, over which residuals are averaged
 BINS = 60
@@ -28,8 +39,13 @@ FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "s
 def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
     """The report of a survey. statistics : as in `survey.json`"""
     reached = accuracy_statistics(run.accuracy)
-    dome = Figure(Path(statistics["picture"]).read_bytes(), "The dome from above: LED errors, faults, next attitudes.")
-    residuals = Figure(residual_figure(run), "Residuals: their distribution, and their means over the chip.")
+    dome = Figure(
+        Path(statistics["picture"]).read_bytes(),
+        "The dome from above: LED errors, faults, next attitudes.",
+    )
+    residuals = Figure(
+        residual_figure(run), "Residuals: their distribution, and their means over the chip."
+    )
     blocks = [
         verdict(statistics, 1e3 * run.accuracy.led_rms_m),
         Text(FIT.format(**statistics)),
@@ -60,9 +76,17 @@ def value_table(statistics: dict[str, Any]) -> Table:
     for row in statistics["values"]:
         what = row["what"]
         numbers = [row["believed"], row["found"], *([truth[what]] if truth else [])]
-        before, found, *known = (f"{one:.5g}" if what[0] in "kp" else f"{one:.3f}" for one in numbers)
+        before, found, *known = (
+            f"{one:.5g}" if what[0] in "kp" else f"{one:.3f}" for one in numbers
+        )
         rows += [[what, before, found, f"{row['sigma']:.2g}", *known]] if row["sigma"] else []
-    return Table([Column("", kind="text"), *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)])], rows)
+    return Table(
+        [
+            Column("", kind="text"),
+            *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)]),
+        ],
+        rows,
+    )
 
 
 def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
@@ -74,28 +98,45 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
         f"True error of the LEDs: {statistics['led_mm_before']:.2g} mm rms before, {statistics['led_mm_after']:.2g} mm"
         f" after (predicted {predicted} mm); {statistics['renamed']} with another identity."
     )
-    errors = ("cross_arcsec_median", "cross_arcsec_worst", "roll_arcsec_median", "roll_arcsec_worst")
+    errors = (
+        "cross_arcsec_median",
+        "cross_arcsec_worst",
+        "roll_arcsec_median",
+        "roll_arcsec_worst",
+    )
     trackers = [(when, statistics[when]) for when in ("before", "after")]
-    rows = [[when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)] for when, one in trackers]
+    rows = [
+        [when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)]
+        for when, one in trackers
+    ]
     heads = ("cross, median", "worst", "roll, median", "worst")
-    columns = [Column("the tracker", kind="text"), Column("solved"), *(Column(head, "″", ".3g") for head in heads)]
+    columns = [
+        Column("the tracker", kind="text"),
+        Column("solved"),
+        *(Column(head, "″", ".3g") for head in heads),
+    ]
     return [Text(text), Table(columns, rows)]
 
 
 def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
     """Errors by the plan, by this survey's covariance, in truth, and with the next attitudes."""
-    predicted, after = statistics.get("predicted"), statistics.get("led_mm_after")
+    predicted = statistics.get("predicted")
+    after = statistics.get("led_mm_after")
     columns = {"by the plan": predicted} if predicted else {}
     columns["by this survey's covariance"] = reached
     columns |= {"true error, rms": {"led_mm": after}} if after is not None else {}
     columns["with the next attitudes"] = statistics["next_reaches"]
     rows = [[what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()]
-    return Table([Column("1σ", kind="text"), *(Column(head, format=".3g") for head in columns)], rows)
+    return Table(
+        [Column("1σ", kind="text"), *(Column(head, format=".3g") for head in columns)], rows
+    )
 
 
 def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
     """Which LEDs are measured, the attitudes to hold next, and what those will reach."""
-    counts, reaches, stops = statistics["coverage"], statistics["next_reaches"], statistics["next"]
+    counts = statistics["coverage"]
+    reaches = statistics["next_reaches"]
+    stops = statistics["next"]
     seen = (
         f"{counts['measured']} of {counts['leds']} LEDs measured, {counts['seen_once']} seen once, {counts['unseen']}"
         f" not seen; hold these {len(stops)} attitudes next:"
@@ -109,7 +150,9 @@ def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
 def stop_table(stops: list[dict[str, Any]]) -> Table:
     """Attitudes as roll, pitch and yaw, with tilt and number of LEDs."""
     names = ("roll", "pitch", "yaw", "tilt")
-    rows = [[n, *(one[f"{name}_deg"] for name in names), one["leds"]] for n, one in enumerate(stops, 1)]
+    rows = [
+        [n, *(one[f"{name}_deg"] for name in names), one["leds"]] for n, one in enumerate(stops, 1)
+    ]
     return Table([Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows)
 
 
@@ -124,10 +167,18 @@ def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
     """LED, fault and details, one row a fault."""
     rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
     for led, off_m in faults["displaced"].items():
-        rows.append((str(led), "displaced", f"{1e3 * off_m:.1f} mm from its place in the list, {place(faults, led)}"))
+        rows.append(
+            (
+                str(led),
+                "displaced",
+                f"{1e3 * off_m:.1f} mm from its place in the list, {place(faults, led)}",
+            )
+        )
     for led, shows, others in faults["exchanged"]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
-        rows.append((str(led), "exchanged", f"LED {shows}{alike} shines at its place, {place(faults, led)}"))
+        rows.append(
+            (str(led), "exchanged", f"LED {shows}{alike} shines at its place, {place(faults, led)}")
+        )
     rows += [("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]]
     return rows
 
@@ -149,7 +200,9 @@ def residual_figure(run: SurveyRun) -> bytes:
     def draw(fig: Any) -> None:
         left, right = fig.subplots(1, 2)
         draw_histogram(left, residual_px.ravel(), run.noise_px)
-        draw_means(right, xy_px, residual_px, (run.survey.camera.width_px, run.survey.camera.height_px))
+        draw_means(
+            right, xy_px, residual_px, (run.survey.camera.width_px, run.survey.camera.height_px)
+        )
 
     return png(draw, (10, 4))
 
@@ -159,7 +212,12 @@ def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
     end_px = float(np.quantile(np.abs(residual_px), 1 - TAIL))
     x_px = np.linspace(-end_px, end_px, 200)
     inside = residual_px[np.abs(residual_px) <= end_px]
-    axes.hist(inside, BINS, weights=np.full(len(inside), BINS / (2 * end_px * len(residual_px))), color=INK[5])
+    axes.hist(
+        inside,
+        BINS,
+        weights=np.full(len(inside), BINS / (2 * end_px * len(residual_px))),
+        color=INK[5],
+    )
     density = np.exp(-((x_px / noise_px) ** 2) / 2) / (noise_px * np.sqrt(2 * np.pi))
     axes.plot(x_px, density, color=INK[1], label=f"Gaussian of the noise, {noise_px:.2g} px")
     axes.set(xlabel="residual coordinate [px]", ylabel="density [1/px]", title="residuals")
@@ -178,9 +236,14 @@ def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int
         for values in (xy_px, residual_px)
     )
     enough = count >= 5
-    centers, means = centers[enough], means[enough]
+    centers = centers[enough]
+    means = means[enough]
     largest_px = float(np.linalg.norm(means, axis=1).max(initial=0)) or 1.0
-    arrows = axes.quiver(*centers.T, *means.T, angles="xy", scale_units="xy", scale=2 * largest_px / width_px)
+    arrows = axes.quiver(
+        *centers.T, *means.T, angles="xy", scale_units="xy", scale=2 * largest_px / width_px
+    )
     axes.quiverkey(arrows, 0.85, 1.04, largest_px, f"{largest_px:.2g} px", labelpos="E")
-    axes.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x [px]", ylabel="y [px]")
+    axes.set(
+        xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x [px]", ylabel="y [px]"
+    )
     axes.set_title("mean residuals over the chip", loc="left")

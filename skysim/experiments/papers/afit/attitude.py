@@ -18,7 +18,13 @@ from estimator.attitude.solvers import quest
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import PairCatalog, build_pair_catalog, candidates
 from estimator.core.arrays import Ints
-from estimator.identification.published.saa_search import Gates, SearchInput, build_primary, gate_rad, match_assumptions
+from estimator.identification.published.saa_search import (
+    Gates,
+    SearchInput,
+    build_primary,
+    gate_rad,
+    match_assumptions,
+)
 from skysim.core.constants import ARCSEC_RAD, INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
@@ -40,7 +46,13 @@ from skysim.experiments.papers.afit.test3_images import (
     photograph,
 )
 from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import percent, prediction_interval, sample_std
 from skysim.results.metrics import proportion
 from skysim.results.plots import INK
@@ -51,7 +63,12 @@ HOLD_MIN = 0.75  # time at a position: fitted, see `draw_holds`
 HOLDS_MIN = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 SITE_AZIMUTH_DEG = "0"  # of the lab's x axis: fitted
 KNOT_S = 0.05  # the vehicle turns at 2 deg/s at most
-STATISTICS: dict[str, Callable[..., Any]] = {"min": np.min, "max": np.max, "mean": np.mean, "sd": sample_std}
+STATISTICS: dict[str, Callable[..., Any]] = {
+    "min": np.min,
+    "max": np.max,
+    "mean": np.mean,
+    "sd": sample_std,
+}
 CAUSE_CAMERA = "two LEDs under a rolling shutter"
 CAUSE_IMU = f"{CAUSE_CAMERA}, an LN-200 with {HOLD_MIN} min per position"
 CAUSE_BUMP = f"{CAUSE_IMU}, position 5 bumped"
@@ -85,14 +102,19 @@ class AllCauses(NamedTuple):
 
 def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     """Tables 10-15: with clean images and a perfect IMU; with camera noise, IMU drift and the bump as the cause."""
-    images, units = options.trials(50, 3), options.trials(60, 8)
+    images = options.trials(50, 3)
+    units = options.trials(60, 8)
     clean = algorithm_errors(build_test3(), images, LEDS, random_stream(options.seed, 0))
     options.watch(1, 4)
-    camera = algorithm_errors(build_test3(FITTED_IMAGING), images, 2, random_stream(options.seed, 1))
+    camera = algorithm_errors(
+        build_test3(FITTED_IMAGING), images, 2, random_stream(options.seed, 1)
+    )
     options.watch(2, 4)
     holds = (HOLD_MIN,) if options.quick else HOLDS_MIN
     drift_deg = {hold: imu_drift(hold, units, random_stream(options.seed, 2)) for hold in holds}
-    drift_without_earth_deg = imu_drift(HOLD_MIN, units, random_stream(options.seed, 2), earth=False)
+    drift_without_earth_deg = imu_drift(
+        HOLD_MIN, units, random_stream(options.seed, 2), earth=False
+    )
     options.watch(3, 4)
     bump_runs = bump.simulate_bumps(bump.FITTED_BUMP, options.trials(10, 3), options.seed)
     bump_deg = np.array([run.imu_deg[-1] for run in bump_runs])
@@ -105,7 +127,9 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     results["named"] = RowResult(named, cause=Cause(CAUSE_CAMERA, named_with_noise))
     yaw_change = [one[:, 3, 0] - one[:, 2, 0] for one in (clean.error_deg, causes.error_deg)]
     with_earth = yaw_change[1].mean() + earth_deg[3, 0] - earth_deg[2, 0]
-    results["turns_back"] = with_draws(CAUSE_IMU, yaw_change[0], yaw_change[1], causes.images, with_earth)
+    results["turns_back"] = with_draws(
+        CAUSE_IMU, yaw_change[0], yaw_change[1], causes.images, with_earth
+    )
     return ExperimentResult(results, make_drawings(causes, drift_deg))
 
 
@@ -117,10 +141,14 @@ def with_draws(
     with_earth : the value if the IMU also contained the Earth rate, for the note
     """
     note = "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
-    return RowResult(prediction_interval(clean), note, Cause(cause, prediction_interval(with_causes, draws)))
+    return RowResult(
+        prediction_interval(clean), note, Cause(cause, prediction_interval(with_causes, draws))
+    )
 
 
-def combine_causes(camera_deg: Floats, drift_deg: Floats, bump_deg: Floats, earth_deg: Floats) -> AllCauses:
+def combine_causes(
+    camera_deg: Floats, drift_deg: Floats, bump_deg: Floats, earth_deg: Floats
+) -> AllCauses:
     """Combine images, IMUs and bumps by cycling through each; a bump adds to the IMU's error at position 5."""
     counts = len(camera_deg), len(drift_deg), len(bump_deg)
     draw = np.arange(max(counts))
@@ -134,7 +162,8 @@ def tables_10_to_14(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
     """Tables 10-14: the algorithm's angles minus the IMU's."""
     results = {}
     for position, axis in np.ndindex(clean.shape[1:]):
-        key, ours = f"position_{position + 1}_theta_{axis + 1}", clean[:, position, axis]
+        key = f"position_{position + 1}_theta_{axis + 1}"
+        ours = clean[:, position, axis]
         if position == HOME:
             results[key] = RowResult(prediction_interval(ours))
             continue
@@ -151,27 +180,36 @@ def table_15(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
     results = {}
     for name, statistic in STATISTICS.items():
         ours, with_causes, with_earth = (
-            statistic(np.abs(one), axis=1) for one in (clean, causes.error_deg, causes.error_deg + causes.earth_deg)
+            statistic(np.abs(one), axis=1)
+            for one in (clean, causes.error_deg, causes.error_deg + causes.earth_deg)
         )
         for column, key in enumerate(("theta_1", "theta_2", "theta_3", "averaged")):
             clean_deg, causes_deg, earth_deg = (
-                one.mean(axis=1) if column == 3 else one[:, column] for one in (ours, with_causes, with_earth)
+                one.mean(axis=1) if column == 3 else one[:, column]
+                for one in (ours, with_causes, with_earth)
             )
-            results[f"{name}_{key}"] = with_draws(CAUSE_BUMP, clean_deg, causes_deg, causes.bumps, earth_deg.mean())
+            results[f"{name}_{key}"] = with_draws(
+                CAUSE_BUMP, clean_deg, causes_deg, causes.bumps, earth_deg.mean()
+            )
     return results
 
 
 # The camera.
 
 
-def algorithm_errors(lab: Lab, images: int, lights: int, rng: np.random.Generator) -> AlgorithmErrors:
+def algorithm_errors(
+    lab: Lab, images: int, lights: int, rng: np.random.Generator
+) -> AlgorithmErrors:
     """The thesis's processing: eqs 43-44, SAA with Table 9's epsilons, QUEST with the `lights` brightest LEDs.
 
     images : number of images per position
     """
-    sightings = [photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)]
+    sightings = [
+        photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)
+    ]
     sets = list(zip(*sightings, strict=False))
-    error_deg, correct = np.empty((len(sets), len(IMU_DEG), 3)), 0
+    error_deg = np.empty((len(sets), len(IMU_DEG), 3))
+    correct = 0
     for n_set, sightings_of_set in enumerate(sets):
         # The home image is the map: all attitudes of a set are relative to it, as in the thesis (3.6.4).
         home = sightings_of_set[HOME]
@@ -194,7 +232,9 @@ def identify_leds(vectors: Floats, magnitude: Floats, catalog: PairCatalog) -> I
     against chance, which five LEDs with errors of 2 mm in a cross of 8 mm rarely are.
     """
     gates = Gates(EPSILON_SEP_ARCSEC * ARCSEC_RAD, EPSILON_POS_M / (48 * INCH_M), EPSILON_MAG, 0.0)
-    stars = SearchInput(vectors, magnitude, catalog.vectors, catalog.magnitude, catalog.cells, gates)
+    stars = SearchInput(
+        vectors, magnitude, catalog.vectors, catalog.magnitude, catalog.cells, gates
+    )
     separation_rad = float(2 * np.arcsin(np.linalg.norm(vectors[0] - vectors[1]) / 2))
     tolerance_rad = gate_rad(gates, separation_rad)
     begin, end = candidates(catalog, separation_rad - tolerance_rad, separation_rad + tolerance_rad)
@@ -215,24 +255,32 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     config = lab.scene.vehicle.imu
     assert config is not None
     legs = lab.scene.motion.maneuver[1:]  # the IMU is zeroed as the vehicle leaves home
-    timed_legs = [leg.model_copy(update={"duration_s": 60 * hold_min}) if leg.kind == "hold" else leg for leg in legs]
+    timed_legs = [
+        leg.model_copy(update={"duration_s": 60 * hold_min}) if leg.kind == "hold" else leg
+        for leg in legs
+    ]
     reference = guidance.plan(lab.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)}))
     t_s = np.arange(0, reference.duration_s, KNOT_S)
     wxyz, rate, _ = (np.array(column) for column in zip(*map(reference.state_at, t_s), strict=True))
-    earth_rad_s, vehicle = imu.earth_rate_lab_rad_s(lab.scene.site) * earth, lab.vehicle
+    earth_rad_s = imu.earth_rate_lab_rad_s(lab.scene.site) * earth
+    vehicle = lab.vehicle
     increments = imu.ideal_increments(
         t_s, wxyz, rate, t_s[1:], KNOT_S, imu_position_m(vehicle), vehicle.gravity_m_s2, earth_rad_s
     )
     # Every second start is the end of a hold, and the first that of home.
     stops = np.searchsorted(t_s[1:], np.array(reference.start_s[::2]) - KNOT_S)
-    configs = [config.model_copy(update={"hardware_seed": int(seed)}) for seed in rng.integers(2**31, size=units)]
+    configs = [
+        config.model_copy(update={"hardware_seed": int(seed)})
+        for seed in rng.integers(2**31, size=units)
+    ]
     measured = (imu.Imu.from_config(config, rng).measure(increments) for config in configs)
     return np.array([integrated_angles(one, stops) - IMU_DEG for one in measured])
 
 
 def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
     """(5, 3) roll, pitch, yaw in degrees from integrated IMU increments, after each number of samples in `stops`."""
-    wxyz, attitudes = np.array([1.0, 0.0, 0.0, 0.0]), []
+    wxyz = np.array([1.0, 0.0, 0.0, 0.0])
+    attitudes = []
     for increments in np.split(measured.angle_rad, stops)[: len(stops)]:
         wxyz = imu.integrate_attitude(wxyz, increments, np.zeros(3), measured.step_s)
         attitudes.append(wxyz)
@@ -265,7 +313,8 @@ def plot_quantiles(axes: Any, x: Any, values: Floats, **style: Any) -> None:
 
 
 def draw_differences(fig: Any, causes: AllCauses) -> None:
-    position, published_deg = np.arange(1, len(IMU_DEG) + 1), np.subtract(ALGORITHM_DEG, IMU_DEG)
+    position = np.arange(1, len(IMU_DEG) + 1)
+    published_deg = np.subtract(ALGORITHM_DEG, IMU_DEG)
     panels = fig.subplots(1, 3, sharey=True)
     for axis, axes in enumerate(panels):
         error_deg = causes.error_deg[:, :, axis]
@@ -282,7 +331,9 @@ def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
     """Mean absolute difference of roll and of pitch against the duration of a stay."""
     published = np.abs(np.subtract(ALGORITHM_DEG, IMU_DEG)).mean(axis=0)
     for axis, axes in enumerate(fig.subplots(1, 2, sharey=True)):
-        mean = np.array([np.abs(error_deg[:, :, axis]).mean(axis=1) for error_deg in drift.values()])
+        mean = np.array(
+            [np.abs(error_deg[:, :, axis]).mean(axis=1) for error_deg in drift.values()]
+        )
         plot_quantiles(axes, list(drift), mean.T, fmt="s-", label="ours, 95 % of IMUs")
         axes.axhline(published[axis], color=INK[1], label="published")
         axes.set(xlabel="minutes at a position", title=f"theta_{axis + 1}")

@@ -14,7 +14,13 @@ import numpy as np
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test3_images import angles_deg
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.plots import INK
@@ -25,7 +31,9 @@ BumpRate = tuple[float, float, float]
 # deg/s about the body axes: fitted to Table 14's theta_2 and theta_3, and the scene's own.
 FITTED_BUMP: BumpRate = (0.0, -12.1, -15.0)
 ASSUMED_BUMP: BumpRate = (3.0, -2.0, 14.0)
-BUMP_START_S, BUMP_END_S, NEXT_IMAGE_S = 1.5, 2.0, 2.5
+BUMP_START_S = 1.5
+BUMP_END_S = 2.0
+NEXT_IMAGE_S = 2.5
 CAUSE = f"a bump of {FITTED_BUMP} deg/s, gyros saturated at 10"
 
 
@@ -51,16 +59,25 @@ def bump(options: ExperimentOptions) -> ExperimentResult:
         runs.append(simulate_bumps(bump_deg_s, options.trials(10, 2), options.seed))
     with_fitted = runs[1]
     # Absolute errors of the IMU's angles at the end, (runs, 3).
-    without_deg, fitted_deg, assumed_deg = (np.abs([run.imu_deg[-1] for run in imus]) for imus in runs)
+    without_deg, fitted_deg, assumed_deg = (
+        np.abs([run.imu_deg[-1] for run in imus]) for imus in runs
+    )
     results = {
-        f"theta_{n + 1}": with_cause(CAUSE, prediction_interval, without_deg[:, n], fitted_deg[:, n]) for n in range(3)
+        f"theta_{n + 1}": with_cause(
+            CAUSE, prediction_interval, without_deg[:, n], fitted_deg[:, n]
+        )
+        for n in range(3)
     }
     cause = f"the scene's bump of {ASSUMED_BUMP} deg/s"
     results["order"] = with_cause(cause, prediction_interval, without_deg[:, 2], assumed_deg[:, 2])
     saturated_s = [[run.saturated_s for run in imus] for imus in runs[:2]]
     results["limited"] = with_cause(CAUSE, prediction_interval, *saturated_s)
-    results["tracker"] = RowResult(prediction_interval([run.tracker_error_deg for run in with_fitted]))
-    results["filter"] = RowResult(prediction_interval([filter_errors_after(run).max() for run in with_fitted]))
+    results["tracker"] = RowResult(
+        prediction_interval([run.tracker_error_deg for run in with_fitted])
+    )
+    results["filter"] = RowResult(
+        prediction_interval([filter_errors_after(run).max() for run in with_fitted])
+    )
     caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
     return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, with_fitted[0])),))
 
@@ -87,7 +104,9 @@ def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
         "exposure": '{time: "10 ms", rate_hz: 1, frames: 6, first: "0.4 s"}',
     }
     with open_flight(loader.load("simsat_bump", overrides)) as flight:
-        errors_deg = [tracker_error_deg(shot) for shot in flight.shots() if shot.truth.t_s > BUMP_END_S]
+        errors_deg = [
+            tracker_error_deg(shot) for shot in flight.shots() if shot.truth.t_s > BUMP_END_S
+        ]
         log = flight.telemetry()
     assert log.lab_from_imu is not None
     assert log.lab_from_filter is not None
@@ -105,13 +124,23 @@ def tracker_error_deg(shot: Shot) -> float:
     """The star tracker's error; infinite if the image was not solved."""
     assert shot.report is not None
     estimate = shot.report.attitude.cam_from_ref
-    return math.inf if estimate is None else float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
+    return (
+        math.inf
+        if estimate is None
+        else float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
+    )
 
 
 def draw(fig: Any, run: BumpRun) -> None:
-    axes, rows = fig.subplots(), experiments()["afit-bump"].rows
+    axes = fig.subplots()
+    rows = experiments()["afit-bump"].rows
     for axis in range(3):
-        axes.plot(run.t_s, np.abs(run.imu_deg[:, axis]), color=INK[(0, 2, 5)[axis]], label=f"IMU, theta_{axis + 1}")
+        axes.plot(
+            run.t_s,
+            np.abs(run.imu_deg[:, axis]),
+            color=INK[(0, 2, 5)[axis]],
+            label=f"IMU, theta_{axis + 1}",
+        )
         published = rows[f"theta_{axis + 1}"].published
         label = f"published, theta_{axis + 1}"
         axes.plot(run.t_s[-1] + 0.15, published, "os^"[axis], color=INK[1], label=label)

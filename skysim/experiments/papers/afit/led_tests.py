@@ -25,7 +25,13 @@ from skysim.experiments.papers.afit.test_stand import (
     measure_lights,
     render_at_attitude,
 )
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
@@ -39,19 +45,32 @@ from skysim.scene.sections.light import FlatSurfaceConfig
 from skysim.simulation.lab import Lab
 
 GrayImage = NDArray[np.uint8]
-LEDS, BOARD_DISTANCE_IN, DOME_IN, CAMERA_IN, PITCH_MM = 9, 36.0, 33.0, 15.0, 8.0
+LEDS = 9
+BOARD_DISTANCE_IN = 36.0
+DOME_IN = 33.0
+CAMERA_IN = 15.0
+PITCH_MM = 8.0
 # Red, blue and green by three resistors of 1, 5 and 10 kohm; the dimmest is green, the brightest red (Fig. 36).
 BOARD = (1.0, 0.2, 0.1, 0.7, 0.14, 0.07, 0.4, 0.08, 0.04)
-DIMMEST_LED, BOARD_INTENSITY_CD, BOARD_EXPOSURE_S = 8, 0.05, 20e-3
+DIMMEST_LED = 8
+BOARD_INTENSITY_CD = 0.05
+BOARD_EXPOSURE_S = 20e-3
 WIDE_PSF = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=2.0)
-NARROW_LOBE, MISALIGNMENT_DEG = CosineLobeConfig(exponent=20.0), 10.0  # half intensity at 15 deg
+# half intensity at 15 deg
+NARROW_LOBE = CosineLobeConfig(exponent=20.0)
+MISALIGNMENT_DEG = 10.0
 # Roll and pitch of the positions of Figs 38 and 40.
 VIEW_ANGLES_DEG = ((0.0, 0.0), (1.5, 2.0), (1.5, -2.0), (-1.5, -2.0))
 WHITE_CD = LEDS / 2 * INTENSITY_CD  # light as in Test 2, in a ninth of the cycle
-WHITE_EXPOSURE_S, SLOT_S = 0.1, 1e-3
+WHITE_EXPOSURE_S = 0.1
+SLOT_S = 1e-3
 PULSES_US = (1000.0, 500.0, 400.0, 200.0, 1.0)
-MIN_AREA_PX, GLARE_RADIUS_PX, DARK_RADIUS_PX = 50, 18, 60  # from an LED's middle; its own radius is 10 px
-SATURATION_FRACTION, CAUSE_SATURATION = 0.72, "pixels full at 0.72 of the converter's range"
+# from an LED's middle; its own radius is 10 px
+MIN_AREA_PX = 50
+GLARE_RADIUS_PX = 18
+DARK_RADIUS_PX = 60
+SATURATION_FRACTION = 0.72
+CAUSE_SATURATION = "pixels full at 0.72 of the converter's range"
 INTERMEDIATE_NOISE_GRAY = 2.5  # between the camera's own and Test 2's; no source states it
 CAUSE_NOISE = f"noise of {NOISE_E / E_PER_GRAY:.1f} gray levels, as in Test 2"
 CAUSE_LONG_PULSE = f"1 us lasting {1e6 * ON_FRACTION * SLOT_S:.0f} us, as in Test 2"
@@ -68,12 +87,20 @@ class LensSettings(NamedTuple):
 DEFAULT_LENS = LensSettings()
 
 
-def board_scene(levels: Sequence[float], distance_in: float, lens: LensSettings, **led_values: Any) -> Scene:
+def board_scene(
+    levels: Sequence[float], distance_in: float, lens: LensSettings, **led_values: Any
+) -> Scene:
     """Scene with a board of nine holes, the first len(levels) with LEDs, above the camera of a level vehicle."""
-    height_in, across_mm = CAMERA_IN + distance_in, PITCH_MM * np.array([1.0, 0.0, -1.0])
+    height_in = CAMERA_IN + distance_in
+    across_mm = PITCH_MM * np.array([1.0, 0.0, -1.0])
     positions = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
     listed = ListedConfig.model_validate(
-        {"kind": "listed", "cap_deg": 27, "levels": list(levels), "positions": positions[: len(levels)]}
+        {
+            "kind": "listed",
+            "cap_deg": 27,
+            "levels": list(levels),
+            "positions": positions[: len(levels)],
+        }
     )
     scene = load("afit_test1_ideal")
     panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
@@ -88,7 +115,9 @@ def board_scene(levels: Sequence[float], distance_in: float, lens: LensSettings,
 def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Lab:
     """Test stand with the first board: three colors by three resistors, always on."""
     drive = DirectConfig(kind="direct")
-    scene = board_scene(BOARD, BOARD_DISTANCE_IN, lens, drive=drive, intensity_cd=BOARD_INTENSITY_CD, **led_values)
+    scene = board_scene(
+        BOARD, BOARD_DISTANCE_IN, lens, drive=drive, intensity_cd=BOARD_INTENSITY_CD, **led_values
+    )
     scene = with_config(scene, "camera", psf=WIDE_PSF)
     return build_test_stand(with_config(scene, "exposure", time_s=BOARD_EXPOSURE_S))
 
@@ -100,7 +129,11 @@ def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) ->
     """
     levels = [pulse * 1e-6 / SLOT_S for pulse in pulses_us]
     scene = board_scene(levels, DOME_IN, LensSettings(8.0, DOME_IN), intensity_cd=WHITE_CD)
-    scene = with_config(scene, "camera.detector", full_well_e=saturation_fraction * scene.camera.detector.full_well_e)
+    scene = with_config(
+        scene,
+        "camera.detector",
+        full_well_e=saturation_fraction * scene.camera.detector.full_well_e,
+    )
     return build_test_stand(with_config(scene, "exposure", time_s=WHITE_EXPOSURE_S))
 
 
@@ -113,7 +146,9 @@ def take_image(
     lab: Lab, rng: np.random.Generator, roll_pitch_deg: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[GrayImage, Floats]:
     """An image in gray levels, and the (N, 2) true pixels of its LEDs in the order of their numbers."""
-    frame, truth = render_at_attitude(lab, Rotation.from_euler("xy", roll_pitch_deg, degrees=True), rng)
+    frame, truth = render_at_attitude(
+        lab, Rotation.from_euler("xy", roll_pitch_deg, degrees=True), rng
+    )
     return gray_levels(frame, lab), truth.sources.xy_px[np.argsort(truth.sources.id)]
 
 
@@ -135,7 +170,9 @@ def count_above(image: GrayImage, xy_px: Floats, threshold: float) -> ThresholdC
     areas = np.bincount(label.ravel())
     areas[0] = 0
     x, y = np.rint(xy_px).astype(int).T
-    distance_px, _ = cKDTree(xy_px).query(np.argwhere(above)[:, ::-1])  # of each lit pixel from the nearest LED
+    distance_px, _ = cKDTree(xy_px).query(
+        np.argwhere(above)[:, ::-1]
+    )  # of each lit pixel from the nearest LED
     dark_px = int(np.sum(distance_px > DARK_RADIUS_PX))
     glare_px = int(np.sum(distance_px > GLARE_RADIUS_PX)) - dark_px
     return ThresholdCounts(areas[label[y - y0, x - x0]].astype(float), glare_px, dark_px)
@@ -156,7 +193,9 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
     pulses, magnitude = brightness(images, rng[4])
     rng_drawn = random_stream(options.seed, 5)
     aperture_images = [take_image(color_board(lens), rng_drawn)[0] for lens in APERTURES.values()]
-    noise_images = [take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)]
+    noise_images = [
+        take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)
+    ]
     drawings = (
         Drawing(
             "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
@@ -190,7 +229,9 @@ def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     lab = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
     always_on = lab.with_sources(replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
-    pulsed, unpulsed = (render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (lab, always_on))
+    pulsed, unpulsed = (
+        render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (lab, always_on)
+    )
     fraction = pulsed.electrons[np.argsort(pulsed.id)] / unpulsed.electrons[np.argsort(unpulsed.id)]
     return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
 
@@ -203,15 +244,22 @@ def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     )
 
     def both(statistic: Callable[[BoardImage], Any], note: str = "") -> RowResult:
-        ours, theirs = ([float(statistic(one)) for one in images] for images in (own_noise, test2_noise))
+        ours, theirs = (
+            [float(statistic(one)) for one in images] for images in (own_noise, test2_noise)
+        )
         return with_cause(CAUSE_NOISE, confidence_interval, ours, theirs, note=note)
 
     lens = LensSettings(noise_e=INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
     dark_px = apply_thresholds(*take_image(color_board(lens), rng)).at_2.dark_px
     return {
         "glare_2": both(lambda image: image.at_2.glare_px),
-        "noise_2": both(lambda image: image.at_2.dark_px, f"{dark_px} with {INTERMEDIATE_NOISE_GRAY} gray levels"),
-        "left_10": both(lambda image: 100 * (outside_px(image.at_10) / max(outside_px(image.at_2), 1))),
+        "noise_2": both(
+            lambda image: image.at_2.dark_px,
+            f"{dark_px} with {INTERMEDIATE_NOISE_GRAY} gray levels",
+        ),
+        "left_10": both(
+            lambda image: 100 * (outside_px(image.at_10) / max(outside_px(image.at_2), 1))
+        ),
         "found_10": both(lambda image: np.sum(image.at_10.area_px >= MIN_AREA_PX)),
         "fragments_4": both(lambda image: image.lights_4 - len(BOARD)),
         "dimmest_25": both(lambda image: image.at_25.area_px[DIMMEST_LED]),
@@ -245,7 +293,10 @@ def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     for name, lens in APERTURES.items():
         lab = color_board(lens)
         taken = [take_image(lab, rng) for _ in range(images)]
-        found = [float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX)) for image_and_px in taken]
+        found = [
+            float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX))
+            for image_and_px in taken
+        ]
         results[f"found_{name}"] = RowResult(confidence_interval(found))
         if name == "wide":
             full_px = [float(np.sum(image == WHITE)) for image, _ in taken]
@@ -253,7 +304,11 @@ def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     return results
 
 
-APERTURES = {"wide": LensSettings(4.0), "narrow": LensSettings(16.0, 40.0), "balanced": LensSettings(8.0, 38.0)}
+APERTURES = {
+    "wide": LensSettings(4.0),
+    "narrow": LensSettings(16.0, 40.0),
+    "balanced": LensSettings(8.0, 38.0),
+}
 
 
 def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
@@ -262,7 +317,9 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
     sources = narrow.camera.sources
     misaligned = narrow.with_sources(replace(sources, normal=misalignment.apply(sources.normal)))
-    directional = [area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED] for lab in (narrow, misaligned)]
+    directional = [
+        area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED] for lab in (narrow, misaligned)
+    ]
     areas, stray = area_variation(color_board(), 0.04, images, rng)
     test2_percent, intermediate_percent = (
         area_variation(color_board(LensSettings(noise_e=noise_e)), 0.04, 1, rng)[1][0]
@@ -277,26 +334,35 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     }
 
 
-def area_variation(lab: Lab, threshold: float, images: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def area_variation(
+    lab: Lab, threshold: float, images: int, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """(n, 9) smallest over largest area of each LED over the positions; (n,) percent of pixels outside LEDs."""
-    ratio, stray = [], []
+    ratio = []
+    stray = []
     for _ in range(images):
         taken = [take_image(lab, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG]
         counted = [count_above(image, xy_px, threshold) for image, xy_px in taken]
         area = np.array([counts.area_px for counts in counted])
-        ratio.append(np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0))
+        ratio.append(
+            np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0)
+        )
         stray.append(np.mean([100 * outside_px(counts) / taken[0][0].size for counts in counted]))
     return np.array(ratio), np.array(stray)
 
 
 def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResult], Floats]:
     """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
-    long_us, pulses_us = 1e6 * ON_FRACTION * SLOT_S, np.array(PULSES_US[:4])
-    lab, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], long_us))
+    long_us = 1e6 * ON_FRACTION * SLOT_S
+    pulses_us = np.array(PULSES_US[:4])
+    lab = white_board(PULSES_US)
+    long_pulse = white_board((*PULSES_US[:-1], long_us))
     magnitudes = np.array([led_magnitudes(long_pulse, rng) for _ in range(images)])
     per_us = magnitudes[:, :4] / pulses_us
     saturating = white_board(PULSES_US, SATURATION_FRACTION)
-    saturating_per_us = np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)]) / pulses_us
+    saturating_per_us = (
+        np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)]) / pulses_us
+    )
     mean = ", ".join(f"{magnitude:.1f}" for magnitude in magnitudes.mean(axis=0))
     note = f"ours with Test 2's intensity: {mean}; Table 7: {', '.join(map(str, table_7_magnitudes()))}"
     board = (1000.0, 500.0, 1.0) * 3
@@ -342,23 +408,34 @@ def crop_board(image: GrayImage) -> GrayImage:
 
 
 def draw_apertures(fig: Any, images: Sequence[GrayImage]) -> None:
-    for axes, name, lens, image in zip(fig.subplots(1, 3), APERTURES, APERTURES.values(), images, strict=True):
+    for axes, name, lens, image in zip(
+        fig.subplots(1, 3), APERTURES, APERTURES.values(), images, strict=True
+    ):
         axes.imshow(crop_board(image), cmap="gray", vmin=0, vmax=WHITE)
         axes.set_title(f"{name}: f/{lens.f_number:g}, {lens.focus_in:g} in")
         axes.set_axis_off()
 
 
 def draw_thresholds(fig: Any, images: Sequence[GrayImage]) -> None:
-    for panels, image, noise in zip(fig.subplots(len(images), 4), images, ("own noise", "Test 2's noise"), strict=True):
+    for panels, image, noise in zip(
+        fig.subplots(len(images), 4), images, ("own noise", "Test 2's noise"), strict=True
+    ):
         panels[0].set_ylabel(noise)
         for axes, threshold in zip(panels, (0.02, 0.04, 0.10, 0.25), strict=True):
-            axes.imshow(crop_board(image) > threshold * WHITE, cmap="Blues", vmin=0, vmax=1, interpolation="nearest")
+            axes.imshow(
+                crop_board(image) > threshold * WHITE,
+                cmap="Blues",
+                vmin=0,
+                vmax=1,
+                interpolation="nearest",
+            )
             axes.set(title=f"{100 * threshold:.0f} %", xticks=[], yticks=[])
 
 
 def draw_pulses(fig: Any, magnitude: Floats) -> None:
     """Magnitude against pulse, ours scaled so that the 200 us LED has its published magnitude."""
-    axes, published = fig.subplots(), np.array(table_7_magnitudes())
+    axes = fig.subplots()
+    published = np.array(table_7_magnitudes())
     ours = magnitude * published[3] / magnitude[:, 3].mean()
     style = {"fmt": "s", "color": INK[0], "capsize": 2, "label": f"ours, {CAUSE_LONG_PULSE}"}
     axes.errorbar(PULSES_US, ours.mean(axis=0), ours.std(axis=0), **style)

@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import INCH_M
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -20,15 +26,26 @@ from skysim.sources.dome.shell.point_cloud import fit_sphere
 from skysim.sources.dome.shell.surface import Rim, Surface, build_surface
 
 FIELD_RAD = np.radians(10.45)
-STATED_HEIGHT_IN, FITTED_HEIGHT_IN = 14.0, 15.5
+STATED_HEIGHT_IN = 14.0
+FITTED_HEIGHT_IN = 15.5
 ANGLES_DEG = (0, 10, 15, 20, 25, 30)
 FLAT = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": "48 in"})
 SPHERE = SphereSurfaceConfig.model_validate({"kind": "sphere", "apex": "48 in", "radius": "48 in"})
-WALL = {"thickness_apex": "0.2036 in", "thickness_base": "0.25 in", "base_deg": 40, "radius_of": "mid_wall"}
-DESIGN = SphereSurfaceConfig.model_validate({"kind": "sphere", "apex": "48 in", "radius": "48.135 in", "wall": WALL})
+WALL = {
+    "thickness_apex": "0.2036 in",
+    "thickness_base": "0.25 in",
+    "base_deg": 40,
+    "radius_of": "mid_wall",
+}
+DESIGN = SphereSurfaceConfig.model_validate(
+    {"kind": "sphere", "apex": "48 in", "radius": "48.135 in", "wall": WALL}
+)
 EDGE_RAD = np.radians(40.0)  # the dome covers 80 deg
-DOME_WIDTH_IN, DESIGN_RADIUS_IN = 62.0, 48.135  # full width; radius of the design's sphere
-SAMPLE_RINGS, SAMPLE_SECTORS = 400, 12
+# full width; radius of the design's sphere
+DOME_WIDTH_IN = 62.0
+DESIGN_RADIUS_IN = 48.135
+SAMPLE_RINGS = 400
+SAMPLE_SECTORS = 12
 
 
 def width_in(surface: Surface, height_in: float, angle_deg: float) -> float:
@@ -38,7 +55,8 @@ def width_in(surface: Surface, height_in: float, angle_deg: float) -> float:
     nearer to the apex has length s to the surface, and the plane through its end across the boresight has the width
     2 s sin(field / 2). s comes from our own intersection code, so eq. 38 is an independent check of it.
     """
-    tilt, half_field = np.radians(angle_deg), FIELD_RAD / 2
+    tilt = np.radians(angle_deg)
+    half_field = FIELD_RAD / 2
     camera_m = height_in * INCH_M * tilted_direction(tilt)
     edge_ray = tilted_direction(tilt - half_field)
     distance_m = np.linalg.norm(surface.meet(camera_m, edge_ray[None])[0] - camera_m)
@@ -61,7 +79,9 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
     for n, angle in enumerate(ANGLES_DEG):
         values = {"width": [width[n] for width in (stated, fitted)]}
         if n:  # the difference from the first width, in percent of their mean (the thesis's definition)
-            values["more"] = [200 * (width[n] - width[0]) / (width[n] + width[0]) for width in (stated, fitted)]
+            values["more"] = [
+                200 * (width[n] - width[0]) / (width[n] + width[0]) for width in (stated, fitted)
+            ]
         for name, pair in values.items():
             results[f"{name}_{angle}"] = with_cause(f"M = {FITTED_HEIGHT_IN} in", exact, *pair)
     dome = build_surface(SPHERE)
@@ -73,7 +93,8 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
 
 def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:
     """Chord between the points where the two edges of the field meet a surface (eq. 42), in inches."""
-    tilt, half_field = np.radians(angle_deg), FIELD_RAD / 2
+    tilt = np.radians(angle_deg)
+    half_field = FIELD_RAD / 2
     edges = np.array([tilted_direction(tilt - half_field), tilted_direction(tilt + half_field)])
     ends_m = surface.meet(height_in * INCH_M * tilted_direction(tilt), edges)
     return float(np.linalg.norm(ends_m[1] - ends_m[0]) / INCH_M)
@@ -95,11 +116,17 @@ def contour(dome: Surface) -> dict[str, RowResult]:
     """Dimensions of the designed and of the measured inner surface (section 3.5.3), from our surface models; inches."""
     design = build_surface(DESIGN)
     rays = tilted_direction(0.0), tilted_direction(EDGE_RAD)
-    radii = np.linalg.norm(design.meet(design.center_m, np.array(rays)) - design.center_m, axis=1) / INCH_M
+    radii = (
+        np.linalg.norm(design.meet(design.center_m, np.array(rays)) - design.center_m, axis=1)
+        / INCH_M
+    )
     # A spheroid through apex and edge, solved for b: 1 / r^2 = cos^2 / a^2 + sin^2 / b^2.
-    design_horizontal_in = np.sin(EDGE_RAD) / np.sqrt(radii[1] ** -2 - np.cos(EDGE_RAD) ** 2 / radii[0] ** 2)
+    design_horizontal_in = np.sin(EDGE_RAD) / np.sqrt(
+        radii[1] ** -2 - np.cos(EDGE_RAD) ** 2 / radii[0] ** 2
+    )
     _, axes_m = dome.as_ellipsoid()
-    horizontal_in, vertical_in = axes_m[0] / INCH_M, axes_m[2] / INCH_M
+    horizontal_in = axes_m[0] / INCH_M
+    vertical_in = axes_m[2] / INCH_M
     return {
         "design_apex": RowResult(exact(radii[0])),
         "design_edge": RowResult(exact(radii[1])),
@@ -149,12 +176,16 @@ def best_sphere(dome: Surface) -> dict[str, RowResult]:
     cap_rad = np.arcsin(DOME_WIDTH_IN / 2 / DESIGN_RADIUS_IN)
     fraction = (np.arange(SAMPLE_RINGS) + 0.5) / SAMPLE_RINGS
     profile_in = intersections_in(dome, np.arccos(1 - fraction * (1 - np.cos(cap_rad))))
-    rotations = Rotation.from_euler("z", np.arange(SAMPLE_SECTORS)[:, None] * (2 * np.pi / SAMPLE_SECTORS))
+    rotations = Rotation.from_euler(
+        "z", np.arange(SAMPLE_SECTORS)[:, None] * (2 * np.pi / SAMPLE_SECTORS)
+    )
     sphere = fit_sphere(np.concatenate([rotation.apply(profile_in) for rotation in rotations]))
     contour_in = intersections_in(dome, fraction * cap_rad)
     error_in = np.linalg.norm(contour_in - sphere.center_m, axis=1) - sphere.radius_m
     return {
         "best_sphere": RowResult(exact(sphere.radius_m)),
         "best_center": RowResult(exact(float(sphere.center_m[2]))),
-        "best_rms": RowResult(exact(float(np.sqrt(np.mean(error_in**2)))), f"weighted by area {sphere.rms_m:.3f}"),
+        "best_rms": RowResult(
+            exact(float(np.sqrt(np.mean(error_in**2)))), f"weighted by area {sphere.rms_m:.3f}"
+        ),
     }

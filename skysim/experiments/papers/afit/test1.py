@@ -23,7 +23,13 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
@@ -36,7 +42,8 @@ from skysim.simulation.lights.known import known_light
 from skysim.simulation.lights.plan import Plan
 from skysim.tracking import onboard_model
 
-LEDS, POSITIONS = 9, 5
+LEDS = 9
+POSITIONS = 5
 FULL_CYCLES_S = 36e-3  # four cycles of nine 1 ms slots
 FRAME_TIME_S = 100e-3  # at 10 Hz: 11 1/9 cycles
 INTENSITY_CD = 10.4e-3  # at FRAME_S; the mean magnitude of the nine is then the published one
@@ -72,8 +79,11 @@ def take_board(lab: Lab, images: int, rng: np.random.Generator) -> Floats:
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:
     """Table 2, and the five angles of Fig. 66."""
-    boards, images = options.trials(24, 3), options.trials(5, 2)
-    stands = [build_test_stand(scene_with_exposure(time_s)) for time_s in (FULL_CYCLES_S, FRAME_TIME_S)]
+    boards = options.trials(24, 3)
+    images = options.trials(5, 2)
+    stands = [
+        build_test_stand(scene_with_exposure(time_s)) for time_s in (FULL_CYCLES_S, FRAME_TIME_S)
+    ]
     runs: tuple[list[Floats], list[Floats]] = ([], [])  # with full cycles, with the frame time
     for n in range(boards):
         options.watch(n, boards)
@@ -114,9 +124,13 @@ def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> dict[s
             for boards in (full_cycles, frame_time)
         )
         for n in range(LEDS):
-            results[f"{name}_{n + 1}"] = with_cause(CAUSE, confidence_interval, ours[:, n], theirs[:, n])
+            results[f"{name}_{n + 1}"] = with_cause(
+                CAUSE, confidence_interval, ours[:, n], theirs[:, n]
+            )
     mean = np.array([board.mean(axis=0) for board in full_cycles])
-    results["scatter"] = RowResult(confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1)))
+    results["scatter"] = RowResult(
+        confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1))
+    )
     return results
 
 
@@ -140,10 +154,17 @@ def lattice_angles(lab: Lab, images: int, rng: np.random.Generator) -> Floats:
             frame, truth = render_at_attitude(lab, lab_from_body, rng)
             xy_px = measure_lights(gray_levels(frame, lab)).xy_px
             if not angles_arcsec:
-                nearest = [int(np.argmin(np.linalg.norm(xy_px - led_px, axis=1))) for led_px in truth.sources.xy_px]
-                spacing_px = [np.linalg.norm(xy_px[nearest[a]] - xy_px[nearest[b]]) for a, b in NEIGHBORS]
+                nearest = [
+                    int(np.argmin(np.linalg.norm(xy_px - led_px, axis=1)))
+                    for led_px in truth.sources.xy_px
+                ]
+                spacing_px = [
+                    np.linalg.norm(xy_px[nearest[a]] - xy_px[nearest[b]]) for a, b in NEIGHBORS
+                ]
                 distance_m = lab.camera.sources.place[4, 2] - lab.camera.mount.camera_body_m[2]
-                camera = camera.zoomed(float(np.mean(spacing_px)) * distance_m / PITCH_M / camera.focal_px)
+                camera = camera.zoomed(
+                    float(np.mean(spacing_px)) * distance_m / PITCH_M / camera.focal_px
+                )
             angles_arcsec.append(np.sort(separations_arcsec(xy_px, lab, camera)))
     return np.array(angles_arcsec)
 
@@ -160,7 +181,9 @@ def separations(angles_arcsec: Floats) -> dict[str, RowResult]:
 
 
 def draw_ranks(fig: Any, full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> None:
-    axes, rank, published = fig.subplots(), np.arange(1, LEDS + 1), published_by_rank("mean")
+    axes = fig.subplots()
+    rank = np.arange(1, LEDS + 1)
+    published = published_by_rank("mean")
     for shift, ink, marker, name, boards in (
         (-0.15, INK[0], "s", "ours, whole cycles", full_cycles),
         (0.15, INK[2], "D", "ours, 100 ms", frame_time),
@@ -168,8 +191,18 @@ def draw_ranks(fig: Any, full_cycles: Sequence[Floats], frame_time: Sequence[Flo
         mean = np.mean([board.mean(axis=0) for board in boards], axis=0)
         std = np.mean([pooled_std_by_rank(board) for board in boards], axis=0)
         scale = published.mean() / mean.mean()
-        axes.errorbar(rank + shift, scale * mean, scale * std, fmt=marker, color=ink, capsize=2, label=name)
-    axes.errorbar(rank, published, published_by_rank("sd"), fmt="o", color=INK[1], capsize=2, label="published")
+        axes.errorbar(
+            rank + shift, scale * mean, scale * std, fmt=marker, color=ink, capsize=2, label=name
+        )
+    axes.errorbar(
+        rank,
+        published,
+        published_by_rank("sd"),
+        fmt="o",
+        color=INK[1],
+        capsize=2,
+        label="published",
+    )
     axes.set(xlabel="rank in the image", ylabel="magnitude", xticks=rank)
     axes.legend()
 
@@ -178,9 +211,19 @@ def draw_board(fig: Any, board: Floats) -> None:
     axes = fig.subplots()
     bins = np.linspace(board.min(), board.max(), 60)
     colors = [*INK, "#bbbbbb"]
-    axes.hist(list(board.T), bins, stacked=True, color=colors, label=[str(n + 1) for n in range(LEDS)])
+    axes.hist(
+        list(board.T), bins, stacked=True, color=colors, label=[str(n + 1) for n in range(LEDS)]
+    )
     published = published_by_rank("mean")
-    axes.plot(published, np.zeros(LEDS), "v", color="black", markersize=7, clip_on=False, label="published means")
+    axes.plot(
+        published,
+        np.zeros(LEDS),
+        "v",
+        color="black",
+        markersize=7,
+        clip_on=False,
+        label="published means",
+    )
     axes.set(xlabel="magnitude", ylabel="images")
     axes.legend(title="rank", ncols=3, fontsize=7)
 
@@ -189,7 +232,9 @@ def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
-    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))):
+    for n, angle_rad in enumerate(
+        2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))
+    ):
         label = "8 mm lattice" if n == 0 else None
         axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")

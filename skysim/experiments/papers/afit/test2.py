@@ -20,9 +20,25 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.surface import contour
-from skysim.experiments.papers.afit.test_stand import E_PER_GRAY, build_test_stand, measure_frame, separations_arcsec
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
-from skysim.experiments.papers.intervals import bootstrap_interval, confidence_interval, sample_std, symmetric_interval
+from skysim.experiments.papers.afit.test_stand import (
+    E_PER_GRAY,
+    build_test_stand,
+    measure_frame,
+    separations_arcsec,
+)
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
+from skysim.experiments.papers.intervals import (
+    bootstrap_interval,
+    confidence_interval,
+    sample_std,
+    symmetric_interval,
+)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
@@ -34,11 +50,22 @@ from skysim.simulation.lab import Lab
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
-PLACES_DEG = (0.0, 14.0, 28.0)  # tilts of the scene's places: apex, halfway, edge within the tilt stop
-HALFWAY_DEG, BOARD_TILT_DEG, SMALLER_BOARD_TILT_DEG, DECENTER_IN = 23.6, 5.5, 4.0, 0.125
+PLACES_DEG = (
+    0.0,
+    14.0,
+    28.0,
+)  # tilts of the scene's places: apex, halfway, edge within the tilt stop
+HALFWAY_DEG = 23.6
+BOARD_TILT_DEG = 5.5
+SMALLER_BOARD_TILT_DEG = 4.0
+DECENTER_IN = 0.125
 PAIR_M = 16.119e-3  # gives Table 5's 2727" at the apex; 16 mm gives 2706.9"
-EXPOSURE_S, INTENSITY_CD, ON_FRACTION, NOISE_E = 0.1, 2.85e-3, 0.0594, 700.0
-BRIGHT, DIM = 0, 1
+EXPOSURE_S = 0.1
+INTENSITY_CD = 2.85e-3
+ON_FRACTION = 0.0594
+NOISE_E = 700.0
+BRIGHT = 0
+DIM = 1
 CAUSE_NOISE = f"noise of {NOISE_E / E_PER_GRAY:.1f} gray levels"
 
 
@@ -74,18 +101,24 @@ def scene(dim_fraction: float) -> Scene:
 def measured_dome(scene: Scene, decenter_in: float = 0.0) -> Surface:
     """The measured dome, displaced along x."""
     assert isinstance(scene.light, DomeConfig)
-    return build_surface(scene.light.surface.model_copy(update={"offset_m": (decenter_in * INCH_M, 0.0, 0.0)}))
+    return build_surface(
+        scene.light.surface.model_copy(update={"offset_m": (decenter_in * INCH_M, 0.0, 0.0)})
+    )
 
 
 def place_pair(lab: Lab, place: Place) -> Lab:
     """The pair on a board tangent to the dome, or tilted from it, with its LEDs along the meridian."""
-    dome, tilt = measured_dome(lab.scene, place.decenter_in), np.radians(place.tilt_deg)
+    dome = measured_dome(lab.scene, place.decenter_in)
+    tilt = np.radians(place.tilt_deg)
     center_m = dome.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
     board_tilt = Rotation.from_euler("y", place.board_tilt_deg, degrees=True)
     normal = board_tilt.apply(dome.inward(center_m[None])[0])
     meridian = np.cross(normal, [0.0, 1.0, 0.0])
-    positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
-    pair, homogeneous = lab.camera.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
+    positions_m = center_m + np.outer(
+        [-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian)
+    )
+    pair = lab.camera.sources.take(np.arange(2))
+    homogeneous = np.column_stack([positions_m, np.ones(2)])
     return lab.with_sources(replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
@@ -96,8 +129,10 @@ def point_at(place: Place) -> Rotation:
 
 def series(lab: Lab, place: Place, images: int, rng: np.random.Generator) -> Series:
     """Measure images of a place; those that do not show two lights are left out."""
-    lab_at_place, attitude = place_pair(lab, place), point_at(place)
-    magnitudes, angles = [], []
+    lab_at_place = place_pair(lab, place)
+    attitude = point_at(place)
+    magnitudes = []
+    angles = []
     for _ in range(images):
         lights = measure_frame(lab_at_place, attitude, rng)
         if len(lights.magnitude) == 2:
@@ -111,7 +146,9 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     images = options.trials(50, 10)
     quiet_stand = build_test_stand(scene(ON_FRACTION))
     # The read noise that gives Table 5's standard deviations.
-    noisy_stand = build_test_stand(with_config(scene(ON_FRACTION), "camera.detector", read_noise_e=NOISE_E))
+    noisy_stand = build_test_stand(
+        with_config(scene(ON_FRACTION), "camera.detector", read_noise_e=NOISE_E)
+    )
     rng = [random_stream(options.seed, stage) for stage in range(3)]
     runs = NoiseRuns([], [])
     for n, tilt_deg in enumerate(PLACES_DEG):
@@ -140,12 +177,16 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
 def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
     """Table 3, and the relative change of the bright LED's magnitude from the first place to the last."""
     results: dict[str, RowResult] = {}
-    counts = [f"{len(own.magnitude)} and {len(more.magnitude)}" for own, more in zip(*runs, strict=True)]
+    counts = [
+        f"{len(own.magnitude)} and {len(more.magnitude)}" for own, more in zip(*runs, strict=True)
+    ]
     for led, name in enumerate(("bright", "dim")):
         ours, theirs = ([one.magnitude[:, led] for one in places] for places in runs)
         for n, (own, more) in enumerate(zip(ours, theirs, strict=True)):
             note = f"the pair is detected in {counts[n]} of {images} images"
-            results[f"{name}_{n + 1}"] = with_cause(CAUSE_NOISE, confidence_interval, own, more, note=note)
+            results[f"{name}_{n + 1}"] = with_cause(
+                CAUSE_NOISE, confidence_interval, own, more, note=note
+            )
         results[f"{name}_avg"] = with_cause(CAUSE_NOISE, mean_of_places, ours, theirs)
         if led == BRIGHT:
             results["gain"] = with_cause(CAUSE_NOISE, relative_gain, ours, theirs)
@@ -154,7 +195,8 @@ def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
 
 def relative_gain(places: Sequence[Floats]) -> Summary:
     """Increase of the mean from the first place to the last in percent; independent errors add in quadrature."""
-    first, last = confidence_interval(places[0]), confidence_interval(places[-1])
+    first = confidence_interval(places[0])
+    last = confidence_interval(places[-1])
     value = 100 * (last.value / first.value - 1)
     half = 100 * float(np.hypot(last.high - last.value, first.high - first.value)) / first.value
     return symmetric_interval(value, half, first.trials + last.trials)
@@ -178,10 +220,14 @@ def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
     for n, (own, more) in enumerate(zip(*runs, strict=True), 1):
         values[f"angle_{n}"] = own.angle_arcsec, more.angle_arcsec
     std_interval = partial(bootstrap_interval, statistic=sample_std)
-    return {f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()}
+    return {
+        f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()
+    }
 
 
-def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+def angles(
+    lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator
+) -> dict[str, RowResult]:
     """Table 5's means, with the effect of each cause on the last two."""
     edge = PLACES_DEG[2]
     halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
@@ -196,7 +242,8 @@ def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> 
     )
     glare_arcsec = glare_bias_arcsec(lab, images, rng)
     noise_bias_arcsec = [
-        float(more.angle_arcsec.mean() - own.angle_arcsec.mean()) for own, more in zip(*runs, strict=True)
+        float(more.angle_arcsec.mean() - own.angle_arcsec.mean())
+        for own, more in zip(*runs, strict=True)
     ]
     at_apex, at_halfway, at_edge = (own.angle_arcsec for own in runs.own)
     note = (
@@ -207,12 +254,18 @@ def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> 
         f' wings: {glare_arcsec:+.1f}"'
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
-    smallest = min(geometric_angle_arcsec(lab, Place(float(tilt))) for tilt in np.linspace(20, 34, 29))
+    smallest = min(
+        geometric_angle_arcsec(lab, Place(float(tilt))) for tilt in np.linspace(20, 34, 29)
+    )
     return {
         "angle_1": RowResult(confidence_interval(at_apex)),
-        "angle_2": with_cause(f"the board at {HALFWAY_DEG} deg", confidence_interval, at_halfway, halfway),
+        "angle_2": with_cause(
+            f"the board at {HALFWAY_DEG} deg", confidence_interval, at_halfway, halfway
+        ),
         "angle_3": with_cause(cause, confidence_interval, at_edge, tilted, note=note),
-        "fall": with_cause(cause, partial(relative_decrease, float(at_apex.mean())), at_edge, tilted),
+        "fall": with_cause(
+            cause, partial(relative_decrease, float(at_apex.mean())), at_edge, tilted
+        ),
         "least": RowResult(exact(smallest)),
     }
 
@@ -231,8 +284,11 @@ def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     """
     psf = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5)
     stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
-    edge, apex = Place(PLACES_DEG[2]), Place(0.0)
-    at_edge, at_apex = (series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex))
+    edge = Place(PLACES_DEG[2])
+    apex = Place(0.0)
+    at_edge, at_apex = (
+        series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex)
+    )
     expected_edge, expected_apex = (geometric_angle_arcsec(lab, place) for place in (edge, apex))
     return float(at_edge - at_apex - expected_edge + expected_apex)
 
@@ -241,7 +297,9 @@ def geometric_angle_arcsec(lab: Lab, place: Place) -> float:
     """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
     camera = onboard_model.assumed_camera(lab.scene)
-    xy_px = project(point_at(place).inv(), place_pair(lab, place).camera.sources.place[:, :3], lever, camera)
+    xy_px = project(
+        point_at(place).inv(), place_pair(lab, place).camera.sources.place[:, :3], lever, camera
+    )
     return float(separations_arcsec(xy_px, lab)[0])
 
 
@@ -257,23 +315,31 @@ def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
             counts, _, _ = axes.hist(values, bins, histtype="step", **style)
             top = max(top, counts.max())
         for n in range(3):
-            mean, sd = rows[f"{name}_{n + 1}"].published, rows[f"sd_{name}_{n + 1}"].published
+            mean = rows[f"{name}_{n + 1}"].published
+            sd = rows[f"sd_{name}_{n + 1}"].published
             style = {"color": INK[1], "marker": MARKS[n], "label": f"published, {n + 1}"}
             axes.errorbar(mean, top * (1.1 + 0.1 * n), xerr=sd, **style)
         axes.set(xlabel=f"magnitude of the {name} LED", ylabel="images", ylim=(0, top * 1.4))
-    fig.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    fig.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8
+    )
 
 
 def draw_angles(fig: Any, lab: Lab, places: Sequence[Series]) -> None:
-    rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
+    rows = experiments()["afit-table-3-5"].rows
+    axes = fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (
         ("measured dome", Place(0)),
         (f"{DECENTER_IN} in off center", Place(0, 0, DECENTER_IN)),
         (f"leaning {BOARD_TILT_DEG:g} deg", Place(0, BOARD_TILT_DEG)),
     )
-    for ink, style, (name, place) in zip((INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True):
-        angle = [geometric_angle_arcsec(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg]
+    for ink, style, (name, place) in zip(
+        (INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True
+    ):
+        angle = [
+            geometric_angle_arcsec(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg
+        ]
         axes.plot(tilt_deg, angle, style, color=ink, label=name)
     ours = [one.angle_arcsec.mean() for one in places]
     axes.plot(PLACES_DEG, ours, "s", color=INK[0], label="ours, from images")

@@ -32,7 +32,13 @@ from skysim.experiments.papers.afit.test3_images import (
     photograph,
 )
 from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments, published_values
 from skysim.results.metrics import Summary, exact, extremum
@@ -46,10 +52,18 @@ BUMPED_POSITION = 4
 TRUE_ANGLES_DEG = (*IMU_DEG[:BUMPED_POSITION], ALGORITHM_DEG[BUMPED_POSITION])
 ON_US = np.array([1000.0, 500.0, 400.0, 200.0, 1.0])
 LINEAR_LEDS = slice(1, 4)  # LEDs of 500, 400 and 200 us
-TABLE_8_GROUPS = ((0, 4), (4, 8), (8, 10))  # rows of neighbors, diagonals, opposite ends of the cross
-MIN_DIFFERENCE_ARCSEC = 100.0  # width of the catalog's buckets; angles closer than this count as one
-NOMINAL_POSITIONS = '[["0 mm", "0 mm", "48 in"], ["8 mm", "0 mm", "48 in"], ["0 mm", "8 mm", "48 in"], \
+TABLE_8_GROUPS = (
+    (0, 4),
+    (4, 8),
+    (8, 10),
+)  # rows of neighbors, diagonals, opposite ends of the cross
+MIN_DIFFERENCE_ARCSEC = (
+    100.0  # width of the catalog's buckets; angles closer than this count as one
+)
+NOMINAL_POSITIONS = (
+    '[["0 mm", "0 mm", "48 in"], ["8 mm", "0 mm", "48 in"], ["0 mm", "8 mm", "48 in"], \
 ["-8 mm", "0 mm", "48 in"], ["0 mm", "-8 mm", "48 in"]]'
+)
 CAUSE = "a rolling shutter, 1/60 s and pixels full at 186 DN"
 
 Statistic = Callable[[Floats], Any]
@@ -57,29 +71,41 @@ Statistic = Callable[[Floats], Any]
 
 def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
     """Tables 6-9: with our baseline, with likely faults of the camera as the cause, and with a bumped IMU."""
-    images, few_images = options.trials(50, 3), options.trials(10, 2)
+    images = options.trials(50, 3)
+    few_images = options.trials(10, 2)
     plan = {
         "ours": ({}, images),
         "camera faults": (FITTED_IMAGING, images),
         "nominal": ({"light.layout.positions": NOMINAL_POSITIONS}, few_images),
         "stated levels": ({"light.layout.levels": "[1.0, 0.5, 0.4, 0.2, 0.001]"}, few_images),
     }
-    positions = [f'["{x * 1e3:.4f} mm", "{y * 1e3:.4f} mm", "48 in"]' for x, y, _ in fit_positions(build_test3())]
+    positions = [
+        f'["{x * 1e3:.4f} mm", "{y * 1e3:.4f} mm", "48 in"]'
+        for x, y, _ in fit_positions(build_test3())
+    ]
     fitted_overrides = {"light.layout.positions": f"[{', '.join(positions)}]"}
     series = {}
     for done, (name, (overrides, n_images)) in enumerate(plan.items()):
         options.watch(done, len(plan))
-        lab, rng = build_test3(fitted_overrides | overrides), random_stream(options.seed, done)
+        lab = build_test3(fitted_overrides | overrides)
+        rng = random_stream(options.seed, done)
         series[name] = ImageSeries(lab, photograph_positions(lab, n_images, rng))
-    ours, with_faults, nominal = (series[name].measurements for name in ("ours", "camera faults", "nominal"))
+    ours, with_faults, nominal = (
+        series[name].measurements for name in ("ours", "camera faults", "nominal")
+    )
     bumped = series["ours"].bumped(BUMPED_POSITION)
     drifted = series["ours"].bumped(*range(len(IMU_DEG)))
-    results = magnitudes(ours, with_faults, series["stated levels"]) | separations(ours, with_faults, nominal)
+    results = magnitudes(ours, with_faults, series["stated levels"]) | separations(
+        ours, with_faults, nominal
+    )
     results |= epsilons(ours, with_faults, bumped, drifted) | buckets()
     caption = f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}."
     drawings = (
         Drawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
-        Drawing(f"Fig. 76: angles of all pairs, ours with {CAUSE}.", lambda fig: draw_separations(fig, with_faults)),
+        Drawing(
+            f"Fig. 76: angles of all pairs, ours with {CAUSE}.",
+            lambda fig: draw_separations(fig, with_faults),
+        ),
         Drawing(
             "Figs 77 and 79: positions of the five LEDs; the IMU is correct except at the bumped position 5.",
             lambda fig: draw_scatter(fig, bumped),
@@ -103,10 +129,13 @@ class ImageSeries(NamedTuple):
     def bumped(self, *positions: int) -> Measurements:
         """The same images, with the IMU errors of Tables 10-14 at these positions."""
         imu_attitudes = {
-            n: lab_from_body((np.add(TRUE_ANGLES_DEG[n], IMU_DEG[n]) - ALGORITHM_DEG[n]).tolist()) for n in positions
+            n: lab_from_body((np.add(TRUE_ANGLES_DEG[n], IMU_DEG[n]) - ALGORITHM_DEG[n]).tolist())
+            for n in positions
         }
         sightings = [
-            replace(one, body_from_lab=imu_attitudes[one.stop].inv()) if one.stop in imu_attitudes else one
+            replace(one, body_from_lab=imu_attitudes[one.stop].inv())
+            if one.stop in imu_attitudes
+            else one
             for one in self.sightings
         ]
         return measure(self.lab, sightings)
@@ -147,22 +176,30 @@ def expected_angles_arcsec(lab: Lab, position_m: Floats) -> Floats:
     """(10,) angle of every pair as the thesis measures it, without noise, averaged over the vehicle's positions."""
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
     camera = onboard_model.calibration(lab.scene.camera)
-    pixels = [project(lab_from_body(angles_deg).inv(), position_m, lever, camera) for angles_deg in TRUE_ANGLES_DEG]
+    pixels = [
+        project(lab_from_body(angles_deg).inv(), position_m, lever, camera)
+        for angles_deg in TRUE_ANGLES_DEG
+    ]
     body_m = np.array([light_positions_m(lab, xy_px) for xy_px in pixels])
     zeros = np.zeros((len(body_m), len(position_m)))
-    return Measurements(np.arange(len(body_m)), zeros, body_m, body_m).separation_arcsec.mean(axis=0)
+    return Measurements(np.arange(len(body_m)), zeros, body_m, body_m).separation_arcsec.mean(
+        axis=0
+    )
 
 
 # Statistics of the images, with intervals over the images.
 
 
-def stratified_bootstrap(measurements: Measurements, values: Floats, statistic: Statistic) -> Summary:
+def stratified_bootstrap(
+    measurements: Measurements, values: Floats, statistic: Statistic
+) -> Summary:
     """A statistic of (F, ...) values of the images, with a bootstrap interval stratified by position.
 
     Images are resampled within each position only, because the differences between positions are systematic.
     statistic : of (..., F, K) values to (...), over the last two axes
     """
-    position, rows = measurements.position, np.arange(len(values))
+    position = measurements.position
+    rows = np.arange(len(values))
     first_row = np.searchsorted(position, position)
     count = np.bincount(position)[position]
     table = values.reshape(len(values), -1)
@@ -177,10 +214,16 @@ def stratified_bootstrap(measurements: Measurements, values: Floats, statistic: 
 
 
 def with_camera_faults(
-    runs: tuple[Measurements, Measurements], quantity: str, columns: Any, statistic: Statistic, note: str = ""
+    runs: tuple[Measurements, Measurements],
+    quantity: str,
+    columns: Any,
+    statistic: Statistic,
+    note: str = "",
 ) -> RowResult:
     """A statistic of columns of a quantity, of our images and of those with likely faults of the camera."""
-    ours, theirs = (stratified_bootstrap(one, getattr(one, quantity)[:, columns], statistic) for one in runs)
+    ours, theirs = (
+        stratified_bootstrap(one, getattr(one, quantity)[:, columns], statistic) for one in runs
+    )
     return RowResult(ours, note, Cause(CAUSE, theirs))
 
 
@@ -198,7 +241,10 @@ def largest_std(values: Floats) -> Any:
 def std_within_position(measurements: Measurements) -> float:
     """Standard deviation of a pair's angle within a position, averaged over positions; the largest over pairs."""
     angle = measurements.separation_arcsec
-    std = [angle[measurements.position == n].std(axis=0, ddof=1) for n in np.unique(measurements.position)]
+    std = [
+        angle[measurements.position == n].std(axis=0, ddof=1)
+        for n in np.unique(measurements.position)
+    ]
     return float(np.mean(std, axis=0).max())
 
 
@@ -208,22 +254,32 @@ def slope(values: Floats) -> Any:
     return values.mean(axis=-2) @ lit / (lit @ lit)
 
 
-def magnitudes(ours: Measurements, with_faults: Measurements, stated_levels: ImageSeries) -> dict[str, RowResult]:
+def magnitudes(
+    ours: Measurements, with_faults: Measurements, stated_levels: ImageSeries
+) -> dict[str, RowResult]:
     """Table 7: means and standard deviations of the magnitudes."""
     results = {}
     for n in range(len(ON_US)):
         for key, statistic in (("magnitude", mean), ("magnitude_sd", largest_std)):
-            results[f"{key}_{n + 1}"] = with_camera_faults((ours, with_faults), "magnitude", [n], statistic)
+            results[f"{key}_{n + 1}"] = with_camera_faults(
+                (ours, with_faults), "magnitude", [n], statistic
+            )
     # Only images with five LEDs are kept, so every one of `stated_levels` shows the LED of 1 us.
-    dimmest = exact(stated_levels.measurements.magnitude[:, -1].mean() if stated_levels.sightings else 0.0)
-    results["magnitude_5"] = RowResult(dimmest, cause=Cause("75 us of light (fitted)", results["magnitude_5"].ours))
+    dimmest = exact(
+        stated_levels.measurements.magnitude[:, -1].mean() if stated_levels.sightings else 0.0
+    )
+    results["magnitude_5"] = RowResult(
+        dimmest, cause=Cause("75 us of light (fitted)", results["magnitude_5"].ours)
+    )
     results["slope"] = RowResult(stratified_bootstrap(ours, ours.magnitude[:, LINEAR_LEDS], slope))
     means = ours.magnitude.mean(axis=0)
     results["order"] = RowResult(exact(1 + np.sum(np.diff(means) < 0)))
     return results
 
 
-def separations(ours: Measurements, with_faults: Measurements, nominal: Measurements) -> dict[str, RowResult]:
+def separations(
+    ours: Measurements, with_faults: Measurements, nominal: Measurements
+) -> dict[str, RowResult]:
     """Table 8: separations of the pairs in ascending order."""
     order = np.argsort(ours.separation_arcsec.mean(axis=0))
     angle = ours.separation_arcsec[:, order]
@@ -234,7 +290,9 @@ def separations(ours: Measurements, with_faults: Measurements, nominal: Measurem
         results[f"separation_sd_{n}"] = spread
     nominal_angle = np.sort(nominal.separation_arcsec, axis=1)
     for n, (first, last) in enumerate(TABLE_8_GROUPS, 1):
-        results[f"class_{n}"] = RowResult(stratified_bootstrap(nominal, nominal_angle[:, first:last], mean))
+        results[f"class_{n}"] = RowResult(
+            stratified_bootstrap(nominal, nominal_angle[:, first:last], mean)
+        )
     is_distinct = np.diff(angle.mean(axis=0)) > MIN_DIFFERENCE_ARCSEC
     results["classes"] = RowResult(exact(1 + np.sum(is_distinct)))
     return results
@@ -245,14 +303,18 @@ def epsilons(
 ) -> dict[str, RowResult]:
     """Table 9 and Figs 77-79: the largest pooled standard deviations; positions in millimeters."""
     position = {
-        name: stratified_bootstrap(series, series.lab_m.reshape(len(series.lab_m), -1) * 1e3, largest_std)
+        name: stratified_bootstrap(
+            series, series.lab_m.reshape(len(series.lab_m), -1) * 1e3, largest_std
+        )
         for name, series in (("ours", ours), ("bumped", bumped), ("drifted", drifted))
     }
     at_one_position = f"{std_within_position(ours):.2g} for a pair at one position"
     separation_note = f"{at_one_position}; the rest is the error of eq. 44 between positions"
     column_mm = np.sort(bumped.lab_m[bumped.position == BUMPED_POSITION, :, 0].mean(axis=0) * 1e3)
     return {
-        "epsilon_mag": with_camera_faults((ours, with_faults), "magnitude", slice(None), largest_std),
+        "epsilon_mag": with_camera_faults(
+            (ours, with_faults), "magnitude", slice(None), largest_std
+        ),
         "epsilon_pos": RowResult(
             position["ours"],
             f"with all differences of Tables 10-14 attributed to the IMU: {position['drifted'].value:.2f}",
@@ -269,7 +331,8 @@ def epsilons(
 def buckets() -> dict[str, RowResult]:
     """Section 2.4.6: length of the example's bucket table, percentage searched outside the gate, and eq. 12."""
     low, high = np.radians([1.5, 8.0])
-    width, gate = 5 * ARCSEC_RAD, 20 * ARCSEC_RAD
+    width = 5 * ARCSEC_RAD
+    gate = 20 * ARCSEC_RAD
     stars = unit(random_stream(0).standard_normal((500, 3)))
     entries = len(build_pair_catalog(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
     # Average over the phase of a pair's angle within a bucket.
@@ -277,7 +340,9 @@ def buckets() -> dict[str, RowResult]:
     first, last = (bucket_of(angle + end, high, width, entries) for end in (-gate, gate))
     searched_rad = (last - first + 1).mean() * width
     # Eq. 12: a pair 1.7 buckets below the end, a gate of 0.6.
-    example_buckets = bucket_of(high - np.array([1.7 + 0.6, 1.7 - 0.6]) * width, high, width, entries)
+    example_buckets = bucket_of(
+        high - np.array([1.7 + 0.6, 1.7 - 0.6]) * width, high, width, entries
+    )
     return {
         "buckets": RowResult(exact(entries)),
         "extra": RowResult(exact(100 * (searched_rad / (2 * gate) - 1))),
@@ -298,7 +363,10 @@ def draw_magnitudes(fig: Any, with_faults: Measurements) -> None:
     """A histogram for each LED, with Table 7's mean and deviation above."""
     axes = fig.subplots()
     edges = np.arange(0, 171, 2.0)
-    heights = [axes.hist(magnitude, edges, color=INK[0], alpha=0.75)[0].max() for magnitude in with_faults.magnitude.T]
+    heights = [
+        axes.hist(magnitude, edges, color=INK[0], alpha=0.75)[0].max()
+        for magnitude in with_faults.magnitude.T
+    ]
     axes.patches[0].set_label("ours")
     mean, sd = (published(key, len(ON_US)) for key in ("magnitude", "magnitude_sd"))
     height = np.full(len(mean), 1.08 * max(heights))
@@ -310,7 +378,8 @@ def draw_magnitudes(fig: Any, with_faults: Measurements) -> None:
 def draw_separations(fig: Any, with_faults: Measurements) -> None:
     """The three groups of angles side by side, and Table 8's means and deviations."""
     angle = np.sort(with_faults.separation_arcsec, axis=1)
-    mean, sd = published("separation", 10), published("separation_sd", 10)
+    mean = published("separation", 10)
+    sd = published("separation_sd", 10)
     panels = fig.subplots(1, len(TABLE_8_GROUPS), sharey=True)
     groups = [slice(*ends) for ends in TABLE_8_GROUPS]
     for axes, group in zip(panels, groups, strict=True):
@@ -320,7 +389,9 @@ def draw_separations(fig: Any, with_faults: Measurements) -> None:
     top = max(axes.get_ylim()[1] for axes in panels)
     for axes, group in zip(panels, groups, strict=True):
         height = top * (1.05 + 0.06 * np.arange(len(mean[group])))
-        axes.errorbar(mean[group], height, xerr=sd[group], fmt="o", color=INK[1], label="published, with 1 sd")
+        axes.errorbar(
+            mean[group], height, xerr=sd[group], fmt="o", color=INK[1], label="published, with 1 sd"
+        )
         axes.set(ylim=(0, 1.4 * top))
     panels[0].set(ylabel="pairs in images")
     panels[-1].legend(loc="upper right", fontsize=8)
@@ -336,6 +407,8 @@ def draw_scatter(fig: Any, bumped: Measurements) -> None:
     x, y = position_mm.mean(axis=0)[:, :2].T
     axes.plot(x, y, "+", color="black", ms=9, ls="", label="mean")
     epsilon_mm = experiments()[ID].rows["epsilon_pos"].published
-    axes.errorbar(x, y - 0.5, xerr=epsilon_mm, fmt="none", color=INK[1], label="published eps_position")
+    axes.errorbar(
+        x, y - 0.5, xerr=epsilon_mm, fmt="none", color=INK[1], label="published eps_position"
+    )
     axes.set(xlabel="X (mm)", ylabel="Y (mm)", aspect="equal")
     fig.legend(loc="outside right upper")

@@ -28,10 +28,16 @@ from skysim.tracking import settings as tracker_settings
 # Roll, pitch, yaw in degrees, Tables 10-14: by the IMU, and by the thesis's algorithm.
 IMU_DEG = experiments()["afit-table-10-15"].data["imu_deg"]
 ALGORITHM_DEG = experiments()["afit-table-10-15"].data["algorithm_deg"]
-LEDS, HOME = 5, 0
+LEDS = 5
+HOME = 0
 
-CAMERA_ROTATION_DEG = 55.0  # of the camera about its boresight: assumed; at 0 deg it misses position 4
-EPSILON_MAG, EPSILON_POS_M, EPSILON_SEP_ARCSEC = 10.191, 1.9861e-3, 9.675  # Table 9
+CAMERA_ROTATION_DEG = (
+    55.0  # of the camera about its boresight: assumed; at 0 deg it misses position 4
+)
+# Table 9
+EPSILON_MAG = 10.191
+EPSILON_POS_M = 1.9861e-3
+EPSILON_SEP_ARCSEC = 9.675
 
 # What the thesis states about its images, and assumptions for the rest; see data/published.
 STATED_IMAGING = {
@@ -55,7 +61,9 @@ FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED c
 def build_test3(overrides: Mapping[str, str] | None = None) -> Lab:
     """Test 3's lab, with the camera turned so that all five positions are on the detector."""
     lab = build_lab(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
-    cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * lab.camera.mount.cam_from_body
+    cam_from_body = (
+        Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * lab.camera.mount.cam_from_body
+    )
     return lab.with_camera(mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
 
 
@@ -80,18 +88,24 @@ def photograph(
     camera = onboard_model.calibration(lab.scene.camera)
     settings = tracker_settings.assumed_settings(lab.scene)
     sightings = []
-    for seed in rng.integers(2**62, size=images):  # each image in a run of its own, for a random phase of the LEDs
+    for seed in rng.integers(
+        2**62, size=images
+    ):  # each image in a run of its own, for a random phase of the LEDs
         frame, truth = render_at_rest(lab.in_run(int(seed)).camera, lab_from_body)
         priors = FramePriors(None, frame.saturation_dn)
         blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)
         inside = camera.contains(lights.xy_px)
         _, nearest = cKDTree(truth.sources.xy_px).query(lights.xy_px[inside])
-        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[inside]
+        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[
+            inside
+        ]
         led, led_row = np.unique(truth.sources.id[nearest], return_index=True)
         if len(led) == LEDS:
             xy_px = lights.xy_px[inside][led_row]
-            sightings.append(Sighting(position, lab_from_body.inv(), led, xy_px, magnitude[led_row]))
+            sightings.append(
+                Sighting(position, lab_from_body.inv(), led, xy_px, magnitude[led_row])
+            )
     return sightings
 
 
@@ -117,6 +131,10 @@ class Measurements:
 def measure(lab: Lab, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
     body_m = np.array([light_positions_m(lab, sighting.xy_px) for sighting in sightings])
-    lab_m = np.array([one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)])
-    position, magnitude = (np.array([getattr(one, name) for one in sightings]) for name in ("stop", "brightness"))
+    lab_m = np.array(
+        [one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)]
+    )
+    position, magnitude = (
+        np.array([getattr(one, name) for one in sightings]) for name in ("stop", "brightness")
+    )
     return Measurements(position, magnitude, body_m, lab_m)

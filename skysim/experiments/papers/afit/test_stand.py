@@ -59,7 +59,9 @@ def build_test_stand(scene: Scene) -> Lab:
     )
 
 
-def render_at_attitude(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
+def render_at_attitude(
+    lab: Lab, lab_from_body: Rotation, rng: np.random.Generator
+) -> tuple[Frame, Truth]:
     """Render a frame at a fixed attitude, in a run of its own: the phase of the LEDs' cycle is random."""
     return render_at_rest(lab.in_run(int(rng.integers(2**62))).camera, lab_from_body)
 

@@ -24,7 +24,12 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import detect_lights
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    with_cause,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
@@ -35,7 +40,8 @@ from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model, settings
 
 INITIAL_DEG = (-6, -3, 0, 3, 6)
-ITERATED_DEG, UPDATES = 2.0, 5
+ITERATED_DEG = 2.0
+UPDATES = 5
 SEPARATION_RAD = 500 * ARCSEC_RAD
 APPROXIMATE_DEG = 1.0  # a solution with a smaller error counts as approximating the attitude
 FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
@@ -79,7 +85,8 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
         shift_m = camera_m - lab.camera.mount.camera_body_m
         position = lab.camera.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
-        sources, mount = replace(lab.camera.sources, place=position), replace(lab.camera.mount, camera_body_m=camera_m)
+        sources = replace(lab.camera.sources, place=position)
+        mount = replace(lab.camera.mount, camera_body_m=camera_m)
         lab = lab.with_sources(sources).with_camera(mount=mount)
     no_leds = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
@@ -104,7 +111,8 @@ def directions(lab: Lab, panel: LedMap, rays: Floats, body_from_lab: Rotation) -
 
     R_0 is the camera's position and b_i the ray of light i; alpha_i is the distance to the panel along the ray.
     """
-    camera_m, lab_from_body = lab.camera.mount.camera_body_m, body_from_lab.inv()
+    camera_m = lab.camera.mount.camera_body_m
+    lab_from_body = body_from_lab.inv()
     origin_m = lab_from_body.apply(camera_m)
     intersection_m = on_surface(lab_from_body.apply(rays), origin_m, panel)
     point_m = camera_m + np.linalg.norm(intersection_m - origin_m, axis=1)[:, None] * rays
@@ -119,7 +127,9 @@ def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
     if match is None:
         return Solution(0, None)
     sigma_rad = np.full(len(match.observed), SEPARATION_RAD)
-    return Solution(len(sigma_rad), quest(observed[match.observed], model.vectors[match.star], sigma_rad))
+    return Solution(
+        len(sigma_rad), quest(observed[match.observed], model.vectors[match.star], sigma_rad)
+    )
 
 
 def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
@@ -162,7 +172,11 @@ class SolutionSeries(NamedTuple):
 
 
 def solve_series(
-    model: OnboardModel, errors_deg: Sequence[float], frames: int, seed: int, options: ExperimentOptions
+    model: OnboardModel,
+    errors_deg: Sequence[float],
+    frames: int,
+    seed: int,
+    options: ExperimentOptions,
 ) -> SolutionSeries:
     """Solve frames from the level vehicle, each from every initial error, and iterated from ITERATED_DEG."""
     solutions: dict[float, list[Solution]] = {error: [] for error in errors_deg}
@@ -179,19 +193,31 @@ def solve_series(
 def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     """Solutions for each initial error (five tests of 50 frames), with the scene's and a fitted camera position."""
     errors_deg = INITIAL_DEG if options.quick else (*INITIAL_DEG, -10, -8, -4.5, 4.5, 8, 10)
-    frames, catalog_frames = options.trials(250, 40), options.trials(50, 10)
+    frames = options.trials(250, 40)
+    catalog_frames = options.trials(50, 10)
     seeds = random_stream(options.seed, 2009).integers(2**31, size=4).tolist()
     scene_camera, fitted_camera = (
-        solve_series(build_model(camera_m, seeds[n], catalog_frames), errors_deg, frames, seeds[n + 2], options)
+        solve_series(
+            build_model(camera_m, seeds[n], catalog_frames),
+            errors_deg,
+            frames,
+            seeds[n + 2],
+            options,
+        )
         for n, camera_m in enumerate((None, FITTED_CAMERA_M))
     )
     statistics: dict[str, Callable[[SolutionSeries], Summary]] = {
         "matched": SolutionSeries.matched,
-        **{f"from_{error}": partial(SolutionSeries.fraction_near, error_deg=error) for error in INITIAL_DEG},
+        **{
+            f"from_{error}": partial(SolutionSeries.fraction_near, error_deg=error)
+            for error in INITIAL_DEG
+        },
         "iterated": SolutionSeries.mean_euler_angle,
     }
     cause = "the camera 0.30 m to the side and 0.20 m up, fitted"
-    results = {key: with_cause(cause, one, scene_camera, fitted_camera) for key, one in statistics.items()}
+    results = {
+        key: with_cause(cause, one, scene_camera, fitted_camera) for key, one in statistics.items()
+    }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
     return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
@@ -201,7 +227,8 @@ def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
     above, below = fig.subplots(2, 1, sharex=True)
     for n, (name, series) in enumerate(series_by_camera.items()):
         errors = sorted(series.solutions)
-        counts, mean_error_deg = [], []
+        counts = []
+        mean_error_deg = []
         for error in errors:
             counts.append(np.mean([one.matched for one in series.solutions[error]]))
             errors_deg = [one.error_deg for one in series.solutions[error] if one.body_from_lab]
@@ -214,4 +241,6 @@ def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
     above.axhline(6, color=INK[1], ls="--", label="published: about 6 on average")
     above.set(ylabel="stars matched, mean", ylim=(-0.5, 9.5))
     fig.legend(loc="outside upper center", ncols=3)
-    below.set(ylabel="error of solutions (deg)", xlabel="error of the initial attitude, each angle (deg)")
+    below.set(
+        ylabel="error of solutions (deg)", xlabel="error of the initial attitude, each angle (deg)"
+    )

@@ -20,7 +20,13 @@ from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.time import J2000_JD, tt_days, utc_days
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
 from skysim.experiments.papers.published import experiments, published_values
 from skysim.experiments.study.execution.trials import constant_rate
@@ -35,18 +41,26 @@ from skysim.tracking import factory
 SITE_DEG = (-23.2, -45.9)  # latitude, longitude of Sao Jose dos Campos
 UTC_LESS_LOCAL = datetime.timedelta(hours=3)
 UT1_LESS_UTC_S = -0.36  # in October 2003 (IERS)
-LOCAL_TIMES = [datetime.datetime(2003, 10, 2, *at) for at in ((19, 55, 22), (20, 1, 56), (20, 7, 0), (20, 11, 30))]
-ROWS, ANGLES = ("1", "2", "3", "4"), ("ra", "dec", "roll")
+LOCAL_TIMES = [
+    datetime.datetime(2003, 10, 2, *at)
+    for at in ((19, 55, 22), (20, 1, 56), (20, 7, 0), (20, 11, 30))
+]
+ROWS = ("1", "2", "3", "4")
+ANGLES = ("ra", "dec", "roll")
 ATTEMPTS = 18
 # Table 2: right ascension, declination, roll, deg.
-TABLE_2 = published_values("ptase-table-2", *(f"{angle}_{row}" for row in ROWS for angle in ANGLES)).reshape(-1, 3)
+TABLE_2 = published_values(
+    "ptase-table-2", *(f"{angle}_{row}" for row in ROWS for angle in ANGLES)
+).reshape(-1, 3)
 # "Very clear and dark": the air of the place and the Moon of the date, at its first quarter, 62 to 66 degrees high.
 NIGHT = {
     "background": "[]",
     "site": f"{{latitude_deg: {SITE_DEG[0]}, longitude_deg: {SITE_DEG[1]}, height: 600 m}}",
     "light.air": "{glow: {dark_mag_arcsec2: 21}}",
 }
-FITTED_DECENTERING = 0.0018  # sqrt(p1^2 + p2^2), uncalibrated: about 0.4 px at the detector's corner
+FITTED_DECENTERING = (
+    0.0018  # sqrt(p1^2 + p2^2), uncalibrated: about 0.4 px at the detector's corner
+)
 FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a vibrating floor
 
 
@@ -106,11 +120,15 @@ def uncalibrated_overrides(direction_rad: float) -> dict[str, str]:
     }
 
 
-def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetime], seed: int) -> FrameSolutions:
+def photograph_and_solve(
+    overrides: dict[str, str], local: list[datetime.datetime], seed: int
+) -> FrameSolutions:
     """Render and solve a frame at each time from the Earth-fixed camera."""
     lab = build_lab(loader.load("ptase_2003", NIGHT | overrides))
-    tracker, tripod = build_tracker(lab.camera), cam_from_itrs()
-    estimated_deg, true_deg = np.full((len(local), 3), np.nan), np.empty((len(local), 3))
+    tracker = build_tracker(lab.camera)
+    tripod = cam_from_itrs()
+    estimated_deg = np.full((len(local), 3), np.nan)
+    true_deg = np.empty((len(local), 3))
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
@@ -143,7 +161,9 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     """Table 2: eighteen frames with a calibrated camera at rest, and as many with each of several decentered lenses."""
     rng = random_stream(options.seed, 2003)
     span = LOCAL_TIMES[3] - LOCAL_TIMES[0]
-    local = LOCAL_TIMES + [LOCAL_TIMES[0] + n / 13 * span for n in range(ATTEMPTS - len(LOCAL_TIMES))]
+    local = LOCAL_TIMES + [
+        LOCAL_TIMES[0] + n / 13 * span for n in range(ATTEMPTS - len(LOCAL_TIMES))
+    ]
     lenses = options.trials(10, 2)
     calibrated = photograph_and_solve({}, local, int(rng.integers(2**31)))
     uncalibrated = []
@@ -152,7 +172,9 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         uncalibrated.append(photograph_and_solve(overrides, local, int(rng.integers(2**31))))
         options.watch(n + 1, lenses)
     results = {
-        f"{angle}_{row}": RowResult(extremum(calibrated.estimated_deg[n : n + 1, axis], np.max), "of one frame")
+        f"{angle}_{row}": RowResult(
+            extremum(calibrated.estimated_deg[n : n + 1, axis], np.max), "of one frame"
+        )
         for n, row in enumerate(ROWS)
         for axis, angle in enumerate(ANGLES)
     }
@@ -169,15 +191,22 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(results, drawings(calibrated, uncalibrated))
 
 
-def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> dict[str, RowResult]:
+def scatter_results(
+    calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
+) -> dict[str, RowResult]:
     """Standard deviation of each angle, and mean error. The interval with the cause is over lenses, because the frames
     of one lens share its distortion."""
-    name, results = "optics decentered and not calibrated, and vibration, fitted", {}
+    name = "optics decentered and not calibrated, and vibration, fitted"
+    results = {}
     for axis, angle in enumerate(ANGLES):
-        stds = np.array([sample_std(solutions.errors_arcsec[:, axis]) for solutions in uncalibrated])
+        stds = np.array(
+            [sample_std(solutions.errors_arcsec[:, axis]) for solutions in uncalibrated]
+        )
         ours = bootstrap_interval(calibrated.errors_arcsec[:, axis], sample_std)
         results[f"{angle}_sd"] = RowResult(ours, cause=Cause(name, bootstrap_interval(stds, rms)))
-    norms, *uncalibrated_norms = (np.linalg.norm(one.errors_arcsec, axis=1) for one in (calibrated, *uncalibrated))
+    norms, *uncalibrated_norms = (
+        np.linalg.norm(one.errors_arcsec, axis=1) for one in (calibrated, *uncalibrated)
+    )
     means = np.array([one.mean() for one in uncalibrated_norms])
     cause = Cause(name, bootstrap_interval(means, np.mean))
     results["noise"] = RowResult(bootstrap_interval(norms, np.mean), cause=cause)
@@ -187,7 +216,13 @@ def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolution
 def zenith_distance_deg(angles_deg: Floats) -> float:
     """Zenith distance of the boresight at the first row's time, at the site."""
     latitude, longitude = np.radians(SITE_DEG)
-    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    up = np.array(
+        [
+            np.cos(latitude) * np.cos(longitude),
+            np.cos(latitude) * np.sin(longitude),
+            np.sin(latitude),
+        ]
+    )
     boresight = stars.cam_from_icrs(angles_deg[0], angles_deg[1], 0.0).inv().apply([0.0, 0.0, 1.0])
     return float(np.degrees(np.arccos(itrs_from_icrs(LOCAL_TIMES[0]).apply(boresight) @ up)))
 
@@ -208,7 +243,9 @@ def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> 
 
 def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
     axes = fig.subplots()
-    axes.plot(calibrated.minutes, calibrated.estimated_deg[:, 0], MARKS[0], color=INK[0], label="ours")
+    axes.plot(
+        calibrated.minutes, calibrated.estimated_deg[:, 0], MARKS[0], color=INK[0], label="ours"
+    )
     axes.plot(calibrated.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published")
     time_range = np.array([0, calibrated.minutes.max()])
     published_rate = experiments()["ptase-table-2"].rows["rate"].published or 0.0
@@ -228,9 +265,13 @@ def draw_errors(fig: Any, calibrated: FrameSolutions, uncalibrated: list[FrameSo
         for solutions in (*uncalibrated, calibrated):
             style = (MARKS[0], INK[0], 4.5) if solutions is calibrated else (MARKS[1], INK[2], 2.5)
             solved = solutions.minutes[np.isfinite(solutions.error_rad)]
-            axes.plot(solved, solutions.errors_arcsec[:, axis], style[0], color=style[1], ms=style[2])
+            axes.plot(
+                solved, solutions.errors_arcsec[:, axis], style[0], color=style[1], ms=style[2]
+            )
         axes.plot(minutes, published[:, axis], "*", ms=10, color=INK[1])
         axes.set(ylabel=f"{name} (arcsec)")
     panels[-1].set(xlabel="minutes after 19:55:22")
     names = ("ours, uncalibrated and shaken", "ours, calibrated and at rest", "published")
-    fig.legend([panels[0].lines[n] for n in (0, -2, -1)], names, ncols=3, loc="outside upper center")
+    fig.legend(
+        [panels[0].lines[n] for n in (0, -2, -1)], names, ncols=3, loc="outside upper center"
+    )

@@ -29,18 +29,26 @@ from skysim.core.jit import jit
 from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval, percent, sample_std
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import WRONG_RAD, Summary, proportion
 from skysim.results.plots import INK, MARKS
 
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
-SIGMA_RAD, SIGMA_MAG = 3 * ARCSEC_RAD, 0.25
+SIGMA_RAD = 3 * ARCSEC_RAD
+SIGMA_MAG = 0.25
 TOLERANCE_RAD = 5 * SIGMA_RAD  # one star in 3e5 is outside; failures are due to the magnitude gate
 DIAGONAL_RAD = 2 * np.arctan(np.sqrt(2) * HALF_FIELD_TAN)
 DOUBLES_RAD = 30 * ARCSEC_RAD
-FITTED_LIMIT_MAG, FITTED_GATE_SIGMAS = 5.1, 3.2
+FITTED_LIMIT_MAG = 5.1
+FITTED_GATE_SIGMAS = 3.2
 SIMULATION_RUNS = 1000
 # Table 1: success (%), mean attitude, roll and axis error (arcsec) of its five simulations.
 TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
@@ -48,7 +56,9 @@ TABLE_1 = np.array(experiments()["ptase-table-1"].data["simulations"])
 
 def catalog(limit_mag: float) -> PairIndex:
     """Hipparcos by READCAT and PROC_CAT to a limiting magnitude, doubles within 30 arcsec merged, with a pair index."""
-    stars = ptase.proc_cat(ptase.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD)
+    stars = ptase.proc_cat(
+        ptase.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", limit_mag), DOUBLES_RAD
+    )
     return pair_index.build(stars.vectors, float(DIAGONAL_RAD), magnitude=stars.magnitude)
 
 
@@ -61,13 +71,16 @@ def version(name: str) -> SearchOptions:
 
 
 @jit
-def simulate(index: PairIndex, parameters: SearchOptions, runs: int, seed: int) -> tuple[Floats, Floats, Ints]:
+def simulate(
+    index: PairIndex, parameters: SearchOptions, runs: int, seed: int
+) -> tuple[Floats, Floats, Ints]:
     """True and estimated R_cam_from_icrs (runs, 3, 3), the latter NaN if unsolved; (runs,) number of stars in view.
 
     Attitudes are uniform over all rotations (see `_attitude`).
     """
     np.random.seed(seed)  # noqa: NPY002  (numba has no other generator that is seeded inside)
-    true, estimated = np.empty((runs, 3, 3)), np.full((runs, 3, 3), np.nan)
+    true = np.empty((runs, 3, 3))
+    estimated = np.full((runs, 3, 3), np.nan)
     stars = np.zeros(runs, np.int64)
     for run in range(runs):
         true[run] = _attitude()
@@ -86,18 +99,28 @@ def _attitude() -> Floats:
     """A rotation matrix uniform over all rotations: its quaternion is a normalized vector of four normal numbers."""
     a, b, c, d = np.random.standard_normal(4)  # noqa: NPY002
     length = np.sqrt(a * a + b * b + c * c + d * d)
-    a, b, c, d = a / length, b / length, c / length, d / length
+    a = a / length
+    b = b / length
+    c = c / length
+    d = d / length
     R = np.empty((3, 3))
-    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)
-    R[1, 0], R[1, 1], R[1, 2] = 2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)
-    R[2, 0], R[2, 1], R[2, 2] = 2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)
+    R[0, 0] = 1 - 2 * (c * c + d * d)
+    R[0, 1] = 2 * (b * c - a * d)
+    R[0, 2] = 2 * (b * d + a * c)
+    R[1, 0] = 2 * (b * c + a * d)
+    R[1, 1] = 1 - 2 * (b * b + d * d)
+    R[1, 2] = 2 * (c * d - a * b)
+    R[2, 0] = 2 * (b * d - a * c)
+    R[2, 1] = 2 * (c * d + a * b)
+    R[2, 2] = 1 - 2 * (b * b + c * c)
     return R
 
 
 @jit
 def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
     """PTASE's gen_sia_input2: noisy directions and magnitudes of the stars in the field, brightest first."""
-    directions, magnitudes = np.empty((len(index.vectors), 3)), np.empty(len(index.vectors))
+    directions = np.empty((len(index.vectors), 3))
+    magnitudes = np.empty(len(index.vectors))
     # Cosine of the angle to the field's corner: rejects most stars by their z alone.
     min_cos = 1 / np.sqrt(1 + 2 * HALF_FIELD_TAN**2)
     count = 0
@@ -106,14 +129,17 @@ def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
         z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
         if z < min_cos:
             continue
-        x, y = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w, R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
+        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
+        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
         if abs(x) > HALF_FIELD_TAN * z or abs(y) > HALF_FIELD_TAN * z:
             continue
         x += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
         y += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
         z += SIGMA_RAD * np.random.standard_normal()  # noqa: NPY002
         length = np.sqrt(x * x + y * y + z * z)
-        directions[count, 0], directions[count, 1], directions[count, 2] = x / length, y / length, z / length
+        directions[count, 0] = x / length
+        directions[count, 1] = y / length
+        directions[count, 2] = z / length
         magnitudes[count] = index.magnitude[star] + SIGMA_MAG * np.random.standard_normal()  # noqa: NPY002
         count += 1
     order = np.argsort(magnitudes[:count])
@@ -173,15 +199,20 @@ def run_version(index: PairIndex, parameters: SearchOptions, runs: int, seed: in
 
 def table_1(options: ExperimentOptions) -> ExperimentResult:
     """Table 1: all four versions, and the second with a wider magnitude gate as the cause."""
-    index, by_version = catalog(FITTED_LIMIT_MAG), {}
+    index = catalog(FITTED_LIMIT_MAG)
+    by_version = {}
     seeds = random_stream(options.seed, 1).integers(2**31, size=len(VERSIONS) + 1)
     for n, (name, seed) in enumerate(zip(VERSIONS, seeds, strict=False)):
-        runs = options.trials(5000 if name == "fialho_1" else 10_000, 300 if name == "fialho_1" else 1000)
+        runs = options.trials(
+            5000 if name == "fialho_1" else 10_000, 300 if name == "fialho_1" else 1000
+        )
         by_version[name] = run_version(index, version(name), runs, int(seed))
         options.watch(n + 1, len(VERSIONS) + 1)
     wider_parameters = version("fialho_2")._replace(gate_mag=FITTED_GATE_SIGMAS * SIGMA_MAG)
     wider_gate = run_version(index, wider_parameters, options.trials(10_000, 1000), int(seeds[-1]))
-    cause = Cause(f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", success_percent(wider_gate))
+    cause = Cause(
+        f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", success_percent(wider_gate)
+    )
     results = {}
     for name, runs_of_version in by_version.items():
         number = name[-1]
@@ -190,7 +221,9 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
         for statistic, values in runs_of_version.right._asdict().items():
             results[f"{statistic}_{number}"] = RowResult(bootstrap_interval(values, np.mean))
     versions = by_version.values()
-    results["wrong"] = RowResult(proportion(sum(one.wrong for one in versions), sum(one.runs for one in versions)))
+    results["wrong"] = RowResult(
+        proportion(sum(one.wrong for one in versions), sum(one.runs for one in versions))
+    )
     results |= scatter(by_version["fialho_2"])
     return ExperimentResult(results, drawings(by_version))
 
@@ -203,12 +236,17 @@ def success_percent(runs_of_version: VersionRuns) -> Summary:
 def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
     """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
     values = {name: getattr(runs_of_version.right, name) for name in ("attitude", "roll", "axis")}
-    values["success"] = np.where(np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0)
+    values["success"] = np.where(
+        np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0
+    )
 
     def std_of_mean(samples: Floats, axis: int = -1) -> Any:
         return sample_std(samples, axis) / np.sqrt(SIMULATION_RUNS)
 
-    return {f"{name}_sd": RowResult(bootstrap_interval(samples, std_of_mean)) for name, samples in values.items()}
+    return {
+        f"{name}_sd": RowResult(bootstrap_interval(samples, std_of_mean))
+        for name, samples in values.items()
+    }
 
 
 def drawings(by_version: dict[str, VersionRuns]) -> tuple[Drawing, ...]:
@@ -227,12 +265,17 @@ def drawings(by_version: dict[str, VersionRuns]) -> tuple[Drawing, ...]:
 
 def draw_histogram(fig: Any, right: Errors) -> None:
     """Histogram of the Frobenius norm, with our mean and the published one."""
-    axes, bins = fig.subplots(), np.arange(0, 25.5, 0.5)
+    axes = fig.subplots()
+    bins = np.arange(0, 25.5, 0.5)
     axes.hist(np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours")
-    axes.axvline(right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}")
+    axes.axvline(
+        right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}"
+    )
     published = experiments()["ptase-table-1"].rows["attitude_2"].published
     axes.axvline(published, color=INK[1], ls="--", label=f"published mean {published:.2f}")
-    axes.set(xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)", ylabel="runs")
+    axes.set(
+        xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)", ylabel="runs"
+    )
     axes.legend()
 
 

@@ -17,7 +17,13 @@ from estimator.detection.shefex import maximum_scan, sequential_scan
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval, bootstrap_of_means
 from skysim.experiments.papers.shefex.nights import FULL_MOON, exposure_override, render_frames
 from skysim.experiments.papers.shefex.setup import MAX_CENTROIDS, PUBLISHED
@@ -33,31 +39,45 @@ from skysim.tracking.exposure_control import ExposureController
 
 REPEATS = 15
 MAX_OBJECTS = 1000
-THRESHOLD_SIGMA, MIN_AREA_PX = 5.0, 3
+THRESHOLD_SIGMA = 5.0
+MIN_AREA_PX = 3
 
 
 def scan_times(options: ExperimentOptions) -> ExperimentResult:
     """Fig. 3: run time of a single pass with a sorted table against one pass per object, on the same frames."""
     frames = render_frames(exposure_override(50), 0.0, options.trials(60, 8), options.seed)
     images = [frame.image_dn for _, frame, _ in frames]
-    times_s = np.array([[scan_time_s(scan, image) for scan in (sequential_scan, maximum_scan)] for image in images])
-    table, all_objects = ([count_common(image, limit) for image in images] for limit in (MAX_CENTROIDS, MAX_OBJECTS))
+    times_s = np.array(
+        [[scan_time_s(scan, image) for scan in (sequential_scan, maximum_scan)] for image in images]
+    )
+    table, all_objects = (
+        [count_common(image, limit) for image in images] for limit in (MAX_CENTROIDS, MAX_OBJECTS)
+    )
     passes = np.array([min(objects + 1, MAX_CENTROIDS) for objects, _ in table])
     median_ms = 1e3 * np.median(times_s, axis=0)
     times_note = f"ours: {median_ms[0]:.2f} and {median_ms[1]:.2f} ms, {passes.mean():.1f} passes"
     overlap = np.mean([overlap for _, overlap in table])
     overlap_note = f"overlap of the {MAX_CENTROIDS} with most light and of those with the highest peak: {overlap:.2f}"
     results = {
-        "ratio": RowResult(quantile(times_s[:, 1] / times_s[:, 0], 0.5), f"{times_note}; times vary from run to run"),
-        "same": RowResult(bootstrap_interval(np.array([overlap for _, overlap in all_objects]), np.mean), overlap_note),
+        "ratio": RowResult(
+            quantile(times_s[:, 1] / times_s[:, 0], 0.5),
+            f"{times_note}; times vary from run to run",
+        ),
+        "same": RowResult(
+            bootstrap_interval(np.array([overlap for _, overlap in all_objects]), np.mean),
+            overlap_note,
+        ),
     }
-    return ExperimentResult(results, (Drawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),))
+    return ExperimentResult(
+        results, (Drawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),)
+    )
 
 
 def scan_time_s(scan: Callable[..., Any], image: NDArray[Any]) -> float:
     """Minimum run time of REPEATS repeats in seconds; other load on the machine can only lengthen a repeat."""
     # Background noise from the median absolute deviation, 1.4826 MAD = sigma for a normal distribution.
-    level, noise = float(np.median(image)), SIGMA_PER_MAD * float(np.median(np.abs(image - np.median(image))))
+    level = float(np.median(image))
+    noise = SIGMA_PER_MAD * float(np.median(np.abs(image - np.median(image))))
     times_s = []
     for _ in range(REPEATS + 1):  # the first one compiles
         begin = time.perf_counter()
@@ -72,7 +92,10 @@ def count_common(image: NDArray[Any], limit: int) -> tuple[int, float]:
     The overlap is the intersection over the union of the sets of bounding boxes.
     """
     boxes = [
-        {tuple(box) for box in DETECTORS[name](image, THRESHOLD_SIGMA, MIN_AREA_PX, limit).box_px.tolist()}
+        {
+            tuple(box)
+            for box in DETECTORS[name](image, THRESHOLD_SIGMA, MIN_AREA_PX, limit).box_px.tolist()
+        }
         for name in ("maximum", "sequential")
     ]
     return len(boxes[0]), len(boxes[0] & boxes[1]) / max(len(boxes[0] | boxes[1]), 1)
@@ -93,7 +116,9 @@ def draw_scans(times_s: Floats, fig: Any) -> None:
 
 # The exposure control.
 
-MEAN_DN, COARSE_DN = 150.0, 9.5  # the same light on 12 bits and on 8
+# the same light on 12 bits and on 8
+MEAN_DN = 150.0
+COARSE_DN = 9.5
 GLARE_E_S = 4e5
 PLANET_MAG = -4.0
 EDGE_PX = 20
@@ -106,8 +131,14 @@ EIGHT_BITS = {
     "tracker.exposure_control": f"{{mean_dn: {COARSE_DN}}}",
 }
 DARK = {"camera.transmission": "1e-6"}
-CAMERAS: dict[str, dict[str, str]] = {"ground": FULL_MOON, "space": {}, "8 bits": FULL_MOON | EIGHT_BITS}
-PLANET, PLANETS, GLARE = {"planets": 1}, {"planets": 4}, {"glare_e_s": GLARE_E_S}
+CAMERAS: dict[str, dict[str, str]] = {
+    "ground": FULL_MOON,
+    "space": {},
+    "8 bits": FULL_MOON | EIGHT_BITS,
+}
+PLANET = {"planets": 1}
+PLANETS = {"planets": 4}
+GLARE = {"glare_e_s": GLARE_E_S}
 DISTURBANCES: dict[str, dict[str, Any]] = {"planet": PLANET, "planets": PLANETS, "glare": GLARE}
 
 
@@ -117,13 +148,19 @@ class ExposureLoop:
     overrides : of the scene;  lab_from_body : its attitude;  start_ms : first exposure time
     """
 
-    def __init__(self, overrides: dict[str, str], lab_from_body: Rotation, start_ms: int = 10) -> None:
-        defaults = {"tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}", "tracker.detector": "sequential"}
+    def __init__(
+        self, overrides: dict[str, str], lab_from_body: Rotation, start_ms: int = 10
+    ) -> None:
+        defaults = {
+            "tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}",
+            "tracker.detector": "sequential",
+        }
         fixed = exposure_override(start_ms) | {"tracker.brightest": str(MAX_CENTROIDS)}
         scene = load("shefex2", defaults | overrides | fixed)
         self.lab = build_lab(scene)
         self.rest = Trajectory.at_rest(lab_from_body, 100.0)
-        self.controller, self.frames = ExposureController(scene), 0
+        self.controller = ExposureController(scene)
+        self.frames = 0
 
     def take_frame(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
         """Render a frame with stray light and planets; return the next commanded exposure time in ms."""
@@ -142,7 +179,8 @@ class ExposureLoop:
 
 def with_planets(camera: StarCamera, rest: Trajectory, count: int) -> Sources:
     """The light sources, with the `count` brightest stars well inside the detector raised to a planet's magnitude."""
-    visible, size_px = render_frame(camera, rest, 0)[1].sources, np.array(camera.canvas.shape[::-1])
+    visible = render_frame(camera, rest, 0)[1].sources
+    size_px = np.array(camera.canvas.shape[::-1])
     inside = np.all((visible.xy_px > EDGE_PX) & (visible.xy_px < size_px - EDGE_PX), axis=1)
     chosen = visible.id[inside][np.argsort(-visible.electrons[inside])[:count]]
     is_planet = np.isin(camera.sources.id, chosen)
@@ -162,7 +200,8 @@ def steady_exposures_ms(overrides: dict[str, str], attitudes: Rotation) -> Float
     """
     exposures_ms = []
     for lab_from_body in attitudes:
-        loop, commanded_ms = ExposureLoop(overrides, lab_from_body, 4), [4.0]
+        loop = ExposureLoop(overrides, lab_from_body, 4)
+        commanded_ms = [4.0]
         while len(commanded_ms) <= STEADY_FRAMES or np.ptp(commanded_ms[-STEADY_FRAMES:]) > 0:
             commanded_ms.append(loop.take_frame())
         exposures_ms.append(commanded_ms[-1])
@@ -188,7 +227,10 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
         steady_ms[name] = steady_exposures_ms(overrides, attitudes)
         options.watch(len(steady_ms), len(CAMERAS) + 1)
     dark_ms = [10.0, *exposures_ms(ExposureLoop(DARK, attitudes[0]), DARK_FRAMES)]
-    changes_ms = {name: exposure_changes_ms(attitudes, disturbance) for name, disturbance in DISTURBANCES.items()}
+    changes_ms = {
+        name: exposure_changes_ms(attitudes, disturbance)
+        for name, disturbance in DISTURBANCES.items()
+    }
     ground_ms = steady_ms["ground"]
     space_and_ground_ms = np.column_stack([steady_ms["space"], ground_ms])
     results = {
@@ -199,10 +241,14 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
             f"from {ground_ms.min():g} to {ground_ms.max():g}",
             Cause("8 bits of 157 e-", bootstrap_interval(steady_ms["8 bits"], np.mean)),
         ),
-        "space": RowResult(bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1])),
+        "space": RowResult(
+            bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1])
+        ),
     }
     for name, values in changes_ms.items():  # the mean, with minimum and maximum as the interval
-        results[name] = RowResult(Summary(float(values.mean()), float(values.min()), float(values.max()), len(values)))
+        results[name] = RowResult(
+            Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
+        )
     drawing = Drawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0]))
     return ExperimentResult(results, (drawing,))
 
@@ -219,7 +265,8 @@ SEQUENCE: tuple[tuple[str, int, dict[str, Any]], ...] = (
 
 def draw_control(lab_from_body: Rotation, fig: Any) -> None:
     """Exposure against frames for a sequence of disturbances (SEQUENCE), for the scene's 12 bits and for 8 bits."""
-    axes, boundaries = fig.subplots(), np.cumsum([0, *(frames for _, frames, _ in SEQUENCE)])
+    axes = fig.subplots()
+    boundaries = np.cumsum([0, *(frames for _, frames, _ in SEQUENCE)])
     for n, (name, label) in enumerate((("ground", "ours, 12 bits"), ("8 bits", "ours, 8 bits"))):
         loop = ExposureLoop(CAMERAS[name], lab_from_body)
         commanded_ms = [10.0]
@@ -229,6 +276,8 @@ def draw_control(lab_from_body: Rotation, fig: Any) -> None:
     axes.axhspan(35, 50, color=PUBLISHED, alpha=0.12, lw=0, label="published: good working range")
     for begin, end, (title, _, _) in zip(boundaries, boundaries[1:], SEQUENCE, strict=False):
         axes.axvline(end, color="#888888", lw=0.6)
-        axes.text((begin + end) / 2, 53.5, title.replace(" ", "\n"), ha="center", va="center", fontsize=8)
+        axes.text(
+            (begin + end) / 2, 53.5, title.replace(" ", "\n"), ha="center", va="center", fontsize=8
+        )
     axes.set(xlabel="frame", ylabel="exposure (ms)", ylim=(0, 57), xlim=(0, boundaries[-1]))
     fig.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)

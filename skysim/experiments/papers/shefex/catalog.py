@@ -12,20 +12,35 @@ from estimator.catalog import pair_index, shefex
 from estimator.catalog.catalog import StarCatalog
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
+from skysim.experiments.papers.compare import (
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.intervals import bootstrap_of_means
-from skysim.experiments.papers.shefex.setup import PRINTED_FIELD_RAD, PUBLISHED, lab_with, paper_catalog, stars
+from skysim.experiments.papers.shefex.setup import (
+    PRINTED_FIELD_RAD,
+    PUBLISHED,
+    lab_with,
+    paper_catalog,
+    stars,
+)
 from skysim.experiments.study.execution import detections
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
 
-BRIGHT_LIMIT_MAG, FAINTEST_MAG = 4.5, 5.75
+BRIGHT_LIMIT_MAG = 4.5
+FAINTEST_MAG = 5.75
 MIN_STARS = 4
 
 
 def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
     """The paper's counts for our versions of its catalogs, stars in view at random attitudes, and two sky maps."""
-    asymmetric, uniform, chosen = (paper_catalog(name) for name in ("asymmetric", "uniform", "chosen"))
+    asymmetric, uniform, chosen = (
+        paper_catalog(name) for name in ("asymmetric", "uniform", "chosen")
+    )
     counts = count_in_fields((asymmetric, uniform), options)
     bright = stars().id[stars().v_mag <= BRIGHT_LIMIT_MAG]
     faint = [count_between(one, 5.2, 5.4) for one in (asymmetric, chosen)]
@@ -40,13 +55,20 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
         "chosen_pairs": RowResult(exact(count_pairs(chosen))),
         "chosen_bright": RowResult(exact(np.isin(bright, chosen.id).mean())),
         "uniform_pairs": RowResult(exact(count_pairs(uniform))),
-        "spread": RowResult(bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion)),
-        "poor": RowResult(bootstrap_of_means((counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0])),
+        "spread": RowResult(
+            bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion)
+        ),
+        "poor": RowResult(
+            bootstrap_of_means((counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0])
+        ),
     }
     drawings = (
         Drawing("Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)),
         Drawing("Fig. 5: the uniform catalog.", partial(draw, uniform), (7.4, 4.2)),
-        Drawing("Stars in the field of 14.9 x 11.2 deg at random attitudes.", partial(draw_counts, counts)),
+        Drawing(
+            "Stars in the field of 14.9 x 11.2 deg at random attitudes.",
+            partial(draw_counts, counts),
+        ),
     )
     return ExperimentResult(results, drawings)
 
@@ -65,7 +87,10 @@ def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOption
     """(N, K) number of stars of each catalog on the detector at N random attitudes."""
     labs = [lab_with(star_catalog) for star_catalog in catalogs]
     attitudes = Rotation.random(options.trials(2000, 300), rng=random_stream(options.seed, 0))
-    counts = [[len(detections.visible_sources(one, attitude)[0]) for one in labs] for attitude in attitudes]
+    counts = [
+        [len(detections.visible_sources(one, attitude)[0]) for one in labs]
+        for attitude in attitudes
+    ]
     return np.array(counts, float)
 
 
@@ -74,7 +99,8 @@ def relative_dispersion(means: Floats) -> Floats:
 
     means : (..., 4) mean counts of both catalogs, then mean squared counts
     """
-    mean, square = means[..., :2], means[..., 2:]
+    mean = means[..., :2]
+    square = means[..., 2:]
     dispersion_index = (square - mean**2) / mean
     return np.asarray(dispersion_index[..., 1] / dispersion_index[..., 0])
 
@@ -87,9 +113,13 @@ def draw(star_catalog: StarCatalog, fig: Any) -> None:
     axes.scatter(-np.arctan2(y, x), np.arcsin(z), s=size, color=INK[0], lw=0)
     axes.set_xticks(np.radians(np.arange(-120, 121, 60)), [])
     axes.set_xlabel("right ascension grows to the left from 0 in the middle", fontsize=8)
-    axes.set_yticks(np.radians(np.arange(-60, 61, 30)), [f"{dec} deg" for dec in range(-60, 61, 30)])
+    axes.set_yticks(
+        np.radians(np.arange(-60, 61, 30)), [f"{dec} deg" for dec in range(-60, 61, 30)]
+    )
     axes.tick_params(labelsize=7)
-    axes.set_title(f"ours: {len(star_catalog)} stars to {star_catalog.v_mag.max():.2f} mag", fontsize=9)
+    axes.set_title(
+        f"ours: {len(star_catalog)} stars to {star_catalog.v_mag.max():.2f} mag", fontsize=9
+    )
 
 
 def draw_counts(counts: Floats, fig: Any) -> None:

@@ -18,7 +18,13 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_of_means
 from skysim.experiments.papers.shefex.setup import (
     CHOSEN_COS_ERROR,
@@ -41,7 +47,8 @@ from skysim.tracking import onboard_model
 COS_ERRORS = np.array([5e-6, 1e-5, 1.5e-5, 2e-5, 3e-5, 4e-5, 5.5e-5, 8e-5, 1.2e-4, 2e-4])
 INDEX_OF = {float(one): n for n, one in enumerate(COS_ERRORS)}
 CENTROID_PX = (0.1, 0.2, 0.3)
-SPIKES, SPIKE_COS_ERRORS = (0, 2, 4, 6, 8, 10), (4e-5, CHOSEN_COS_ERROR, 8e-5, 1.2e-4)
+SPIKES = (0, 2, 4, 6, 8, 10)
+SPIKE_COS_ERRORS = (4e-5, CHOSEN_COS_ERROR, 8e-5, 1.2e-4)
 ERRORS_PX = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
 LIMIT_INDEX = 3  # index of 0.45 px
 LIMIT_DEG = 0.1
@@ -80,8 +87,12 @@ def identify(
     xy_px = xy_px[:MAX_CENTROIDS]
     if len(xy_px) < 4:
         return Identification(np.nan, 0.0, 0.0, np.full(3, np.nan))
-    rays, sigma_rad, counters = camera.rays(xy_px), centroid_px / camera.focal_px, np.zeros(3, np.int64)
-    _, cam_from_ref = identify_and_solve(rays, pairs(), cosine_error, accept_log10_chance, sigma_rad, counters)
+    rays = camera.rays(xy_px)
+    sigma_rad = centroid_px / camera.focal_px
+    counters = np.zeros(3, np.int64)
+    _, cam_from_ref = identify_and_solve(
+        rays, pairs(), cosine_error, accept_log10_chance, sigma_rad, counters
+    )
     work = float(counters[1] + 3 * counters[2])
     if cam_from_ref is None:
         return Identification(work, 0.0, 0.0, np.full(3, np.nan))
@@ -118,23 +129,26 @@ def compute_curves(options: ExperimentOptions) -> Curves:
     parameters only.
     """
     points = 4 * len(COS_ERRORS) + len(SPIKES) * (len(SPIKE_COS_ERRORS) + 1) + len(ERRORS_PX)
-    fields, completed = random_fields(options.trials(1000, 60), options.seed), itertools.count(1)
+    fields = random_fields(options.trials(1000, 60), options.seed)
+    completed = itertools.count(1)
 
     def results_at(
         centroid_px: float, cosine_error: float, spikes: int = 0, accept: float = FOURTH_STAR
     ) -> list[Floats]:
         """Work, right, wrong and errors of all attitudes at one point of a curve."""
         results = [
-            identify(field, centroid_px, cosine_error, spikes, accept, random_stream(options.seed, 1, n))
+            identify(
+                field, centroid_px, cosine_error, spikes, accept, random_stream(options.seed, 1, n)
+            )
             for n, field in enumerate(fields)
         ]
         options.watch(next(completed), points)
         return [np.array(column) for column in zip(*results, strict=True)]
 
     significant = ACCEPT_LOG10_CHANCE
-    work, right = np.array([[results_at(px, error)[:2] for error in COS_ERRORS] for px in CENTROID_PX]).transpose(
-        2, 0, 1, 3
-    )
+    work, right = np.array(
+        [[results_at(px, error)[:2] for error in COS_ERRORS] for px in CENTROID_PX]
+    ).transpose(2, 0, 1, 3)
     right_significant = [results_at(0.2, error, 0, significant)[1] for error in COS_ERRORS]
     wrong = [[results_at(0.2, error, n)[2] for error in SPIKE_COS_ERRORS] for n in SPIKES]
     wrong_significant = [results_at(0.2, CHOSEN_COS_ERROR, n, significant)[2] for n in SPIKES]
@@ -152,13 +166,26 @@ def eq3_cos_error(centroid_px: float, factor: float) -> float:
 def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     """Figs 7 to 10, the choice of cosError, and the equations it is based on."""
     curves = compute_curves(options)
-    results = time_results(curves) | success_results(curves) | wrong_results(curves) | attitude_results(curves)
+    results = (
+        time_results(curves)
+        | success_results(curves)
+        | wrong_results(curves)
+        | attitude_results(curves)
+    )
     results |= equation_results(random_stream(options.seed, 2))
     drawings = (
-        Drawing("Fig. 7: angles compared by an identification, against cosError.", partial(draw_time, curves)),
+        Drawing(
+            "Fig. 7: angles compared by an identification, against cosError.",
+            partial(draw_time, curves),
+        ),
         Drawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
-        Drawing("Fig. 9: wrong recognitions against the spikes among the stars.", partial(draw_wrong, curves)),
-        Drawing("Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)),
+        Drawing(
+            "Fig. 9: wrong recognitions against the spikes among the stars.",
+            partial(draw_wrong, curves),
+        ),
+        Drawing(
+            "Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)
+        ),
     )
     return ExperimentResult(results, drawings)
 
@@ -166,7 +193,9 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
 def time_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
     low = [bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
-    high = [bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work]
+    high = [
+        bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work
+    ]
 
     def moved(means: Floats) -> Floats:
         first, last = (half.argmin(axis=-1) for half in np.split(means, 2, axis=-1))
@@ -175,13 +204,16 @@ def time_results(curves: Curves) -> dict[str, RowResult]:
     return {
         "least_low": RowResult(min(low), "smallest of the three centroid errors"),
         "least_high": RowResult(min(high), "smallest of the three centroid errors"),
-        "optimum": RowResult(bootstrap_of_means(np.vstack([curves.work[0], curves.work[-1]]).T, moved)),
+        "optimum": RowResult(
+            bootstrap_of_means(np.vstack([curves.work[0], curves.work[-1]]).T, moved)
+        ),
     }
 
 
 def success_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 8: rise with cosError, order of the curves, and the success rate at the chosen cosError."""
-    chosen, has_four_stars = curves.right[1, INDEX_OF[CHOSEN_COS_ERROR]], curves.has_four_stars
+    chosen = curves.right[1, INDEX_OF[CHOSEN_COS_ERROR]]
+    has_four_stars = curves.has_four_stars
     increase = chosen - curves.right[1, INDEX_OF[1e-5]]
     difference = curves.right[0, INDEX_OF[2e-5]] - curves.right[2, INDEX_OF[2e-5]]
     return {
@@ -200,27 +232,39 @@ def wrong_results(curves: Curves) -> dict[str, RowResult]:
     by_cos_error = curves.wrong[-1, -1] - curves.wrong[-1, 0]
     chosen = SPIKE_COS_ERRORS.index(CHOSEN_COS_ERROR)
     wrong_by_our_rule = int(curves.wrong_significant.sum())
-    note = f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
+    note = (
+        f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
+    )
     return {
         "wrong_spikes": RowResult(bootstrap_of_mean(by_spikes), note),
         "wrong_cos_error": RowResult(bootstrap_of_mean(by_cos_error)),
-        "wrong_chosen": RowResult(proportion(curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars))),
+        "wrong_chosen": RowResult(
+            proportion(curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars))
+        ),
     }
 
 
 def attitude_results(curves: Curves) -> dict[str, RowResult]:
     """Fig. 10: errors at 0.45 px, and the centroid error at which yaw exceeds the limit, as rms and as 2 sigma."""
-    yaw, cross = curves.error_deg[:, :, 2].T, np.hypot(curves.error_deg[:, :, 0], curves.error_deg[:, :, 1]).T
-    yaw_at_limit, yaw_squared = yaw[:, LIMIT_INDEX], yaw**2
+    yaw = curves.error_deg[:, :, 2].T
+    cross = np.hypot(curves.error_deg[:, :, 0], curves.error_deg[:, :, 1]).T
+    yaw_at_limit = yaw[:, LIMIT_INDEX]
+    yaw_squared = yaw**2
     yaw_and_cross = np.column_stack([yaw_at_limit**2, cross[:, LIMIT_INDEX] ** 2 / 2])
-    one_sigma, two_sigma = (bootstrap_of_means(yaw_squared, partial(error_at_limit, times)) for times in (1.0, 2.0))
+    one_sigma, two_sigma = (
+        bootstrap_of_means(yaw_squared, partial(error_at_limit, times)) for times in (1.0, 2.0)
+    )
     return {
         "yaw_mean": RowResult(bootstrap_of_mean(np.abs(yaw_at_limit))),
         "yaw_rms": RowResult(bootstrap_of_rms(yaw_at_limit)),
         "yaw_2_sigma": RowResult(bootstrap_of_rms(yaw_at_limit, 2.0)),
         "passes": RowResult(one_sigma, cause=Cause("2 sigma drawn, not rms", two_sigma)),
-        "increasing": RowResult(bootstrap_of_means(yaw_squared, lambda m: np.diff(np.sqrt(m), axis=-1).min(axis=-1))),
-        "yaw_over_pitch": RowResult(bootstrap_of_means(yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1]))),
+        "increasing": RowResult(
+            bootstrap_of_means(yaw_squared, lambda m: np.diff(np.sqrt(m), axis=-1).min(axis=-1))
+        ),
+        "yaw_over_pitch": RowResult(
+            bootstrap_of_means(yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1]))
+        ),
         "pitch": RowResult(bootstrap_of_means(yaw_and_cross[:, 1:], lambda m: np.sqrt(m[..., 0]))),
     }
 
@@ -264,7 +308,8 @@ GATE_ANGLES_DEG = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
 
 def count_triangles(rng: np.random.Generator) -> int:
     """Number of base triangles that a search tests for 15 spikes."""
-    camera, counters = onboard_model.calibration(shefex_lab().scene.camera), np.zeros(3, np.int64)
+    camera = onboard_model.calibration(shefex_lab().scene.camera)
+    counters = np.zeros(3, np.int64)
     rays = camera.rays(rng.random((MAX_CENTROIDS, 2)) * [camera.width_px, camera.height_px] - 0.5)
     search_limits = search_options(pairs(), CHOSEN_COS_ERROR, MAX_CENTROIDS, -np.inf)
     search(rays, pairs(), search_limits, counters)
@@ -309,8 +354,12 @@ def set_up_cos_error_axis(axes: Any) -> None:
 def draw_success(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, centroid_px in enumerate(CENTROID_PX):
-        plot_curve(axes, COS_ERRORS, fractions(curves.right[n]), n, f"ours, fourth star, {centroid_px} px")
-    plot_curve(axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px")
+        plot_curve(
+            axes, COS_ERRORS, fractions(curves.right[n]), n, f"ours, fourth star, {centroid_px} px"
+        )
+    plot_curve(
+        axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px"
+    )
     set_up_cos_error_axis(axes)
     axes.set(ylabel="success rate", ylim=(0, 1.02))
     axes.legend()
@@ -319,8 +368,20 @@ def draw_success(curves: Curves, fig: Any) -> None:
 def draw_wrong(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, cosine_error in enumerate(SPIKE_COS_ERRORS):
-        plot_curve(axes, SPIKES, fractions(curves.wrong[:, n]), n, f"ours, fourth star, cosError {cosine_error:g}")
-    plot_curve(axes, SPIKES, fractions(curves.wrong_significant), 4, f"ours, beyond chance, {CHOSEN_COS_ERROR:g}")
+        plot_curve(
+            axes,
+            SPIKES,
+            fractions(curves.wrong[:, n]),
+            n,
+            f"ours, fourth star, cosError {cosine_error:g}",
+        )
+    plot_curve(
+        axes,
+        SPIKES,
+        fractions(curves.wrong_significant),
+        4,
+        f"ours, beyond chance, {CHOSEN_COS_ERROR:g}",
+    )
     axes.set(xlabel="spikes", ylabel="wrong recognition rate")
     axes.legend()
 

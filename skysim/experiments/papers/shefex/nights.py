@@ -15,7 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow import background
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
+from skysim.experiments.papers.compare import (
+    Cause,
+    Drawing,
+    ExperimentOptions,
+    ExperimentResult,
+    RowResult,
+)
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.shefex.optics import DEFOCUS_M, optics_results, out_of_focus
 from skysim.experiments.papers.shefex.setup import PUBLISHED, plot_curve, processing_chain
@@ -34,11 +40,14 @@ SKY = "{kind: sky, mag_arcsec2: 20}"
 MOON = "{kind: moon, ra_deg: 90, dec_deg: 20, phase_angle_deg: 0, moon_zenith_deg: 40, field_zenith_deg: 30}"
 ONE_FRAME = {"exposure.first": "10 ms", "exposure.frames": "1"}
 ATMOSPHERE = {"camera.transmission": "0.595"}  # 30 % less than the scene's 0.85
-MOONLESS, FULL_MOON = ATMOSPHERE | {"background": f"[{SKY}]"}, ATMOSPHERE | {"background": f"[{SKY}, {MOON}]"}
+MOONLESS = ATMOSPHERE | {"background": f"[{SKY}]"}
+FULL_MOON = ATMOSPHERE | {"background": f"[{SKY}, {MOON}]"}
 NORTH_DEG = (8.0, 90.0)  # declinations that culminate above 45 deg at Bremen
-RATES, QUICK_RATES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), (0.0, 2.0, 4.0, 5.0)
+RATES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+QUICK_RATES = (0.0, 2.0, 4.0, 5.0)
 SPACE_RATES = (0.0, 2.0, 4.0, 6.0)
-SIGMA, LOW_SIGMA = 5.0, 4.0
+SIGMA = 5.0
+LOW_SIGMA = 4.0
 CATALOG = "uniform"  # "processed using the uniform Hipparcos catalog"
 
 
@@ -74,7 +83,9 @@ def render_frames(
     lab = build_lab(load("shefex2", ONE_FRAME | overrides))
     trial = FrameTrial(kind="frames", rate_deg_s=rate_deg_s, dec_deg=NORTH_DEG)
     setup = Setup(lab, build_tracker(lab.camera), trial, "")
-    moon_direction, trial_seed, rendered = background.direction(*MOON_DEG), 1_000_000 * seed, 0
+    moon_direction = background.direction(*MOON_DEG)
+    trial_seed = 1_000_000 * seed
+    rendered = 0
     while rendered < count:
         trial_seed += 1
         lab_from_body = trials.random_attitude(setup, trials.streams(setup, trial_seed)[0])
@@ -86,7 +97,9 @@ def render_frames(
         yield setup, frame, truth
 
 
-def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, seed: int) -> NightResults:
+def process_frames(
+    overrides: dict[str, str], rate_deg_s: float, count: int, seed: int
+) -> NightResults:
     """Process frames with all chains."""
     rows = []
     for setup, frame, truth in render_frames(overrides, rate_deg_s, count, seed):
@@ -105,7 +118,9 @@ def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, see
 
 def is_right(cam_from_ref: Rotation | None, truth: Truth) -> bool:
     """Return True if a frame is solved with an error below ten arc-minutes."""
-    return cam_from_ref is not None and not metrics.is_wrong((cam_from_ref * truth.cam_from_lab.inv()).magnitude())
+    return cam_from_ref is not None and not metrics.is_wrong(
+        (cam_from_ref * truth.cam_from_lab.inv()).magnitude()
+    )
 
 
 def night_results(options: ExperimentOptions) -> ExperimentResult:
@@ -128,19 +143,27 @@ def night_results(options: ExperimentOptions) -> ExperimentResult:
         options.watch(len(results), len(conditions))
     drawings = (
         Drawing("Frames identified against the turning rate.", partial(draw_rates, results)),
-        Drawing("Fig. 11: a frame of 40 ms, its centroids and those identified.", partial(draw_frame, options.seed)),
+        Drawing(
+            "Fig. 11: a frame of 40 ms, its centroids and those identified.",
+            partial(draw_frame, options.seed),
+        ),
     )
     return ExperimentResult(frame_results(results) | optics_results(options), drawings)
 
 
 def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
     """Answers from the frames to the statements of sections 4 and 5."""
-    at_rest, centroids = results["ground 0"], results["40 ms"].centroids
+    at_rest = results["ground 0"]
+    centroids = results["40 ms"].centroids
     fewest, median, most = np.quantile(centroids, [0.025, 0.5, 0.975], method="nearest")
     by_exposure = {"35 ms": results["35 ms"], "40 ms": results["40 ms"], "50 ms": at_rest}
-    by_exposure_note = ", ".join(f"{result.success.value:.2f} at {name}" for name, result in by_exposure.items())
+    by_exposure_note = ", ".join(
+        f"{result.success.value:.2f} at {name}" for name, result in by_exposure.items()
+    )
     combined, combined_low_threshold = (
-        bootstrap_interval(np.mean([getattr(result, name) for result in by_exposure.values()], axis=0), np.mean)
+        bootstrap_interval(
+            np.mean([getattr(result, name) for result in by_exposure.values()], axis=0), np.mean
+        )
         for name in ("right", "right_low_threshold")
     )
     cause = Cause(f"a threshold of {LOW_SIGMA:g} sigma", combined_low_threshold)
@@ -170,7 +193,11 @@ def draw_rates(results: dict[str, NightResults], fig: Any) -> None:
     axes = fig.subplots()
     labels = {"ground": "ours, under air and Moon", "space": "ours, in space"}
     for n, (condition, label) in enumerate(labels.items()):
-        by_rate = {float(key.split()[1]): result for key, result in results.items() if key.startswith(condition)}
+        by_rate = {
+            float(key.split()[1]): result
+            for key, result in results.items()
+            if key.startswith(condition)
+        }
         successes = [result.success for result in by_rate.values()]
         plot_curve(axes, list(by_rate), successes, n, f"{label}, the paper's chain")
         if n == 0:
@@ -178,7 +205,9 @@ def draw_rates(results: dict[str, NightResults], fig: Any) -> None:
             plot_curve(axes, list(by_rate), ours, 2, f"{label}, our default chain")
     axes.axvspan(0, 2, color=PUBLISHED, alpha=0.25, lw=0, label="published: mostly identified")
     axes.axvspan(4, 8, color=PUBLISHED, alpha=0.1, lw=0, label="published: rarely identified")
-    axes.set(xlabel="turning rate (deg/s)", ylabel="frames identified", ylim=(0, 1.03), xlim=(-0.1, 8.1))
+    axes.set(
+        xlabel="turning rate (deg/s)", ylabel="frames identified", ylim=(0, 1.03), xlim=(-0.1, 8.1)
+    )
     axes.legend(fontsize=8)
 
 
@@ -186,15 +215,25 @@ def draw_frame(seed: int, fig: Any) -> None:
     """Draw the first frame in which the paper's chain identifies at least eight stars, or the last of forty."""
     axes = fig.subplots()
     for setup, frame, _ in render_frames(FULL_MOON | exposure_override(40), 0.0, 40, seed):
-        result = processing_chain(CATALOG, SIGMA, setup.lab.scene.camera.focal_px).solve(frame.image_dn)
+        result = processing_chain(CATALOG, SIGMA, setup.lab.scene.camera.focal_px).solve(
+            frame.image_dn
+        )
         if len(result.observed) >= 8:
             break
     low, high = np.percentile(frame.image_dn, [50, 99.95])
     axes.imshow(frame.image_dn, cmap="gray_r", vmin=low, vmax=high, interpolation="none")
     xy_px = result.centroids.xy_px
-    axes.scatter(*xy_px.T, s=130, facecolors="none", edgecolors="blue", label=f"{len(xy_px)} centroids")
+    axes.scatter(
+        *xy_px.T, s=130, facecolors="none", edgecolors="blue", label=f"{len(xy_px)} centroids"
+    )
     identified_px = xy_px[result.observed]
-    axes.scatter(*identified_px.T, s=45, facecolors="none", edgecolors="red", label=f"{len(identified_px)} identified")
+    axes.scatter(
+        *identified_px.T,
+        s=45,
+        facecolors="none",
+        edgecolors="red",
+        label=f"{len(identified_px)} identified",
+    )
     axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.grid(visible=False)
     fig.legend(*axes.get_legend_handles_labels(), loc="outside right upper")

@@ -26,7 +26,8 @@ from skysim.scene.loader import load
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import onboard_model
 
-NOMINAL_FOCAL_MM, TRUE_FOCAL_MM = 25.0, 24.95
+NOMINAL_FOCAL_MM = 25.0
+TRUE_FOCAL_MM = 24.95
 DEFOCUS_M = 1e-4
 EXPOSURE_S = 0.05
 
@@ -38,7 +39,9 @@ def optics_results(options: ExperimentOptions) -> dict[str, RowResult]:
     results = {
         "field_h": RowResult(exact(horizontal)),
         "field_v": RowResult(exact(vertical)),
-        "diagonal": RowResult(exact(diagonal), f"hypotenuse of both fields {np.hypot(horizontal, vertical):.3f}"),
+        "diagonal": RowResult(
+            exact(diagonal), f"hypotenuse of both fields {np.hypot(horizontal, vertical):.3f}"
+        ),
         "diagonal_true": RowResult(exact(diagonal)),
         "absorbed": RowResult(exact(absorbed)),
         "blur": RowResult(exact(blur_px())),
@@ -52,7 +55,8 @@ def optics_results(options: ExperimentOptions) -> dict[str, RowResult]:
 
 def field_deg(camera: Camera) -> tuple[float, float, float]:
     """Horizontal, vertical and diagonal field of view in degrees, between the detector's outer edges and corners."""
-    right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
+    right = camera.width_px - 0.5
+    bottom = camera.height_px - 0.5
     x, y = camera.center_px
     edges = [[(-0.5, y), (right, y)], [(x, -0.5), (x, bottom)], [(-0.5, -0.5), (right, bottom)]]
     rays = [camera.rays(np.array(pair)) for pair in edges]
@@ -87,7 +91,9 @@ def star_image(
     path = lab_from_body * Rotation.from_rotvec(np.outer(t_s - exposure_s / 2, rate_body))
     image = np.zeros(lab.camera.canvas.shape)
     trajectory = Trajectory(t_s, path, np.tile(rate_body, (len(t_s), 1)))
-    render(image, brightest, lab.camera.optics, trajectory, lab.camera.mount, Window(0.0, exposure_s))
+    render(
+        image, brightest, lab.camera.optics, trajectory, lab.camera.mount, Window(0.0, exposure_s)
+    )
     return image
 
 
@@ -102,7 +108,9 @@ def variance_px2(image: Floats) -> Floats:
 
 def smear_px(rate_deg_s: float) -> float:
     """Length L of a streak in pixels: smear along a line adds L^2 / 12 to the variance of the star at rest."""
-    moving, at_rest = (variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0))
+    moving, at_rest = (
+        variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0)
+    )
     return float(np.sqrt(12 * (moving - at_rest)))
 
 
@@ -111,15 +119,24 @@ def peak_loss(rate_deg_s: float, count: int, seed: int) -> RowResult:
 
     The note gives the mean over random positions in the pixel and random directions.
     """
-    rng, pixel_rad = random_stream(seed, 4), 1 / shefex_lab().camera.optics.camera.focal_px
+    rng = random_stream(seed, 4)
+    pixel_rad = 1 / shefex_lab().camera.optics.camera.focal_px
     places = [((0.0, 0.0), np.pi / 2)]
-    places += [(tuple(rng.uniform(-0.5, 0.5, 2) * pixel_rad), rng.uniform(0, 2 * np.pi)) for _ in range(count)]
+    places += [
+        (tuple(rng.uniform(-0.5, 0.5, 2) * pixel_rad), rng.uniform(0, 2 * np.pi))
+        for _ in range(count)
+    ]
     loss_mag = []
     for place, axis_rad in places:
-        peaks = [star_image(shefex_lab(), EXPOSURE_S, rate, place, axis_rad).max() for rate in (0.0, rate_deg_s)]
+        peaks = [
+            star_image(shefex_lab(), EXPOSURE_S, rate, place, axis_rad).max()
+            for rate in (0.0, rate_deg_s)
+        ]
         loss_mag.append(2.5 * np.log10(peaks[0] / peaks[1]))
     mean_note = format_summary(bootstrap_interval(np.array(loss_mag[1:]), np.mean))
-    return RowResult(exact(loss_mag[0]), f"mean over positions in the pixel and directions: {mean_note}")
+    return RowResult(
+        exact(loss_mag[0]), f"mean over positions in the pixel and directions: {mean_note}"
+    )
 
 
 def blur_px() -> float:
@@ -141,14 +158,20 @@ def out_of_focus(defocus_m: float) -> dict[str, str]:
 def calibrated_focal_mm(options: ExperimentOptions) -> tuple[Summary, str]:
     """Focal length in mm by our star-field calibration, of a 24.95 mm lens with a nominal 25 mm; with a note."""
     overrides = {"camera.focal_length": f"{TRUE_FOCAL_MM} mm", "exposure.time": "50 ms"}
-    lab = build_lab(load("shefex2", overrides | {"exposure.first": "10 ms", "exposure.frames": "1"}))
+    lab = build_lab(
+        load("shefex2", overrides | {"exposure.first": "10 ms", "exposure.frames": "1"})
+    )
     setup = Setup(lab, build_tracker(lab.camera), FrameTrial(kind="frames"), "")
     nominal_camera = onboard_model.calibration(shefex_lab().scene.camera)
     detector = lab.scene.camera.detector
     settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
     first_seed = 1_000_000 * options.seed
-    rendered = (trials.render_trial_frame(setup, first_seed + n)[0] for n in range(options.trials(40, 8)))
-    frames = [detect_and_centroid(frame.image_dn, nominal_camera, settings, Clock()) for frame in rendered]
+    rendered = (
+        trials.render_trial_frame(setup, first_seed + n)[0] for n in range(options.trials(40, 8))
+    )
+    frames = [
+        detect_and_centroid(frame.image_dn, nominal_camera, settings, Clock()) for frame in rendered
+    ]
 
     def tracker(camera: Camera, uncertainty: float) -> StarTracker:
         return StarTracker(camera, stars(), apparent(stars()), settings, uncertainty)

@@ -58,7 +58,9 @@ def paper_catalog(name: str) -> StarCatalog:
 def lab_with(star_catalog: StarCatalog) -> Lab:
     """The scene's lab with the stars of a catalog only."""
     lab = shefex_lab()
-    return lab.with_sources(lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
+    return lab.with_sources(
+        lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id))
+    )
 
 
 def apparent(star_catalog: StarCatalog) -> Floats:
@@ -104,32 +106,46 @@ class ProcessingChain:
         centroids = detect_lights(self.settings, self.camera, image)
         if len(centroids) < 4:
             return ChainResult(centroids, np.empty(0, np.int64), None)
-        rays, counters = self.camera.rays(centroids.xy_px), np.zeros(3, np.int64)
+        rays = self.camera.rays(centroids.xy_px)
+        counters = np.zeros(3, np.int64)
         sigma_rad = 0.1 / self.camera.focal_px
-        solution = identify_and_solve(rays, self.index, CHOSEN_COS_ERROR, FOURTH_STAR, sigma_rad, counters)
+        solution = identify_and_solve(
+            rays, self.index, CHOSEN_COS_ERROR, FOURTH_STAR, sigma_rad, counters
+        )
         return ChainResult(centroids, *solution)
 
 
 processing_chain = cache(ProcessingChain)
 
 
-def search_options(index: PairIndex, cos_error: float, lights: int, accept_log10_chance: float) -> SearchOptions:
+def search_options(
+    index: PairIndex, cos_error: float, lights: int, accept_log10_chance: float
+) -> SearchOptions:
     """SearchOptions of the paper's identifier for a number of lights, without a limit on its work."""
     # The angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3).
     max_angle_rad = index.max_angle_rad
     tolerance_rad = float(max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0)))
-    return SearchOptions(cos_error, tolerance_rad, UNLIMITED, UNLIMITED, lights, accept_log10_chance)
+    return SearchOptions(
+        cos_error, tolerance_rad, UNLIMITED, UNLIMITED, lights, accept_log10_chance
+    )
 
 
 def identify_and_solve(
-    rays: Floats, index: PairIndex, cos_error: float, accept_log10_chance: float, sigma_rad: float, counters: Ints
+    rays: Floats,
+    index: PairIndex,
+    cos_error: float,
+    accept_log10_chance: float,
+    sigma_rad: float,
+    counters: Ints,
 ) -> tuple[Ints, Rotation | None]:
     """Rows of the identified rays, and cam_from_ref by ESOQ2; None if none is identified. `counters` count the work."""
     options = search_options(index, cos_error, len(rays), accept_log10_chance)
     observed, star, _, _ = search(rays, index, options, counters)
     if not len(observed):
         return observed, None
-    return observed, SOLVERS["esoq2"](rays[observed], index.vectors[star], np.full(len(observed), sigma_rad))
+    return observed, SOLVERS["esoq2"](
+        rays[observed], index.vectors[star], np.full(len(observed), sigma_rad)
+    )
 
 
 class Field(NamedTuple):
@@ -154,4 +170,12 @@ def plot_curve(axes: Any, x: Any, summaries: list[Summary], curve: int, label: s
     """Plot a curve of ours with its intervals; INK[1] is reserved for published data."""
     value, low, high, *_ = np.array(summaries).T
     color = [one for one in INK if one != PUBLISHED][curve]
-    axes.errorbar(x, value, [value - low, high - value], marker=MARKS[curve], color=color, capsize=2, label=label)
+    axes.errorbar(
+        x,
+        value,
+        [value - low, high - value],
+        marker=MARKS[curve],
+        color=color,
+        capsize=2,
+        label=label,
+    )

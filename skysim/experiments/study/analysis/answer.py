@@ -12,7 +12,13 @@ import numpy as np
 
 from skysim.experiments.study.analysis import claims, thresholds
 from skysim.experiments.study.analysis.axes import axis, distinct, unit_of
-from skysim.experiments.study.analysis.table import Place, PointRow, format_level, format_summary, has_few_values
+from skysim.experiments.study.analysis.table import (
+    Place,
+    PointRow,
+    format_level,
+    format_summary,
+    has_few_values,
+)
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
 from skysim.results import metrics
@@ -24,11 +30,18 @@ EVENTS = {
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
 SHARES = (*EVENTS, "ambiguous", "misled", "refused")
-RESPONSES = (*SHARES, "mismatched", "nees")  # responses that the answers need besides those of the study
+RESPONSES = (
+    *SHARES,
+    "mismatched",
+    "nees",
+)  # responses that the answers need besides those of the study
 
 
 def headline(
-    study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool, worst: str = "skysim study worst STUDY"
+    study: Study,
+    lines: Sequence[PointRow],
+    may_be_ambiguous: bool,
+    worst: str = "skysim study worst STUDY",
 ) -> list[str]:
     """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
 
@@ -39,7 +52,8 @@ def headline(
     done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
     if not done:
         return []
-    place, found = placer(study, done), list[str]()
+    place = placer(study, done)
+    found = list[str]()
     for threshold in study.thresholds:
         found += thresholds.sentences(threshold, study, done)
     found.append(solved_everywhere(study, done, place, worst))
@@ -55,12 +69,18 @@ def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     """Smallest and largest value of each response over the points, but of those that the headline is about."""
     done = [line for line in lines if line.trials]
     place = placer(study, done)
-    return [response_range(name, done, place) for name in study.responses if name not in SHARES] if done else []
+    return (
+        [response_range(name, done, place) for name in study.responses if name not in SHARES]
+        if done
+        else []
+    )
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
-    varied = [name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1]
+    varied = [
+        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+    ]
     units = {name: unit_of(axis(study, lines, name)) for name in varied}
 
     def named(name: str, level: Value) -> str:
@@ -84,14 +104,20 @@ def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
 
 def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
-    known = [(share, line) for share, line in zip(shares, lines, strict=True) if np.isfinite(share.value)]
+    known = [
+        (share, line) for share, line in zip(shares, lines, strict=True) if np.isfinite(share.value)
+    ]
     if not known:
         return f"{text}: unknown, as the tracker does not name its lights."
     never = [share for share, _ in known if share.value == 0]
     if len(never) == len(known):
         return f"{text}: {none_of(never)}."
     most, line = max(known, key=lambda pair: pair[0].value)
-    where = f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:" if len(known) > 1 else ""
+    where = (
+        f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        if len(known) > 1
+        else ""
+    )
     found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 
@@ -100,7 +126,8 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
-        refused, wrong = line.responses["ambiguous"], line.responses["misled"]
+        refused = line.responses["ambiguous"]
+        wrong = line.responses["misled"]
         either = refused.value + np.nan_to_num(wrong.value)
         share = metrics.proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
@@ -124,7 +151,9 @@ def one_unit(fixed: Sequence[str]) -> list[str]:
     """That the intervals are of one unit of hardware, and how to cover others; nothing without a seed drawn once."""
     if not fixed:
         return []
-    units = " and ".join("one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed)
+    units = " and ".join(
+        "one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed
+    )
     return [
         f"Intervals cover other attitudes, with {units}: `hardware: [{', '.join(fixed)}]` in the study draws"
         " the hardware anew in every replicate, and they cover it too."

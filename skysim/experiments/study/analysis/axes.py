@@ -18,7 +18,14 @@ from skysim.results import metrics
 SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
 GROUPS = 4  # number of groups into which a sampled factor `by` is divided
 LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
-UNITS = {"_deg_s": "deg/s", "_arcsec": "arcsec", "_deg": "deg", "_mag": "mag", "_px": "px", "_um": "um"}
+UNITS = {
+    "_deg_s": "deg/s",
+    "_arcsec": "arcsec",
+    "_deg": "deg",
+    "_mag": "mag",
+    "_px": "px",
+    "_um": "um",
+}
 UNITS |= {"_mm": "mm", "_ms": "ms", "_hz": "Hz", "_m": "m", "_s": "s"}
 Shown = Figure | Threshold
 
@@ -83,7 +90,8 @@ def is_share(name: str) -> bool:
 
 def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
     """The axis of a factor, with the levels at which there are points."""
-    factor, levels = study.factors[name], distinct(line.levels[name] for line in lines)
+    factor = study.factors[name]
+    levels = distinct(line.levels[name] for line in lines)
     key = "" if isinstance(factor, Levels) else factor.key or ""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
     numbers, own_unit = as_numbers(levels)
@@ -98,7 +106,9 @@ def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
             log = suits_log_scale(np.sort(numbers))
         return Axis(label(name, own_unit or unit), levels, True, log)
     order = [one for one, _ in factor.options()]
-    levels.sort(key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order)))
+    levels.sort(
+        key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order))
+    )
     has_text = any(isinstance(one, str | bool) for one in levels)
     return Axis(label(name, "" if has_text else unit), levels, False, False)
 
@@ -115,7 +125,8 @@ def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
         parts = [split_quantity(one) for one in levels]
     except ValueError:
         return None, ""
-    numbers, units = np.array([number for number, _ in parts]), {unit for _, unit in parts}
+    numbers = np.array([number for number, _ in parts])
+    units = {unit for _, unit in parts}
     if len(units) != 1 or len(np.unique(numbers)) < len(numbers):
         return None, ""
     return numbers, units.pop()
@@ -129,7 +140,9 @@ def suits_log_scale(numbers: Floats) -> bool:
     """
     if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < LOG_FACTOR_RATIO * numbers[0]:
         return False
-    variation = [np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))]
+    variation = [
+        np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))
+    ]
     return bool(variation[0] < variation[1])
 
 
@@ -170,13 +183,19 @@ def check_levels(levels: Mapping[str, Value], study: Study, lines: Sequence[Poin
             raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
 
 
-def points_at(lines: Sequence[PointRow], study: Study, levels: Mapping[str, Value]) -> list[PointRow]:
+def points_at(
+    lines: Sequence[PointRow], study: Study, levels: Mapping[str, Value]
+) -> list[PointRow]:
     """The table lines (points) at these levels. Raises InputError for an unknown factor or level."""
     check_levels(levels, study, lines)
-    return [line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())]
+    return [
+        line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())
+    ]
 
 
-def group_points(lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study) -> dict[str, list[PointRow]]:
+def group_points(
+    lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study
+) -> dict[str, list[PointRow]]:
     """Table lines grouped by the level of factor `name`, in the order of its axis `group_axis`."""
     # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
     if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
@@ -184,7 +203,9 @@ def group_points(lines: Sequence[PointRow], group_axis: Axis, name: str, study: 
         bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
         parts = [ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a]
         spans = [[group_axis.coordinate(part[n].levels[name]) for n in (0, -1)] for part in parts]
-        return {f"{low:.3g} to {high:.3g}": part for (low, high), part in zip(spans, parts, strict=True)}
+        return {
+            f"{low:.3g} to {high:.3g}": part for (low, high), part in zip(spans, parts, strict=True)
+        }
     return {
         group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
         for one in group_axis.levels

@@ -33,11 +33,15 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
         widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
         at = f" at {place(line)}" if len(found) > 1 else ""
         between = f"{widest.low:.3g} to {widest.high:.3g}"
-        return [f"{question} Nothing says otherwise, but NEES is known to {between} only{at}; more trials decide it."]
+        return [
+            f"{question} Nothing says otherwise, but NEES is known to {between} only{at}; more trials decide it."
+        ]
     worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
-    factor, size = math.sqrt(worst.value / 3), "small"
+    factor = math.sqrt(worst.value / 3)
+    size = "small"
     if factor < 1:
-        factor, size = 1 / factor, "large"
+        factor = 1 / factor
+        size = "large"
     at = f" at {place(line)}" if len(found) > 1 else ""
     count = f", at {len(false)} of {len(found)} points" if len(found) > 1 else ""
     wrong = line.responses.get("wrong", metrics.NO_VALUE).value
@@ -58,7 +62,11 @@ def known(nees: Summary) -> Summary:
 
 def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
     """How many matches are wrong, and whether the attitude errs more than claimed because of them; none if none are."""
-    shares = [one for line in lines if (one := line.responses.get("mismatched", metrics.NO_VALUE)).value > 0]
+    shares = [
+        one
+        for line in lines
+        if (one := line.responses.get("mismatched", metrics.NO_VALUE)).value > 0
+    ]
     if not shares:
         return []
     matches = sum(one.trials for one in shares)
@@ -68,8 +76,14 @@ def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str
     if not misled:
         return [f"{text}; the attitude is unaffected: all errors are as claimed."]
     most, line = max(misled, key=lambda pair: pair[0].value)
-    at = f" at {len(misled)} of {len(lines)} points, most at {place(line)}:" if len(lines) > 1 else " in"
-    share = f"{100 * most.value:.3g} % of the frames ({100 * most.low:.3g} to {100 * most.high:.3g} %)"
+    at = (
+        f" at {len(misled)} of {len(lines)} points, most at {place(line)}:"
+        if len(lines) > 1
+        else " in"
+    )
+    share = (
+        f"{100 * most.value:.3g} % of the frames ({100 * most.low:.3g} to {100 * most.high:.3g} %)"
+    )
     return [f"{text}; the attitude errs more than claimed{at} {share}."]
 
 
@@ -90,7 +104,8 @@ def runs_needed(lines: Sequence[PointRow], events: Sequence[str]) -> list[str]:
     fewest = min(never)
     bound = metrics.exact_bounds(0, fewest)[1]
     claim = 10.0 ** (math.ceil(math.log10(bound) - 1e-9) - 1)
-    needed, each = metrics.trials_for_bound(claim), " at each point" if len(lines) > 1 else ""
+    needed = metrics.trials_for_bound(claim)
+    each = " at each point" if len(lines) > 1 else ""
     return [
         f"None in {fewest:,} is less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence; a claim of"
         f" less than {100 * claim:.6g} % needs {needed:,} in all{each} without any."

@@ -27,21 +27,31 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
             for value in values if not isinstance(factor, Levels) else [values[0]]:
                 si(value)
         except InputError as error:
-            allowed = "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
+            allowed = (
+                "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
+            )
             raise InputError(where, error.problem, allowed) from None
     for name, prices in config.levels.items():
         where = f"optimize.cost.levels.{name}"
         factor = require_factor(name, factors, where)
-        named = [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
+        named = (
+            [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
+        )
         if sorted(named) != sorted(prices):
-            allowed = f"a price of each of {', '.join(named)}" if named else "optimize.cost.per, as it is a range"
+            allowed = (
+                f"a price of each of {', '.join(named)}"
+                if named
+                else "optimize.cost.per, as it is a range"
+            )
             raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
 
 
 def check_parts(config: Cost, scene: Scene) -> None:
     """Raise InputError if a scene whose parts are to be priced has no dome."""
     if config.parts and not isinstance(scene.light, DomeConfig):
-        raise InputError("optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome")
+        raise InputError(
+            "optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome"
+        )
 
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
@@ -74,4 +84,8 @@ def cost(plan: Plan, point: Point) -> tuple[float, str]:
 def factors_cost(config: Cost, levels: Mapping[str, Value]) -> float:
     """base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
     linear = sum(price * si(levels[name]) for name, price in config.per.items())
-    return config.base + linear + sum(price[str(levels[name])] for name, price in config.levels.items())
+    return (
+        config.base
+        + linear
+        + sum(price[str(levels[name])] for name, price in config.levels.items())
+    )

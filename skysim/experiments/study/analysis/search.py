@@ -33,7 +33,9 @@ from skysim.results.metrics import Columns, Summary
 
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
 MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
-MISSING_VIOLATION = 1e3  # violation of a candidate without a value; larger than usual relative violations
+MISSING_VIOLATION = (
+    1e3  # violation of a candidate without a value; larger than usual relative violations
+)
 MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 
 
@@ -91,9 +93,14 @@ def check(study: Study) -> None:
             raise InputError(f"optimize.constraints.{n}", "no bound", "at_least, at_most or both")
     for name, factor in study.factors.items():
         if isinstance(factor, Distribution):
-            raise InputError(f"factors.{name}", "a distribution cannot be optimized", "levels, values, from and to")
+            raise InputError(
+                f"factors.{name}",
+                "a distribution cannot be optimized",
+                "levels, values, from and to",
+            )
     check_cost(study.factors, config.cost)
-    trials, budget = config.candidates * study.replicates, study.budget.trials
+    trials = config.candidates * study.replicates
+    budget = study.budget.trials
     if budget is not None and trials > budget:
         raise InputError("budget.trials", budget, f"at least {trials}, the trials of the search")
 
@@ -122,8 +129,12 @@ def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) 
     price, unpriced = cost(plan, point)
     values = {name: figure.value for name, figure in figures.items()} | {COST: price}
     objectives = tuple(values[one.response] for one in config.objectives)
-    violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
-    violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
+    violated = [
+        one.response for one in config.constraints if violation(one, values[one.response]) > 0
+    ]
+    violated += [
+        f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])
+    ]
     refused = scene_error(columns)
     why = refused or unpriced or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
@@ -133,8 +144,16 @@ def violation(limit: Constraint, value: float) -> float:
     """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
     if math.isnan(value):
         return MISSING_VIOLATION
-    over = [] if limit.at_most is None else [(value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE)]
-    under = [] if limit.at_least is None else [(limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE)]
+    over = (
+        []
+        if limit.at_most is None
+        else [(value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE)]
+    )
+    under = (
+        []
+        if limit.at_least is None
+        else [(limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE)]
+    )
     return max(over + under)
 
 
@@ -152,7 +171,9 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
-    dominated = [np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values]
+    dominated = [
+        np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values
+    ]
     best = [n for n in range(len(feasible)) if not dominated[n]]
     return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
 
@@ -166,7 +187,10 @@ def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[lis
         [
             str(one.number),
             *map(format_level, one.levels.values()),
-            *(f"{one.cost:.4g}" if name == COST else format_summary(one.figures[name]) for name in shown),
+            *(
+                f"{one.cost:.4g}" if name == COST else format_summary(one.figures[name])
+                for name in shown
+            ),
         ]
         for one in result.front
     ]
@@ -181,14 +205,17 @@ def front_columns(result: SearchResult) -> dict[str, Any]:
 
 def collect_result(plan: Plan, store: Store) -> SearchResult:
     """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
-    study, replicates = plan.study, plan.study.replicates
+    study = plan.study
+    replicates = plan.study.replicates
     assert study.optimize is not None
     evaluated = [
         evaluate_candidate(plan, n, point, columns)
         for n, point in enumerate(store.points())
         if len((columns := store.point_columns(n))["trial"]) == replicates
     ]
-    return SearchResult(evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates)
+    return SearchResult(
+        evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates
+    )
 
 
 # The search.
@@ -199,9 +226,11 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
 
     Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
     """
-    study, config = plan.study, plan.study.optimize
+    study = plan.study
+    config = plan.study.optimize
     assert config is not None
-    sampler, stored = create_sampler(study), store.points()
+    sampler = create_sampler(study)
+    stored = store.points()
     total = Progress(config.candidates * study.replicates, **store.counts())
     evaluated: dict[str, Candidate] = {}
     for n in range(config.candidates):
@@ -233,20 +262,29 @@ def create_sampler(study: Study) -> Any:
     try:
         import optuna
     except ImportError:
-        raise InputError("optimize", "optuna is not installed", "after pip install 'skysim[optuna]'") from None
+        raise InputError(
+            "optimize", "optuna is not installed", "after pip install 'skysim[optuna]'"
+        ) from None
     assert study.optimize is not None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])
     sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=STARTUP_CANDIDATES)
-    directions = ["minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives]
+    directions = [
+        "minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives
+    ]
     optuna_study = optuna.create_study(sampler=sampler, directions=directions)
     factors = study.factors.items()
-    middle = {name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2 for name, factor in factors}
+    middle = {
+        name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2
+        for name, factor in factors
+    }
     optuna_study.enqueue_trial(middle)
     return optuna_study
 
 
-def propose(sampler: Any, study: Study, evaluated: dict[str, Candidate]) -> tuple[Any, Point | None]:
+def propose(
+    sampler: Any, study: Study, evaluated: dict[str, Candidate]
+) -> tuple[Any, Point | None]:
     """The sampler's next proposal that was not evaluated yet: optuna trial and point; (None, None) if there is none.
 
     A repeated proposal gets the known result, so that the sampler moves on.
@@ -254,7 +292,8 @@ def propose(sampler: Any, study: Study, evaluated: dict[str, Candidate]) -> tupl
     assert study.optimize is not None
     for _ in range(MAX_REPEATS):
         # A number in [0, 1] for a range, an index for levels or values.
-        proposal, chosen = sampler.ask(), {}
+        proposal = sampler.ask()
+        chosen = {}
         for name, factor in study.factors.items():
             if isinstance(factor, Range):
                 chosen[name] = factor.value_at(proposal.suggest_float(name, 0.0, 1.0))
@@ -278,7 +317,9 @@ def report_to_sampler(sampler: Any, proposal: Any, config: Search, candidate: Ca
 
     A candidate without values gets infinitely bad objectives and an extra violated constraint.
     """
-    values = {name: figure.value for name, figure in candidate.figures.items()} | {COST: candidate.cost}
+    values = {name: figure.value for name, figure in candidate.figures.items()} | {
+        COST: candidate.cost
+    }
     for n, limit in enumerate(config.constraints):
         proposal.set_constraint(str(n), violation(limit, values[limit.response]))
     valid = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
@@ -297,7 +338,8 @@ def run_candidate(
     refused : number of failed trials of invalid scenes, which the budget does not count
     """
     # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
-    before, budget = replace(total), plan.study.budget
+    before = replace(total)
+    budget = plan.study.budget
     left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
     if left_s is not None and left_s <= 0:
         return False
@@ -306,8 +348,10 @@ def run_candidate(
     limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
 
     def watch_candidate(progress: Progress) -> None:
-        total.now, total.done = before.now + progress.now, before.done + progress.now
-        total.failed, total.wrong = progress.failed, before.wrong + progress.wrong
+        total.done = before.done + progress.now
+        total.now = before.now + progress.now
+        total.failed = progress.failed
+        total.wrong = before.wrong + progress.wrong
         if watch:
             watch(total)
         if progress.failed > refused and scene_error(store.point_columns(number)):
@@ -325,9 +369,13 @@ def run_candidate(
 
 def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
-    columns, replicates = store.point_columns(number), plan.study.replicates
+    columns = store.point_columns(number)
+    replicates = plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
     failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
     return [
-        failed._replace(trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)) for k in missing
+        failed._replace(
+            trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)
+        )
+        for k in missing
     ]

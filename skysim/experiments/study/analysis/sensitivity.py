@@ -52,33 +52,41 @@ def indices(plan: Plan, store: Store) -> list[Index]:
 def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     """Indices of every factor for one error; NaN if no replicate is complete."""
     a, b, ab = sample_outputs(plan, store, AXES[response])
-    names, count = list(plan.study.factors), a.shape[1]
+    names = list(plan.study.factors)
+    count = a.shape[1]
     if not len(a):
         return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
     estimate = generalized(a, b, ab)
     rng = random_stream(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     selections = rng.integers(count, size=(RESAMPLES, count))
-    resampled = np.array([generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections])
+    resampled = np.array(
+        [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
+    )
     low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     first, total = (
         [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*index, strict=True)]
         for index in zip(estimate, low, high, strict=True)
     )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
-    sigma_arcsec = float(np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])))
+    sigma_arcsec = float(
+        np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response]))
+    )
     rms_arcsec = [sigma_arcsec * float(np.sqrt(max(one.value, 0.0))) for one in first]
     columns = zip(names, first, total, rms_arcsec, strict=True)
     return [Index(name, response, one, other, rms) for name, one, other, rms in columns]
 
 
-def sample_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
+def sample_outputs(
+    plan: Plan, store: Store, axes: tuple[str, ...]
+) -> tuple[Floats, Floats, Floats]:
     """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
 
     There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
     trials has no solution or is not done yet.
     """
-    width, each = len(plan.study.factors), plan.study.replicates
+    width = len(plan.study.factors)
+    each = plan.study.replicates
     columns = store.columns()
     # Trial number = point * replicates + replicate, and points are in the order A, B, AB_1 .. AB_D.
     values = np.full((len(axes), plan.trials), np.nan)

@@ -35,7 +35,8 @@ Place = Callable[[PointRow], str]  # names a point in words
 
 def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
     """One row for every point of a store; responses of points without trials are NaN."""
-    functions, rows = {name: metrics.response(name) for name in responses}, []
+    functions = {name: metrics.response(name) for name in responses}
+    rows = []
     for number, point in enumerate(store.points()):
         columns = store.point_columns(number)
         responses_ = {name: response(columns) for name, response in functions.items()}
@@ -54,7 +55,9 @@ def has_few_values(row: PointRow, response: str) -> bool:
 
 def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
     """The rows with only these responses."""
-    return [one._replace(responses={name: one.responses[name] for name in responses}) for one in rows]
+    return [
+        one._replace(responses={name: one.responses[name] for name in responses}) for one in rows
+    ]
 
 
 def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
@@ -76,7 +79,9 @@ def format_level(value: Any) -> str:
     """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    if isinstance(value, str) and (match := LONG_QUANTITY.match(value)):  # a sampled quantity with a unit
+    if isinstance(value, str) and (
+        match := LONG_QUANTITY.match(value)
+    ):  # a sampled quantity with a unit
         return f"{float(match[1]):.4g}{match[2]}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
@@ -119,13 +124,20 @@ def trial_columns(store: Store) -> Rows:
 def level_columns(store: Store) -> dict[str, NDArray[Any]]:
     """(P,) levels of each factor by point: numbers, or texts."""
     points = store.points()
-    return {name: to_array([one.levels[name] for one in points]) for name in (points[0].levels if points else ())}
+    return {
+        name: to_array([one.levels[name] for one in points])
+        for name in (points[0].levels if points else ())
+    }
 
 
 def to_array(levels: Sequence[Any]) -> NDArray[Any]:
     """Levels of a factor as an array; those that numpy has no type for as texts."""
     array = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
-    return array if array.dtype != object else np.array([one if one is None else str(one) for one in levels], object)
+    return (
+        array
+        if array.dtype != object
+        else np.array([one if one is None else str(one) for one in levels], object)
+    )
 
 
 def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:

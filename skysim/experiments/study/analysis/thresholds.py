@@ -64,28 +64,42 @@ def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = 
     """
     fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
     rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
-    deviance = 2 * (log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising]))
+    deviance = 2 * (
+        log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising])
+    )
     if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
         return Crossing(math.nan, -math.inf, math.inf, rising)
     # In the order in which the proportion falls, `above` and `below` are certain levels.
     order = slice(None, None, -1) if rising else slice(None)
     sign = -1.0 if rising else 1.0
-    places, fit = (np.log(x) if log else x)[order], fits[rising][order]
-    value, between = sign * math.inf, None
+    places = (np.log(x) if log else x)[order]
+    fit = fits[rising][order]
+    value = sign * math.inf
+    between = None
     below = np.flatnonzero(fit < limit)
     if len(below):
         n = int(below[0])
         share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n]) if n else 0.0
-        value = float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
+        value = (
+            float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
+        )
         value = math.exp(value) if log and n else value
         if n and too_few(trials, limit):
             first, second = sorted(x[order][n - 1 : n + 1].tolist())
             between = first, second
     above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
-    ends = (-sign * math.inf if above is None else above, sign * math.inf if beneath is None else beneath)
+    ends = (
+        -sign * math.inf if above is None else above,
+        sign * math.inf if beneath is None else beneath,
+    )
     open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
-    needs = [(float(x[order][end]), trials_needed(float(fit[end]), limit, above=end == 0)) for end in open_ends]
-    return Crossing(value, min(ends), max(ends), rising, between, tuple((at, n) for at, n in needs if n))
+    needs = [
+        (float(x[order][end]), trials_needed(float(fit[end]), limit, above=end == 0))
+        for end in open_ends
+    ]
+    return Crossing(
+        value, min(ends), max(ends), rising, between, tuple((at, n) for at, n in needs if n)
+    )
 
 
 def too_few(trials: Floats, limit: float) -> bool:
@@ -110,20 +124,31 @@ def trials_needed(share: float, limit: float, above: bool) -> int:
 
 def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
     """(L,) isotonic fit of proportions, by pooling adjacent violators."""
-    return np.asarray(scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x)
+    return np.asarray(
+        scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x
+    )
 
 
 def log_likelihood(hits: Floats, trials: Floats, proportion: Floats) -> float:
     """Binomial log-likelihood of proportions, without the term that does not depend on them."""
-    return float(np.sum(scipy.special.xlogy(hits, proportion) + scipy.special.xlogy(trials - hits, 1 - proportion)))
+    return float(
+        np.sum(
+            scipy.special.xlogy(hits, proportion)
+            + scipy.special.xlogy(trials - hits, 1 - proportion)
+        )
+    )
 
 
-def certain_levels(x: Floats, hits: Floats, trials: Floats, limit: float) -> tuple[float | None, float | None]:
+def certain_levels(
+    x: Floats, hits: Floats, trials: Floats, limit: float
+) -> tuple[float | None, float | None]:
     """The last level that is certainly above the limit and the first that is certainly below it, by fixed sequences.
 
     x : (L,) levels in the order in which the proportion falls
     """
-    counts = list(zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True))
+    counts = list(
+        zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True)
+    )
     above = beneath = None
     for place, count, total in counts:
         if metrics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
@@ -143,36 +168,54 @@ def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRo
     """Raise InputError for a threshold of no proportion, or along a factor without numeric levels."""
     name = threshold.response
     if not metrics.is_proportion(name):
-        raise InputError(f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ...")
+        raise InputError(
+            f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ..."
+        )
     if axes.is_sampled(study):
-        raise InputError(where, "points are sampled, without levels", "design factorial or one_at_a_time")
+        raise InputError(
+            where, "points are sampled, without levels", "design factorial or one_at_a_time"
+        )
     axis = axes.axis(study, rows, threshold.along)
     if not axis.numeric or len(axis.levels) < 2:
-        raise InputError(f"{where}.along", f"{threshold.along} has no two numeric levels", "a factor with numbers")
+        raise InputError(
+            f"{where}.along",
+            f"{threshold.along} has no two numeric levels",
+            "a factor with numbers",
+        )
 
 
 def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:
     """The study's thresholds of a curve's response, along its x, at its levels."""
-    levels, shown = axes.fixed_levels(curve, study, lines), (curve.y, curve.x, curve.by)
+    levels = axes.fixed_levels(curve, study, lines)
+    shown = (curve.y, curve.x, curve.by)
     return [
         one
         for one in study.thresholds
-        if (one.response, one.along, one.by) == shown and axes.fixed_levels(one, study, lines) == levels
+        if (one.response, one.along, one.by) == shown
+        and axes.fixed_levels(one, study, lines) == levels
     ]
 
 
-def crossings(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> dict[str, Crossing | None]:
+def crossings(
+    threshold: Threshold, study: Study, lines: Sequence[PointRow]
+) -> dict[str, Crossing | None]:
     """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
-    axis, chosen = axes.axis(study, lines, threshold.along), axes.shown_points(lines, threshold, study)
+    axis = axes.axis(study, lines, threshold.along)
+    chosen = axes.shown_points(lines, threshold, study)
     groups = {"": chosen}
     if threshold.by is not None:
-        groups = axes.group_points(chosen, axes.axis(study, lines, threshold.by), threshold.by, study)
+        groups = axes.group_points(
+            chosen, axes.axis(study, lines, threshold.by), threshold.by, study
+        )
     return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
 
 
 def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) -> Crossing | None:
     """The crossing along one series of points; None without trials at two levels."""
-    summaries = [(axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response]) for line in lines]
+    summaries = [
+        (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
+        for line in lines
+    ]
     rows = [(x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials]
     if len(rows) < 2:
         return None
@@ -192,7 +235,9 @@ def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> 
 
 def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     """A crossing in words, such as "identified falls below 95 % at rate = 6.2 deg/s (95 %: 4 to 8)"."""
-    response, limit, name = threshold.response, f"{100 * threshold.limit:g} %", threshold.along
+    response = threshold.response
+    limit = f"{100 * threshold.limit:g} %"
+    name = threshold.along
     if found is None:
         return f"{response} has no trials at two levels of {name} yet."
     unit = axes.unit_of(axis)
@@ -213,7 +258,9 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
 
 def interval_text(found: Crossing, name: str, unit: str) -> str:
     """The interval of a crossing in words, and how many trials it takes in all where an end is open."""
-    counts = " and ".join(f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs)
+    counts = " and ".join(
+        f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs
+    )
     needs = f"; needs {counts}" if counts else ""
     low, high = (f"{end:.4g}" for end in (found.low, found.high))
     if math.isinf(found.low) and math.isinf(found.high):

@@ -69,7 +69,9 @@ class WorstTrial(NamedTuple):
         """The setting that starts a scene at the attitude; empty under the stars, where the direction does."""
         if math.isnan(self.yaw_deg):
             return ""
-        angles = ", ".join(f"{name}: {getattr(self, name):.3f}" for name in ("roll_deg", "pitch_deg", "yaw_deg"))
+        angles = ", ".join(
+            f"{name}: {getattr(self, name):.3f}" for name in ("roll_deg", "pitch_deg", "yaw_deg")
+        )
         return f"motion.start: {{{angles}}}"
 
     @property
@@ -90,7 +92,8 @@ def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[Wo
     if not columns:
         return []
     keys, counted = ranking(columns, response)
-    axis, chosen = np.empty((0, 3)), list[WorstTrial]()
+    axis = np.empty((0, 3))
+    chosen = list[WorstTrial]()
     for rows in worst_first(keys, np.flatnonzero(counted)):
         directions = unit_directions(subset(columns, rows))
         left = np.all(directions @ axis.T <= NEAR, axis=1)
@@ -113,7 +116,8 @@ def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDA
         below = rows[first < limit]
         yield below[np.lexsort([key[below] for key in reversed(keys)])]
         yield from worst_first(keys[1:], rows[first == limit])
-        rows, most = rows[first > limit], 10 * most
+        rows = rows[first > limit]
+        most = 10 * most
     if len(rows):
         yield rows
 
@@ -135,21 +139,31 @@ def body_angles_deg(columns: Columns, row: int) -> list[float]:
     wxyz = [float(columns[f"lab_from_body_{part}"][row]) for part in "wxyz"]
     if not (np.isfinite(columns["body_tilt_deg"][row]) and np.isfinite(wxyz).all()):
         return []
-    return [float(angle) for angle in Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True)]
+    return [
+        float(angle)
+        for angle in Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True)
+    ]
 
 
 def unit_directions(columns: Columns) -> Floats:
     """(N, 3) direction of each trial's attitude: the body's z axis in the lab, or the boresight on the sky."""
     in_dome = np.isfinite(columns["body_tilt_deg"])
-    zenith = np.radians(np.where(in_dome, columns["body_tilt_deg"], 90 - columns["boresight_dec_deg"]))
-    azimuth = np.radians(np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"]))
-    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
+    zenith = np.radians(
+        np.where(in_dome, columns["body_tilt_deg"], 90 - columns["boresight_dec_deg"])
+    )
+    azimuth = np.radians(
+        np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"])
+    )
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
+    )
 
 
 def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.bool_]]:
     """Sort keys, (N,) each, the first the most important and smaller the worse; and (N,) whether a trial qualifies."""
     angle = metrics.QUANTITIES["angle_arcsec"](columns)
-    unsolved_first, fewest_first = np.where(np.isnan(angle), -np.inf, -angle), np.nan_to_num(columns["stars"], nan=0.0)
+    unsolved_first = np.where(np.isnan(angle), -np.inf, -angle)
+    fewest_first = np.nan_to_num(columns["stars"], nan=0.0)
     quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
     if metrics.COVERAGE.match(response):
         return [fewest_first], columns["frames"] > 0
@@ -157,7 +171,9 @@ def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.b
         values = metrics.QUANTITIES[quantity](columns)
         key = values if quantity in metrics.MORE_IS_BETTER else -values
         return [key, fewest_first], np.isfinite(values)
-    flagged = np.nan_to_num(np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float))
+    flagged = np.nan_to_num(
+        np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float)
+    )
     return [-flagged, unsolved_first, fewest_first], flagged > 0
 
 

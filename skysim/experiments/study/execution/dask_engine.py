@@ -19,7 +19,15 @@ from uuid import uuid4
 import cv2
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.execution.engines import AHEAD, DIED, Chunk, Chunks, Job, run_timed, split_chunk
+from skysim.experiments.study.execution.engines import (
+    AHEAD,
+    DIED,
+    Chunk,
+    Chunks,
+    Job,
+    run_timed,
+    split_chunk,
+)
 from skysim.experiments.study.execution.setups import code_version
 from skysim.experiments.study.execution.trials import Segment
 
@@ -27,10 +35,14 @@ try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
     from distributed.comm import CommClosedError, get_address_host_port
 except ImportError:
-    raise InputError("engine", "dask is not installed", "pip install 'skysim[dask]', or another engine") from None
+    raise InputError(
+        "engine", "dask is not installed", "pip install 'skysim[dask]', or another engine"
+    ) from None
 
 WAIT_S = 10.0  # timeout for a reply
-POLL_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
+POLL_S = (
+    5.0  # interval between queries of the cluster's thread count, because workers join and leave
+)
 Submission = tuple[Chunk, bool]  # a submitted chunk, and whether it is the only one in flight
 ADDRESS = "a scheduler's address, such as tcp://10.0.0.1:8786"
 
@@ -47,7 +59,9 @@ def connect(scheduler: str) -> Client:
     try:
         client = Client(scheduler, timeout=WAIT_S, set_as_default=False, name="skysim")
     except (OSError, ImportError, RuntimeError):
-        raise InputError("scheduler", f"no reply from {scheduler} within {WAIT_S:.0f} s", ADDRESS) from None
+        raise InputError(
+            "scheduler", f"no reply from {scheduler} within {WAIT_S:.0f} s", ADDRESS
+        ) from None
     try:
         check_workers(client, scheduler)
     except BaseException:
@@ -68,14 +82,24 @@ def check_workers(client: Client, scheduler: str) -> None:
         versions = client.run(code_version, on_error="return")
     except OSError:
         raise silent from None
-    replies = {worker: code for worker, code in versions.items() if not isinstance(code, CommClosedError)}
+    replies = {
+        worker: code for worker, code in versions.items() if not isinstance(code, CommClosedError)
+    }
     if not replies:
         raise silent
     for worker, code in replies.items():
         if isinstance(code, Exception):
-            raise InputError("scheduler", f"worker {worker} cannot run trials: {code}", "a worker with this skysim")
+            raise InputError(
+                "scheduler",
+                f"worker {worker} cannot run trials: {code}",
+                "a worker with this skysim",
+            )
         if code != code_version():
-            raise InputError("scheduler", f"worker {worker} has skysim {code}", f"{code_version()}, the version here")
+            raise InputError(
+                "scheduler",
+                f"worker {worker} has skysim {code}",
+                f"{code_version()}, the version here",
+            )
 
 
 def thread_count(client: Client) -> int:
@@ -94,14 +118,22 @@ def collect_rows(
     """
     retries: deque[Chunk] = deque()
     completed = as_completed(loop=client.loop, with_results=True, raise_errors=False)
-    capacity, polled_s = 0, -POLL_S
+    capacity = 0
+    polled_s = -POLL_S
     while True:
         if time.monotonic() - polled_s >= POLL_S:
-            capacity, polled_s = max(thread_count(client), 1) * (1 + AHEAD), time.monotonic()
+            capacity = max(thread_count(client), 1) * (1 + AHEAD)
+            polled_s = time.monotonic()
         alone = bool(retries)
-        new = take(retries.popleft if alone else chunks.next, (1 if alone else capacity) - len(in_flight))
+        new = take(
+            retries.popleft if alone else chunks.next, (1 if alone else capacity) - len(in_flight)
+        )
         # One message submits all, and results arrive in the background: a round trip for each would be the limit.
-        futures = client.map(run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False) if new else []
+        futures = (
+            client.map(run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False)
+            if new
+            else []
+        )
         in_flight |= {future: (chunk, alone) for future, chunk in zip(futures, new, strict=True)}
         completed.update(futures)
         if not in_flight:
@@ -134,14 +166,20 @@ def take(source: Callable[[], Chunk], count: int) -> list[Chunk]:
 
 def encode_chunk(chunk: Chunk) -> str:
     """A chunk as JSON text, because Dask searches other arguments for its task keys. Floats round-trip exactly."""
-    rows = [(one.point, one.settings, one.first, one.replicates.start, one.replicates.stop) for one in chunk]
+    rows = [
+        (one.point, one.settings, one.first, one.replicates.start, one.replicates.stop)
+        for one in chunk
+    ]
     return json.dumps(rows, default=str)  # YAML dates become text, which scenes accept
 
 
 def decode_chunk(text: str) -> Chunk:
     """The chunk in a text made by `encode_chunk`."""
     rows = json.loads(text)
-    return tuple(Segment(point, settings, first, range(*replicates)) for point, settings, first, *replicates in rows)
+    return tuple(
+        Segment(point, settings, first, range(*replicates))
+        for point, settings, first, *replicates in rows
+    )
 
 
 # On the workers.
@@ -153,7 +191,9 @@ class JobPlugin(WorkerPlugin):
     """Worker plugin that gives every worker a run's job, including workers that join later."""
 
     def __init__(self, name: str, job: Job, code: str) -> None:
-        self.name, self.job, self.code = name, job, code
+        self.name = name
+        self.job = job
+        self.code = code
 
     def setup(self, worker: Any) -> None:
         """Store the job on the worker. Raises InputError if its code version differs from the run's."""
@@ -170,7 +210,9 @@ class JobPlugin(WorkerPlugin):
 def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
     """`run_timed` with the run's job on this worker. Raises InputError if `JobPlugin.setup` rejected it."""
     if name not in JOBS:
-        raise InputError("scheduler", f"a new worker has skysim {code_version()}", "the version of the run")
+        raise InputError(
+            "scheduler", f"a new worker has skysim {code_version()}", "the version of the run"
+        )
     return run_timed(JOBS[name], decode_chunk(text))
 
 
@@ -185,14 +227,17 @@ class Dask:
     name = "dask"
 
     def __init__(self, scheduler: str) -> None:
-        self.scheduler, self.client = scheduler, connect(scheduler)
+        self.scheduler = scheduler
+        self.client = connect(scheduler)
         self.workers = thread_count(self.client)
 
     def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
         """See `Engine`; the client is closed at the end. Raises InputError if the scheduler's connection is lost."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)
-        client, name, in_flight = self.client, f"skysim-{uuid4().hex}", dict[Future, Submission]()
+        client = self.client
+        name = f"skysim-{uuid4().hex}"
+        in_flight = dict[Future, Submission]()
         try:
             client.register_plugin(JobPlugin(name, job, code_version()), name)
             yield from collect_rows(client, name, job, chunks, in_flight)

@@ -31,7 +31,9 @@ from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
-FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
+FLUX_NOISE = (
+    0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
+)
 
 
 class View(NamedTuple):
@@ -53,7 +55,8 @@ def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
 
 def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
     """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
-    R_cam_from_body, camera_body_m = lab.camera.mount.cam_from_body.as_matrix(), lab.camera.mount.camera_body_m
+    R_cam_from_body = lab.camera.mount.cam_from_body.as_matrix()
+    camera_body_m = lab.camera.mount.camera_body_m
     R_lab_from_body = lab_from_body.as_matrix()
     poses = Poses(
         np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
@@ -67,12 +70,16 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
     if atmosphere:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
-    rate_e_s = rates_e_s(near, lab.camera.optics, lab.camera.known.emitter, distance_m, cos_out, cos_in)
+    rate_e_s = rates_e_s(
+        near, lab.camera.optics, lab.camera.known.emitter, distance_m, cos_out, cos_in
+    )
     electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
     x, y = xy_px.T
     width_px, height_px = lab.camera.canvas.shape[::-1]
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
-    start = exposure_of(lab.camera, Trajectory.at_rest(lab.start, MARGIN_S), 0, Window(0.0, 0.0), None)
+    start = exposure_of(
+        lab.camera, Trajectory.at_rest(lab.start, MARGIN_S), 0, Window(0.0, 0.0), None
+    )
     views = []
     for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         chosen = begin + np.flatnonzero(visible[begin:end])
@@ -115,23 +122,35 @@ def simulate_detections(
 
 
 def solve_coded(
-    lab: Lab, tracker: CodedTracker, trial: CentroidTrial, lab_from_body: Rotation, rng: np.random.Generator
+    lab: Lab,
+    tracker: CodedTracker,
+    trial: CentroidTrial,
+    lab_from_body: Rotation,
+    rng: np.random.Generator,
 ) -> tuple[Floats, Report]:
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
     lab = lab.in_run(int(rng.integers(2**62)))
     ((rows, xy_px, electrons),) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
     electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
-    per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})  # the error of a brightness is that of the LED
+    per_frame = trial.model_copy(
+        update={"magnitude_sigma": 0.0}
+    )  # the error of a brightness is that of the LED
     tracker.last_s = None  # begins anew
     first = int(rng.integers(tracker.code.bits))
     for frame in range(first, first + tracker.code.bits):
-        light_e = electrons * brightness(lab, rows, frame) * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
+        light_e = (
+            electrons
+            * brightness(lab, rows, frame)
+            * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
+        )
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(rows))
         lit = light_e > 0
         detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], lab.scene, rng)
         window = exposure_window(lab.scene, frame)
         middle_s = window.middle_s(lab.scene.camera.height_px)
-        attitude = tracker.solve_centroids(detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame)
+        attitude = tracker.solve_centroids(
+            detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame
+        )
         if attitude.solved:
             break
     return xy_px, Report(attitude, detections)
@@ -139,8 +158,10 @@ def solve_coded(
 
 def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     """(K,) light of LEDs in the exposure of a frame over their mean light: what code, pulses and filters leave."""
-    window, steady = exposure_window(lab.scene, frame), lab.camera.sources.take(rows)
-    begin_s, end_s = window.open_s, window.open_s + window.exposure_s
+    window = exposure_window(lab.scene, frame)
+    steady = lab.camera.sources.take(rows)
+    begin_s = window.open_s
+    end_s = window.open_s + window.exposure_s
     dome = lab.camera.known
     assert isinstance(dome, LedDome)
     middle_s = (begin_s + end_s) / 2

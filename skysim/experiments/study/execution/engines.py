@@ -62,7 +62,8 @@ class Engine(Protocol):
 class Serial:
     """Runs one trial after another in this process."""
 
-    name, workers = "serial", 1
+    name = "serial"
+    workers = 1
 
     def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
         while chunk := chunks.next():
@@ -121,7 +122,8 @@ class Pool:
         if job != self._job:
             self.close()
         if self._pool is None:
-            self._pool, self._job = start_pool(self.workers, job), job
+            self._pool = start_pool(self.workers, job)
+            self._job = job
         return self._pool
 
     def _kill(self) -> None:
@@ -149,7 +151,9 @@ class Pool:
         while True:
             # A retried trial runs with nothing else in flight, so that a worker's death can be attributed to it.
             capacity = self.workers * (1 + AHEAD) if not retries else 1
-            while len(in_flight) < capacity and (chunk := retries.popleft() if retries else chunks.next()):
+            while len(in_flight) < capacity and (
+                chunk := retries.popleft() if retries else chunks.next()
+            ):
                 try:
                     in_flight[pool.submit(run_chunk, chunk)] = chunk
                 except BrokenProcessPool:  # a worker died while the caller stored rows
@@ -157,7 +161,8 @@ class Pool:
                     raise
             if not in_flight:
                 return
-            finished, rows = wait(in_flight, return_when=FIRST_COMPLETED).done, list[Any]()
+            finished = wait(in_flight, return_when=FIRST_COMPLETED).done
+            rows = list[Any]()
             whole = [future for future in finished if future.exception() is None]
             for future in whole:
                 more, seconds = future.result()
@@ -200,7 +205,9 @@ def start_pool(count: int, job: Job) -> ProcessPoolExecutor:
         for future in [pool.submit(code_version) for _ in range(count)]:
             future.result()
     except BrokenProcessPool:
-        raise InputError("workers", f"{count} processes do not start", "fewer, or engine serial") from None
+        raise InputError(
+            "workers", f"{count} processes do not start", "fewer, or engine serial"
+        ) from None
     return pool
 
 

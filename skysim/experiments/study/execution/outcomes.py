@@ -96,7 +96,12 @@ class Outcome:
 
 
 FIELDS = tuple(field.name for field in fields(Outcome))
-IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")  # unknown of an external tracker
+IDENTITY = (
+    "misidentified",
+    "roll_noise",
+    "misled",
+    "wrong_matches",
+)  # unknown of an external tracker
 FAILED = Outcome("failed")
 DIRECTION = FIELDS[-8:]  # attitude and direction
 
@@ -126,7 +131,8 @@ def score(lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLi
 
     Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
     """
-    solution, centroids_px = report.attitude, report.centroids.xy_px
+    solution = report.attitude
+    centroids_px = report.centroids.xy_px
     lab_from_body = quaternion.from_rotation(lights.lab_from_body)
     cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
@@ -166,14 +172,20 @@ def error_and_nees(solution: Attitude, cam_from_lab: Floats) -> tuple[Floats, fl
     estimate = quaternion.from_rotation(solution.cam_from_ref)
     error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab)))
     covariance = solution.covariance_rad2
-    return error, math.nan if covariance is None else float(error @ np.linalg.solve(covariance, error))
+    return error, math.nan if covariance is None else float(
+        error @ np.linalg.solve(covariance, error)
+    )
 
 
 # Identity of the lights.
 
 
 def claimed_image_px(
-    lab: Lab, estimator: factory.Estimator, match: StarMatch, lab_from_body: Floats, cam_from_lab: Floats
+    lab: Lab,
+    estimator: factory.Estimator,
+    match: StarMatch,
+    lab_from_body: Floats,
+    cam_from_lab: Floats,
 ) -> Floats:
     """(K, 2) true images at mid-exposure of the stars or LEDs with which the tracker matched its lights.
 
@@ -182,7 +194,9 @@ def claimed_image_px(
     """
     if isinstance(estimator, DomeTracker):
         order = np.argsort(lab.camera.sources.id)
-        rows = order[np.searchsorted(lab.camera.sources.id, estimator.leds.id[match.star], sorter=order)]
+        rows = order[
+            np.searchsorted(lab.camera.sources.id, estimator.leds.id[match.star], sorter=order)
+        ]
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
         offset_lab = lab.camera.sources.place[rows, :3] - camera_m
     else:
@@ -191,7 +205,9 @@ def claimed_image_px(
     return lab.camera.optics.project(offset_lab @ quaternion.to_matrix(cam_from_lab).T)
 
 
-def count_wrong_matches(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> int:
+def count_wrong_matches(
+    observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float
+) -> int:
     """How many of K lights are matched with a star or LED whose true image is farther than reach_px from them.
 
     observed_px : (K, 2) centroids;  claimed_px : (K, 2) true images at mid-exposure of the matched stars or LEDs
@@ -202,7 +218,9 @@ def count_wrong_matches(observed_px: Floats, claimed_px: Floats, lights: TrueLig
         return len(observed_px)
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
-    return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))  # NaN is wrong
+    return int(
+        np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px))
+    )  # NaN is wrong
 
 
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
@@ -217,13 +235,15 @@ def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) ->
 @jit
 def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
     """(K,) row of the light nearest to each position, and its distance."""
-    nearest, distance_px = np.zeros(len(xy_px), np.int64), np.full(len(xy_px), math.inf)
+    nearest = np.zeros(len(xy_px), np.int64)
+    distance_px = np.full(len(xy_px), math.inf)
     for k in range(len(xy_px)):
         least_px2 = math.inf
         for n in range(len(lights_px)):
             away_px2 = (xy_px[k, 0] - lights_px[n, 0]) ** 2 + (xy_px[k, 1] - lights_px[n, 1]) ** 2
             if away_px2 < least_px2:  # never for a position behind the camera, which is NaN
-                nearest[k], least_px2 = n, away_px2
+                nearest[k] = n
+                least_px2 = away_px2
         distance_px[k] = math.sqrt(least_px2)
     return nearest, distance_px
 
@@ -258,7 +278,10 @@ def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: flo
 def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -> Outcome:
     """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
     solved = [outcome for outcome in outcomes if outcome.solved]
-    x, y, roll = (rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
+    x, y, roll = (
+        rms([getattr(one, name) for one in solved])
+        for name in ("x_arcsec", "y_arcsec", "roll_arcsec")
+    )
     good = [bool(one.solved and not one.wrong) for one in outcomes]
     error = angles_arcsec(log.lab_from_filter, log, settle_s)
     pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
@@ -284,7 +307,10 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         rms(pointing),
         float(pointing.max()) if len(pointing) else math.nan,
         sum(one.ambiguous for one in outcomes),
-        **{name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan for name in IDENTITY},
+        **{
+            name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan
+            for name in IDENTITY
+        },
         centroid_px=rms(finite([one.centroid_px for one in outcomes])),
         streak_px=mean(finite([one.streak_px for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
@@ -297,7 +323,11 @@ def worst_frame(outcomes: list[Outcome]) -> Outcome:
 
     def badness(one: Outcome) -> tuple[bool, bool, float]:
         error = math.hypot(one.x_arcsec, one.y_arcsec, one.roll_arcsec)
-        return bool(one.wrong or one.misidentified == 1), not one.solved, 0.0 if math.isnan(error) else error
+        return (
+            bool(one.wrong or one.misidentified == 1),
+            not one.solved,
+            0.0 if math.isnan(error) else error,
+        )
 
     return max(outcomes, key=badness, default=FAILED)
 

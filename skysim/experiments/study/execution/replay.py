@@ -37,7 +37,8 @@ class Replay(NamedTuple):
 
 def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     """The segment with this trial alone. Raises InputError if the study has no such trial."""
-    points, each = store.points(), plan.study.replicates
+    points = store.points()
+    each = plan.study.replicates
     if not 0 <= trial < len(points) * each:
         raise InputError(f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}")
     point, replicate = divmod(trial, each)
@@ -56,7 +57,8 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
-    files, pictures = [], []
+    files = []
+    pictures = []
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         frames.remove_results(file_io.make_folder(folder))
@@ -65,7 +67,8 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
                 frames.write_frame(folder, frame, truth, setup.lab.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
-                match, xy_px = report.attitude.match, report.centroids.xy_px
+                match = report.attitude.match
+                xy_px = report.centroids.xy_px
                 matched_px = xy_px[match.observed] if match else np.empty((0, 2))
                 truth_px = truth.sources.xy_px[visible(truth.sources)]
                 picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
@@ -84,7 +87,8 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
     trial = setup.trial
     if isinstance(trial, CentroidTrial):
         frame_trial = FrameTrial(
-            kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")}
+            kind="frames",
+            **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
         )
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
         yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1])
@@ -99,7 +103,9 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
             frame,
             truth,
             solve_or_failed(
-                lambda: factory.solve_frame(setup.estimator, frame, streak_px, trials.gyro_rate(setup, truth))
+                lambda: factory.solve_frame(
+                    setup.estimator, frame, streak_px, trials.gyro_rate(setup, truth)
+                )
             ),
         )
 

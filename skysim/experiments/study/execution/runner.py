@@ -71,9 +71,14 @@ class ChunkQueue:
         spec: TrialSpec | None = None,
         seconds: float = CHUNK_S,
     ) -> None:
-        self.points, self.replicates, self.missing, self.first, self.spec = points, replicates, missing, first, spec
+        self.points = points
+        self.replicates = replicates
+        self.missing = missing
+        self.first = first
+        self.spec = spec
         self.seconds = seconds
-        self.position, self.size = 0, 1
+        self.position = 0
+        self.size = 1
 
     def next(self) -> Chunk:
         """The next chunk; empty if nothing is left."""
@@ -81,9 +86,14 @@ class ChunkQueue:
         if self.size >= self.replicates and end < len(self.missing):
             last = self.missing[end - 1] // self.replicates
             end = int(np.searchsorted(self.missing, (last + 1) * self.replicates))
-        chosen, self.position = self.missing[self.position : end], end
+        chosen = self.missing[self.position : end]
+        self.position = end
         # A segment ends where the trial numbers are not consecutive, the next point begins, or the hardware is another.
-        ends = (np.diff(chosen) != 1) | (chosen[1:] % self.replicates == 0) | bool(self.spec and self.spec.hardware)
+        ends = (
+            (np.diff(chosen) != 1)
+            | (chosen[1:] % self.replicates == 0)
+            | bool(self.spec and self.spec.hardware)
+        )
         breaks = np.flatnonzero(ends) + 1
         return tuple(self._segment(trials) for trials in np.split(chosen, breaks) if len(trials))
 
@@ -106,7 +116,9 @@ def chunk_seconds(workers: int) -> float:
     return CHUNK_S * max(1.0, workers / MANY)
 
 
-def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
+def prepare_store(
+    plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None
+) -> None:
     """Initialize a store for a plan, or check that it belongs to the plan.
 
     The store may be of the same study with fewer replicates: its trials are kept, and numbered anew.
@@ -116,21 +128,29 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
 
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
-    stored, done = store.meta("digest"), store.counts()["done"]
+    stored = store.meta("digest")
+    done = store.counts()["done"]
     kept = stored_replicates(plan, store) if stored else plan.study.replicates
     if not kept:
-        raise InputError(store.path, "contains another study, or an earlier version of this one", "another store")
+        raise InputError(
+            store.path, "contains another study, or an earlier version of this one", "another store"
+        )
     if resume and not stored:
         raise InputError(store.path, "contains no trials to resume", "to run the study")
     if done and not resume:
-        raise InputError(store.path, f"already contains {done} trials", "to resume the study, or another store")
+        raise InputError(
+            store.path, f"already contains {done} trials", "to resume the study, or another store"
+        )
     if done and store.meta("code") != code_version():
         problem = f"its {done} trials are of skysim {store.meta('code')}"
-        raise InputError(store.path, problem, f"{code_version()}, the version here, or another store")
+        raise InputError(
+            store.path, problem, f"{code_version()}, the version here, or another store"
+        )
     if done:
         check_scene(plan, store)
     if stored != plan.digest or not done:
-        text, file = plan.path.read_text(encoding="utf-8"), str(plan.path.resolve())
+        text = plan.path.read_text(encoding="utf-8")
+        file = str(plan.path.resolve())
         store.begin(
             plan.points,
             grown=(kept, plan.study.replicates) if done else None,
@@ -152,7 +172,9 @@ def stored_replicates(plan: Plan, store: Store) -> int:
         return 0
     with store.corruption_as_input_error():
         fewer = int(store.meta("replicates") or 0)
-    same = replace(plan, study=plan.study.model_copy(update={"replicates": fewer})).digest == store.meta("digest")
+    same = replace(
+        plan, study=plan.study.model_copy(update={"replicates": fewer})
+    ).digest == store.meta("digest")
     return fewer if same and 0 < fewer < plan.study.replicates else 0
 
 
@@ -177,7 +199,12 @@ def run(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) ->
 
 
 def run_points(
-    plan: Plan, store: Store, engine: Engine, points: Sequence[Point], first: int, watch: Watch | None = None
+    plan: Plan,
+    store: Store,
+    engine: Engine,
+    points: Sequence[Point],
+    first: int,
+    watch: Watch | None = None,
 ) -> Progress:
     """Run the missing trials of `points`, numbered from `first`, within the budget of time and failures.
 
@@ -197,14 +224,20 @@ def run_points(
             progress.add(batch)
             if watch:
                 watch(progress)
-            out_of_time = budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
-            if out_of_time or (budget.failures is not None and progress.failed - failed_before >= budget.failures):
+            out_of_time = (
+                budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
+            )
+            if out_of_time or (
+                budget.failures is not None and progress.failed - failed_before >= budget.failures
+            ):
                 break
     finally:
         if hasattr(rows, "close"):
             rows.close()
         if progress.now:
-            store.record_run(engine.name, engine.workers, progress.now, time.perf_counter() - progress.began)
+            store.record_run(
+                engine.name, engine.workers, progress.now, time.perf_counter() - progress.began
+            )
     return progress
 
 

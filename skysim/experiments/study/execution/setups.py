@@ -57,7 +57,8 @@ def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> Setup:
 
     key : its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the key
     """
-    key, cached = key or setup_key(spec, settings), CACHE.setups
+    key = key or setup_key(spec, settings)
+    cached = CACHE.setups
     if key not in cached:
         cached[key] = build_setup(spec, settings)
         while len(cached) > CACHE_SIZE:
@@ -75,7 +76,9 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
             return setup._replace(trial=trial)
     # A lab whose scene differs only in section `tracker` has the same hardware.
     cached = (setup.lab for setup in CACHE.setups.values())
-    same = (one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene)
+    same = (
+        one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene
+    )
     lab = next(same, None) or build_lab(scene, UserParts(spec.programs))
     lab = lab.with_scene(scene)
     return Setup(lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs)
@@ -84,8 +87,15 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
 def scene_hash(scene: Scene) -> str:
     """Hash of a scene, of the files it names, and of the releases of external tracker, controller and lights."""
     tree = scene.model_dump(mode="json", by_alias=True)
-    contents = [sha256(Path(path).read_bytes()).hexdigest() for _, path in file_names(tree) if Path(path).is_file()]
-    releases = [TRACKERS.release(scene.tracker.name), *(PLUGINS.release(light.kind) for light in scene.lights)]
+    contents = [
+        sha256(Path(path).read_bytes()).hexdigest()
+        for _, path in file_names(tree)
+        if Path(path).is_file()
+    ]
+    releases = [
+        TRACKERS.release(scene.tracker.name),
+        *(PLUGINS.release(light.kind) for light in scene.lights),
+    ]
     if scene.motion.control and (release := CONTROLLERS.release(scene.motion.control.law)):
         releases.append(release)
     return digest([tree, contents, *releases])
@@ -95,8 +105,14 @@ def scene_hash(scene: Scene) -> str:
 def code_version() -> str:
     """Hash of the source code of skysim and estimator and of their data; stored with each trial."""
     code = sha256()
-    sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
-    data = [path for folder in ("qe", "led", "bands", "cameras", "ephemeris") for path in (DATA / folder).rglob("*")]
+    sources = [
+        path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")
+    ]
+    data = [
+        path
+        for folder in ("qe", "led", "bands", "cameras", "ephemeris")
+        for path in (DATA / folder).rglob("*")
+    ]
     for path in sorted(sources + [path for path in data if path.is_file()]):
         code.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return code.hexdigest()[:16]
@@ -105,4 +121,6 @@ def code_version() -> str:
 def seed_of(spec: TrialSpec, point: int, replicate: int) -> int:
     """Seed of a trial, 63 bits, derived from the study's seed; with `paired` it is the same at every point."""
     key = (replicate,) if spec.paired else (replicate, point)
-    return int(np.random.SeedSequence(spec.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)
+    return int(
+        np.random.SeedSequence(spec.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1
+    )

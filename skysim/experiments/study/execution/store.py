@@ -44,7 +44,17 @@ BLOCK_TRIALS = 100_000  # numbers of trials of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
-COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")  # of `Store.columns`
+COLUMNS = (
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "scene",
+    "code",
+    *FIELDS,
+    "error",
+    "time_ms",
+)  # of `Store.columns`
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -77,7 +87,9 @@ class Store:
     """An open store of one study. `open_store` opens one for reading, `writing` makes or opens one for writing."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        self.path, self.db, self.parts_folder = path, connection, path.with_suffix(".parts")
+        self.path = path
+        self.db = connection
+        self.parts_folder = path.with_suffix(".parts")
         self._room = 0  # rows that SQLite takes until rows move; 0 before they are counted
         self._parts: dict[int, Part] = {}  # by number
         self._near = NONE_NEAR  # points that were read together with the last one
@@ -91,11 +103,15 @@ class Store:
         """Overrides of study keys from the run's command line: YAML text by key. Raises InputError."""
         with self.corruption_as_input_error():
             overrides = json.loads(self.meta("overrides") or "{}")
-            if not isinstance(overrides, dict) or not all(isinstance(v, str) for v in overrides.values()):
+            if not isinstance(overrides, dict) or not all(
+                isinstance(v, str) for v in overrides.values()
+            ):
                 raise ValueError("overrides are not text values by key")
             return overrides
 
-    def begin(self, points: Iterable[Point], grown: tuple[int, int] | None = None, **values: str) -> None:
+    def begin(
+        self, points: Iterable[Point], grown: tuple[int, int] | None = None, **values: str
+    ) -> None:
         """Set the study's points and metadata in one transaction.
 
         grown : replicates of the stored trials and of the study, if it has more: trials are numbered
@@ -119,13 +135,19 @@ class Store:
     def scenes(self) -> list[tuple[int, int, str]]:
         """Point, replicate and scene hash of the first and the last trial that did not fail."""
         query = (
-            "SELECT point, replicate, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
+            "SELECT point, replicate, scene FROM trials WHERE scene != '' AND error IS NULL "
+            "ORDER BY trial {} LIMIT 1"
         )
         with self.snapshot():
-            found = [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
+            found = [
+                row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))
+            ]
             for part in self.parts():
                 part.trials(self._replicates())  # is as listed
-                columns = [row_parts.read_column(part.path, name)[[0, -1]] for name in ("point", "replicate", "scene")]
+                columns = [
+                    row_parts.read_column(part.path, name)[[0, -1]]
+                    for name in ("point", "replicate", "scene")
+                ]
                 found += zip(*(column.tolist() for column in columns), strict=True)
         found = [self.checked(row, int, int, str) for row in found]
         return [min(found), max(found)] if found else []
@@ -171,11 +193,13 @@ class Store:
         None move without pyarrow, or before the study is known.
         """
         in_parts = sum(part.rows for part in self.parts())
-        count, moved = self.db.execute("SELECT COUNT(*) FROM trials").fetchone()[0], PART_ROWS
+        count = self.db.execute("SELECT COUNT(*) FROM trials").fetchone()[0]
+        moved = PART_ROWS
         able = row_parts.can_write_parts() and bool(self.meta("replicates"))
         while able and in_parts + count > MOST_ROWS and count >= PART_ROWS == moved:
             moved = self._move_part()
-            count, in_parts = count - moved, in_parts + moved
+            count = count - moved
+            in_parts = in_parts + moved
         self._room = MOST_ROWS - in_parts - count
         if self._room < 0:
             self._room = PART_ROWS - count if count < PART_ROWS else PART_ROWS
@@ -196,8 +220,13 @@ class Store:
             row = (number, len(trial), int(columns["wrong"].sum()), *ends)
             self.db.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
             self.db.execute("DELETE FROM trials WHERE trial <= ? AND error IS NULL", last)
-            self.db.execute("DELETE FROM timings WHERE trial <= ? AND trial NOT IN (SELECT trial FROM trials)", last)
-            self.db.execute("UPDATE meta SET value = ? WHERE key = 'format'", (str(FORMAT_OF_PARTS),))
+            self.db.execute(
+                "DELETE FROM timings WHERE trial <= ? AND trial NOT IN (SELECT trial FROM trials)",
+                last,
+            )
+            self.db.execute(
+                "UPDATE meta SET value = ? WHERE key = 'format'", (str(FORMAT_OF_PARTS),)
+            )
         return len(trial)
 
     def part_path(self, number: int) -> Path:
@@ -213,11 +242,16 @@ class Store:
 
     def parts(self) -> list[Part]:
         """All parts, in the order in which they were written."""
-        if self.meta("format") != str(FORMAT_OF_PARTS):  # a store of an earlier skysim has no such table
+        if self.meta("format") != str(
+            FORMAT_OF_PARTS
+        ):  # a store of an earlier skysim has no such table
             return []
         rows = self.db.execute("SELECT part, rows, wrong, first, last FROM parts ORDER BY part")
         known = (self.checked(row, int, int, int, int, int) for row in rows)
-        return [self._parts.setdefault(number, Part(self.part_path(number), *others)) for number, *others in known]
+        return [
+            self._parts.setdefault(number, Part(self.part_path(number), *others))
+            for number, *others in known
+        ]
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
@@ -241,13 +275,17 @@ class Store:
         """Every run that was not killed: engine, workers, trials, seconds."""
         rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
         known = (self.checked(row, str, int, int, float) for row in rows)
-        return [dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in known]
+        return [
+            dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in known
+        ]
 
     def done(self, count: int) -> NDArray[np.bool_]:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         with self.snapshot():
-            rows = self.db.execute("SELECT trial FROM trials WHERE trial >= 0 AND trial < ?", (count,))
+            rows = self.db.execute(
+                "SELECT trial FROM trials WHERE trial >= 0 AND trial < ?", (count,)
+            )
             mask[np.fromiter((trial for (trial,) in rows), np.int64)] = True
             for part in self.parts():
                 numbers = part.trials(self._replicates())
@@ -261,14 +299,20 @@ class Store:
             # SQLite's sum is an integer only if all values are.
             done, failed, wrong = self.checked(self.db.execute(query).fetchone(), int, int, int)
             parts = self.parts()
-        done, wrong = done + sum(part.rows for part in parts), wrong + sum(part.wrong for part in parts)
+        done = done + sum(part.rows for part in parts)
+        wrong = wrong + sum(part.wrong for part in parts)
         return {"done": done, "failed": failed, "wrong": wrong}
 
     def failures(self) -> list[tuple[int, str]]:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""
-        rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
+        rows = self.db.execute(
+            "SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial"
+        )
         with self.corruption_as_input_error():
-            return [(trial, self.checked([error], str)[0].strip().splitlines()[-1]) for trial, error in rows]
+            return [
+                (trial, self.checked([error], str)[0].strip().splitlines()[-1])
+                for trial, error in rows
+            ]
 
     def trial(self, number: int) -> dict[str, Any]:
         """One row by column name. Raises InputError if the trial is not in the store."""
@@ -296,8 +340,11 @@ class Store:
         # To read one point of a part takes as long as to read all of them.
         (point,), (near, rows) = points, self._near
         if point not in near:
-            last = min((part.last for part in parts if part.first <= point <= part.last), default=point)
-            near, rows = range(point, last + 1), self._rows(ranges_of(range(point, last + 1), self._replicates()))
+            last = min(
+                (part.last for part in parts if part.first <= point <= part.last), default=point
+            )
+            near = range(point, last + 1)
+            rows = self._rows(ranges_of(range(point, last + 1), self._replicates()))
             self._near = near, rows
         if len(near) == 1:
             return rows
@@ -322,7 +369,8 @@ class Store:
 
         where : what else holds of those in SQLite
         """
-        sources, numbers = list[Source](), list[NDArray[np.int64]]()
+        sources = list[Source]()
+        numbers = list[NDArray[np.int64]]()
         with self.snapshot():
             for part in self.parts():
                 if (source := part.source(ranges, self._replicates())) is not None:
@@ -348,14 +396,19 @@ class Store:
     def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, NDArray[Any]]:
         """The columns of rows in SQLite, in trial order."""
         query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
-        cursor, texts = self.db.execute(query, values), dict[Any, Any]()
+        cursor = self.db.execute(query, values)
+        texts = dict[Any, Any]()
         batches: list[list[NDArray[Any]]] = [[to_array(name, (), texts)] for name in COLUMNS]
         with self.corruption_as_input_error():
             while rows := cursor.fetchmany(10_000):
-                for name, arrays, column in zip(COLUMNS, batches, zip(*rows, strict=True), strict=True):
+                for name, arrays, column in zip(
+                    COLUMNS, batches, zip(*rows, strict=True), strict=True
+                ):
                     arrays.append(to_array(name, column, texts))
             self.checked([text for text in texts if not isinstance(text, str | None)][:1], str)
-            return {name: np.concatenate(arrays) for name, arrays in zip(COLUMNS, batches, strict=True)}
+            return {
+                name: np.concatenate(arrays) for name, arrays in zip(COLUMNS, batches, strict=True)
+            }
 
     def checked(self, row: Iterable[Any], *types: type) -> tuple[Any, ...]:
         """The values of a row. Raises InputError for a value of another type: SQLite stores any type in any column."""
@@ -372,8 +425,17 @@ class Store:
             yield
         except InputError:
             raise
-        except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-            raise InputError(self.path, f"not a valid study store: {' '.join(str(error).split())[:120]}") from None
+        except (
+            ArithmeticError,
+            AttributeError,
+            LookupError,
+            RecursionError,
+            TypeError,
+            ValueError,
+        ) as error:
+            raise InputError(
+                self.path, f"not a valid study store: {' '.join(str(error).split())[:120]}"
+            ) from None
 
 
 def to_sql(value: Any) -> Any:
@@ -459,7 +521,9 @@ def writing(path: Path) -> Iterator[Store]:
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
                 raise
-            raise InputError(path, "in use by another run", "one run at a time, or another store") from None
+            raise InputError(
+                path, "in use by another run", "one run at a time, or another store"
+            ) from None
         with closing(sqlite3.connect(path, timeout=30)) as db:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = NORMAL")

@@ -41,7 +41,13 @@ from skysim.experiments.study.execution.outcomes import (
     summarize_flight,
     true_lights,
 )
-from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of, setup_key
+from skysim.experiments.study.execution.setups import (
+    Setup,
+    code_version,
+    prepared_setup,
+    seed_of,
+    setup_key,
+)
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import (
     AxisConfig,
@@ -112,7 +118,9 @@ class TrialJob:
         """The row of a trial that repeatedly killed its worker."""
         replicate = segment.replicates[0]
         seed = seed_of(self.spec, segment.point, replicate)
-        return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0)
+        return Row(
+            segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0
+        )
 
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
@@ -151,10 +159,14 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """
     numbers = list(enumerate(segment.replicates, segment.first))
     seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
-    scene, outcomes, error, start_s = "", [FAILED] * len(seeds), None, time.perf_counter()
+    scene = ""
+    outcomes = [FAILED] * len(seeds)
+    error = None
+    start_s = time.perf_counter()
     try:
         setup = prepared_setup(spec, segment.settings, key)
-        scene, start_s = setup.scene_hash, time.perf_counter()
+        scene = setup.scene_hash
+        start_s = time.perf_counter()
         outcomes = TRIALS[setup.trial.kind](setup, seeds)
     except Exception as raised:
         if len(seeds) > 1:
@@ -163,7 +175,9 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
             scene = scene or REFUSED
             error = str(raised)
         else:
-            error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
+            error = traceback.format_exc().replace(
+                f"{ROOT}/", ""
+            )  # independent of the installation path
     seconds = (time.perf_counter() - start_s) / len(seeds)
     return [
         Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
@@ -173,7 +187,9 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
 
 def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
     """Run one trial of a segment's point; an exception is stored in its row."""
-    return run_block(spec, segment._replace(first=trial, replicates=range(replicate, replicate + 1)))[0]
+    return run_block(
+        spec, segment._replace(first=trial, replicates=range(replicate, replicate + 1))
+    )[0]
 
 
 def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
@@ -187,23 +203,33 @@ def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
 
 def solved_centroids(setup: Setup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
     """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
-    lab, trial, estimator = setup.lab, setup.trial, setup.estimator
+    lab = setup.lab
+    trial = setup.trial
+    estimator = setup.estimator
     assert isinstance(trial, CentroidTrial)
     drawn = [streams(setup, seed) for seed in seeds]
     lab_from_body = random_attitudes(setup, [attitude_rng for attitude_rng, _ in drawn])
     noise = [noise_rng for _, noise_rng in drawn]
     if isinstance(estimator, CodedTracker):
-        coded = [solve_coded(lab, estimator, trial, *each) for each in zip(lab_from_body, noise, strict=True)]
-        seen_px, reports = [xy_px for xy_px, _ in coded], [report for _, report in coded]
+        coded = [
+            solve_coded(lab, estimator, trial, *each)
+            for each in zip(lab_from_body, noise, strict=True)
+        ]
+        seen_px = [xy_px for xy_px, _ in coded]
+        reports = [report for _, report in coded]
     else:
         views = visible_rows(lab, lab_from_body)
-        seen_px, scene = [view.xy_px for view in views], lab.scene
+        seen_px = [view.xy_px for view in views]
+        scene = lab.scene
         detections = [
             simulate_detections(trial, view.xy_px, view.electrons, scene, rng)
             for view, rng in zip(views, noise, strict=True)
         ]
         exposure_s = scene.exposure.time_s
-        reports = [Report(factory.solve_centroids(estimator, each, exposure_s), each) for each in detections]
+        reports = [
+            Report(factory.solve_centroids(estimator, each, exposure_s), each)
+            for each in detections
+        ]
     lights = [TrueLights(*each, each[1], None) for each in zip(lab_from_body, seen_px, strict=True)]
     return list(zip(lights, reports, strict=True))
 
@@ -223,7 +249,9 @@ def run_frame_trial(setup: Setup, seed: int) -> Outcome:
     if tracked_frames(setup):
         report = tracked_report(setup, moving, frame)
     else:
-        report = factory.solve_frame(setup.estimator, frame, moving.streak_px, gyro_rate(setup, truth))
+        report = factory.solve_frame(
+            setup.estimator, frame, moving.streak_px, gyro_rate(setup, truth)
+        )
     return score(setup.lab, setup.estimator, report, true_lights(truth))
 
 
@@ -232,7 +260,9 @@ def run_flight_trial(setup: Setup, seed: int) -> Outcome:
     trial = setup.trial
     assert isinstance(trial, FlightTrial)
     with trial_flight(setup, seed) as flight:
-        outcomes = [one for t_s, one in flight_outcomes(flight, setup.estimator) if t_s >= trial.settle_s]
+        outcomes = [
+            one for t_s, one in flight_outcomes(flight, setup.estimator) if t_s >= trial.settle_s
+        ]
         return summarize_flight(flight.telemetry(), outcomes, trial.settle_s)
 
 
@@ -246,14 +276,18 @@ def trial_flight(setup: Setup, seed: int) -> Flight:
     return Flight(lab, UserParts(setup.programs, tracker=setup.estimator))
 
 
-def flight_outcomes(flight: Flight, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
+def flight_outcomes(
+    flight: Flight, estimator: factory.Estimator
+) -> Iterator[tuple[float, Outcome]]:
     """Mid-exposure time and outcome of every frame of the main camera."""
     for shot in flight.shots(cameras=[0]):
         assert shot.report is not None
         yield shot.truth.t_s, score(flight.lab, estimator, shot.report, true_lights(shot.truth))
 
 
-def one_by_one(run: Callable[[Setup, int], Outcome]) -> Callable[[Setup, Sequence[int]], list[Outcome]]:
+def one_by_one(
+    run: Callable[[Setup, int], Outcome],
+) -> Callable[[Setup, Sequence[int]], list[Outcome]]:
     """Trials of which each is run by itself."""
     return lambda setup, seeds: [run(setup, seed) for seed in seeds]
 
@@ -279,7 +313,8 @@ def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotat
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
     uniform over the sphere within `dec_deg` or between two angles from a body, roll uniform.
     """
-    trial, lab = setup.trial, setup.lab
+    trial = setup.trial
+    lab = setup.lab
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
@@ -287,17 +322,23 @@ def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotat
     if isinstance(lab.scene.light, DomeConfig):
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
-        least, most = math.cos(math.radians(high)), math.cos(math.radians(low))
+        least = math.cos(math.radians(high))
+        most = math.cos(math.radians(low))
         tilts = [math.acos(min(rng.uniform(least, most), 1.0)) for rng in rngs]
-        drawn = [zyz(first, tilt, last - first) for (first, last), tilt in zip(turns, tilts, strict=True)]
+        drawn = [
+            zyz(first, tilt, last - first) for (first, last), tilt in zip(turns, tilts, strict=True)
+        ]
         return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
     near = attitudes.near
     low, high = (math.radians(dec) for dec in attitudes.dec_deg)
     if near:  # a body is the pole
         high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
-    least, most = math.sin(low), math.sin(high)
+    least = math.sin(low)
+    most = math.sin(high)
     zeniths = [math.acos(min(max(rng.uniform(least, most), -1.0), 1.0)) for rng in rngs]
-    lab_from_cam = [zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)]
+    lab_from_cam = [
+        zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)
+    ]
     if near:
         lab_from_pole = lab_from_body_pole(near.body, lab.scene)
         lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
@@ -317,9 +358,13 @@ def lab_from_body_pole(name: str, scene: Scene) -> Floats:
 
 def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     """(4,) wxyz of Rz(first) Ry(second) Rz(third), which rotates z to azimuth `first` and zenith angle `second`."""
-    half, sum_, difference = second_rad / 2, (first_rad + third_rad) / 2, (first_rad - third_rad) / 2
-    sine, cosine = math.sin(half), math.cos(half)
-    x, y = -sine * math.sin(difference), sine * math.cos(difference)
+    half = second_rad / 2
+    sum_ = (first_rad + third_rad) / 2
+    difference = (first_rad - third_rad) / 2
+    sine = math.sin(half)
+    cosine = math.cos(half)
+    x = -sine * math.sin(difference)
+    y = sine * math.cos(difference)
     return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
 
 
@@ -354,7 +399,8 @@ def tracked_frames(setup: Setup) -> int:
 
 def moving_camera(setup: Setup, seed: int) -> MovingCamera:
     """The camera in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
-    trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
+    trial = setup.trial
+    (attitude_rng, noise) = streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     camera = setup.lab.in_run(int(noise.integers(2**62))).camera
     middle, axis_cam = attitude_and_axis(setup, attitude_rng)
@@ -365,7 +411,9 @@ def moving_camera(setup: Setup, seed: int) -> MovingCamera:
         for value in (trial.rate_deg_s, trial.turn_deg, trial.acceleration_deg_s2)
     )
     middle = middle * Rotation.from_rotvec(turn_body)
-    trajectory = constant_acceleration(camera.scene, middle, rate_body, acceleration_body, trial.tracked)
+    trajectory = constant_acceleration(
+        camera.scene, middle, rate_body, acceleration_body, trial.tracked
+    )
     streak_px = exposure_window(camera.scene, 0).exposure_s * camera.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     streak = (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
@@ -376,7 +424,9 @@ def attitude_and_axis(setup: Setup, rng: np.random.Generator) -> tuple[Rotation,
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
     lab_from_body = random_attitude(setup, rng)
-    return lab_from_body, rate_axis(setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.lab.camera.mount)
+    return lab_from_body, rate_axis(
+        setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.lab.camera.mount
+    )
 
 
 def tracked_report(setup: Setup, moving: MovingCamera, frame: Frame) -> Report:
@@ -390,10 +440,14 @@ def tracked_report(setup: Setup, moving: MovingCamera, frame: Frame) -> Report:
     for index in range(frame.index + 1):
         shown = frame if index == frame.index else moving.render(index)[0]
         turned = (
-            rotation_between(moving, tracker.last.t_s, shown.t_mid_s) if moving.streak_px and tracker.last else None
+            rotation_between(moving, tracker.last.t_s, shown.t_mid_s)
+            if moving.streak_px and tracker.last
+            else None
         )
         try:
-            report = tracker.solve(shown.image_dn, shown.t_mid_s, turned, moving.streak_px, shown.exposure_s)
+            report = tracker.solve(
+                shown.image_dn, shown.t_mid_s, turned, moving.streak_px, shown.exposure_s
+            )
         except ImageError as error:
             report = TrackedReport(Attitude(str(error)), Centroids.empty())
     if report.attitude.solved and report.health & Health.SEARCHED:
@@ -404,7 +458,8 @@ def tracked_report(setup: Setup, moving: MovingCamera, frame: Frame) -> Report:
 def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotation:
     """True rotation cam(now) from cam(then)."""
     now, then = (
-        moving.camera.mount.cam_from_body * moving.trajectory.attitude_at(t_s).inv() for t_s in (now_s, then_s)
+        moving.camera.mount.cam_from_body * moving.trajectory.attitude_at(t_s).inv()
+        for t_s in (now_s, then_s)
     )
     return now * then.inv()
 
@@ -412,15 +467,25 @@ def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotat
 def gyro_rate(setup: Setup, truth: Truth) -> RateEstimate | None:
     """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
     assert isinstance(setup.trial, FrameTrial)
-    return RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if setup.trial.gyro else None
+    return (
+        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if setup.trial.gyro else None
+    )
 
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:
     """(3,) unit axis of rotation in camera axes; azimuth_rad is that of one perpendicular to the boresight."""
     if not isinstance(axis, AxisConfig):
         boresight = np.array([0.0, 0.0, 1.0])
-        return boresight if axis == "boresight" else np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
-    vector = mount.cam_from_body.apply(axis.body) if axis.body is not None else np.array(axis.camera, dtype=float)
+        return (
+            boresight
+            if axis == "boresight"
+            else np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+        )
+    vector = (
+        mount.cam_from_body.apply(axis.body)
+        if axis.body is not None
+        else np.array(axis.camera, dtype=float)
+    )
     return np.asarray(vector / np.linalg.norm(vector))
 
 
@@ -436,8 +501,11 @@ def constant_acceleration(
 
     The acceleration is along the rate or there is no rate: the rotation vector is rate t + acceleration t^2 / 2.
     """
-    windows, rows = [exposure_window(scene, index) for index in range(frame + 1)], scene.camera.height_px
-    exposures = [np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS) for one in windows]
+    windows = [exposure_window(scene, index) for index in range(frame + 1)]
+    rows = scene.camera.height_px
+    exposures = [
+        np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS) for one in windows
+    ]
     t_s = np.unique(np.concatenate(exposures))
     since_s = t_s - windows[-1].middle_s(rows)
     turned = np.outer(since_s, rate_body) + np.outer(since_s**2 / 2, acceleration_body)

@@ -23,8 +23,12 @@ def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
 
     Columns without any value are left out: of a study of frames, for example, those of flights.
     """
-    levels, names = level_columns(store), names_with_values(store)
-    with files.atomic_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    levels = level_columns(store)
+    names = names_with_values(store)
+    with (
+        files.atomic_file(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(names)
         for block in store.blocks():
@@ -35,7 +39,8 @@ def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
 def names_with_values(store: Store) -> list[str]:
     """Names of the columns of `trial_columns` that are not empty; all of a store without trials."""
     every = [*COLUMNS, *level_columns(store)]
-    empty, some = set(COLUMNS), False
+    empty = set(COLUMNS)
+    some = False
     for block in store.blocks():
         some |= bool(len(block["trial"]))
         empty -= {name for name in empty if has_values(block[name])}
@@ -44,7 +49,11 @@ def names_with_values(store: Store) -> list[str]:
 
 def has_values(column: NDArray[Any]) -> bool:
     """Whether any value is neither None nor NaN."""
-    return any(value is not None for value in column) if column.dtype == object else bool(np.any(column == column))
+    return (
+        any(value is not None for value in column)
+        if column.dtype == object
+        else bool(np.any(column == column))
+    )
 
 
 def texts(column: NDArray[Any]) -> list[Any]:
@@ -62,8 +71,12 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
         import pyarrow.parquet
     except ImportError:
         raise InputError(path, f"Parquet {EXTRA}") from None
-    levels, meta = level_columns(store), {key: store.meta(key) for key in ("title", "code", "study")}
-    tables = (to_arrow(with_levels(block, levels)).replace_schema_metadata(meta) for block in store.blocks())
+    levels = level_columns(store)
+    meta = {key: store.meta(key) for key in ("title", "code", "study")}
+    tables = (
+        to_arrow(with_levels(block, levels)).replace_schema_metadata(meta)
+        for block in store.blocks()
+    )
     first = next(tables)
     with (
         files.atomic_file(path) as temporary,

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import Axis, axis, is_sampled, is_share, label, shown_points
+from skysim.experiments.study.analysis.axes import (
+    Axis,
+    axis,
+    is_sampled,
+    is_share,
+    label,
+    shown_points,
+)
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
 from skysim.experiments.study.plan import Curve, Heat, Study
@@ -23,11 +30,14 @@ if TYPE_CHECKING:
     from skysim.experiments.study.analysis.sensitivity import Index
 
 MAX_TICKS = 16  # maximum number of levels with a tick each
-MAX_WRAPPED_LABELS = 8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
+MAX_WRAPPED_LABELS = (
+    8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
+)
 LABEL_WIDTH = 88  # characters that fit below an axis
 MAX_CELLS_WITH_TEXT = 12  # maximum rows and columns of a heat map with values written in its cells
 MAX_LABELED_POINTS = 12  # maximum number of Pareto points that are labeled
-GRAY, ORANGE = "#8fa1b3", "#d55e00"
+GRAY = "#8fa1b3"
+ORANGE = "#d55e00"
 
 
 def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) -> bytes:
@@ -38,7 +48,10 @@ def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) ->
         return png(lambda fig: draw_scatter(fig, lines, figure, study), (7.0, 4.4))
     cells = layout.grid(lines, figure, study)
     rows, columns = cells.value.shape
-    size = float(np.clip(2.6 + 0.6 * columns, 4.6, 9.6)), float(np.clip(1.2 + 0.42 * rows, 2.6, 7.0))
+    size = (
+        float(np.clip(2.6 + 0.6 * columns, 4.6, 9.6)),
+        float(np.clip(1.2 + 0.42 * rows, 2.6, 7.0)),
+    )
     return png(lambda fig: draw_heat(fig, cells, figure), size)
 
 
@@ -47,7 +60,9 @@ def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) ->
 
 def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study) -> None:
     """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
-    axes, x_axis, sampled = fig.subplots(), axis(study, lines, figure.x), is_sampled(study)
+    axes = fig.subplots()
+    x_axis = axis(study, lines, figure.x)
+    sampled = is_sampled(study)
     shown = layout.series(lines, figure, study)
     dots = layout.draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
@@ -68,7 +83,9 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888")
     if group_axis is not None and shown:
         columns = math.ceil(len(shown) / 14)
-        fig.legend(title=group_axis.label, loc="outside right upper", ncols=columns, alignment="left")
+        fig.legend(
+            title=group_axis.label, loc="outside right upper", ncols=columns, alignment="left"
+        )
 
 
 def draw_thresholds(axes: Any, figure: Curve, study: Study, lines: Sequence[PointRow]) -> None:
@@ -87,7 +104,9 @@ def draw_thresholds(axes: Any, figure: Curve, study: Study, lines: Sequence[Poin
             axes.plot(one.value, threshold.limit, "|", color=ink, markersize=13, markeredgewidth=2)
 
 
-def set_up_y_axis(axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, bars: bool = True) -> None:
+def set_up_y_axis(
+    axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, bars: bool = True
+) -> None:
     """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
     expected = layout.expected_value(name)
@@ -121,16 +140,27 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt
     draw_few(axes, one, mark, **style)
     if axes.get_yscale() == "log":
         none = (one.value <= 0) & (one.high > 0)
-        axes.plot(one.x[none], one.high[none], "v", color=ink, markerfacecolor="white", transform=offset)
+        axes.plot(
+            one.x[none], one.high[none], "v", color=ink, markerfacecolor="white", transform=offset
+        )
 
 
 def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
     """Draw the points of few values: hollow, with their number."""
     axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
-    for x, value, count in zip(one.x[one.few], one.value[one.few], one.values[one.few], strict=True):
+    for x, value, count in zip(
+        one.x[one.few], one.value[one.few], one.values[one.few], strict=True
+    ):
         if np.isfinite(value):
-            place = {"xy": (x, value), "xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
-            axes.annotate(f"n={count}", **place, fontsize=6.5, color=style["color"], path_effects=[halo()])
+            place = {
+                "xy": (x, value),
+                "xytext": (4, 4),
+                "textcoords": "offset points",
+                "xycoords": style["transform"],
+            }
+            axes.annotate(
+                f"n={count}", **place, fontsize=6.5, color=style["color"], path_effects=[halo()]
+            )
 
 
 def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
@@ -153,10 +183,14 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
         axes.plot(*level_medians(one), color=ink, label=one.label or None, **medians)
 
 
-def draw_bars(axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | None = None) -> None:
+def draw_bars(
+    axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | None = None
+) -> None:
     """Draw intervals as bars with caps."""
     places = one.x if isinstance(one, Series) else x
-    axes.vlines(places, *drawn_interval(axes, one), color=ink, alpha=0.6, linewidth=1, transform=where)
+    axes.vlines(
+        places, *drawn_interval(axes, one), color=ink, alpha=0.6, linewidth=1, transform=where
+    )
     for end in (one.low, one.high):
         axes.plot(places, end, "_", color=ink, alpha=0.6, markersize=6, transform=where)
 
@@ -187,7 +221,11 @@ def color(n: int, count: int, ordered: bool) -> Any:
     """Color of line n of `count`: from a color scale if the lines are ordered, else from the palette."""
     from matplotlib import colormaps
 
-    return colormaps["viridis"](0.82 * n / max(count - 1, 1)) if ordered and count > 2 else INK[n % len(INK)]
+    return (
+        colormaps["viridis"](0.82 * n / max(count - 1, 1))
+        if ordered and count > 2
+        else INK[n % len(INK)]
+    )
 
 
 def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
@@ -207,14 +245,18 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
         return
     names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
     rotated = len(places) > MAX_WRAPPED_LABELS and max(map(len, names)) * len(names) > LABEL_WIDTH
-    axes.set_xticks(places, names, rotation=25 if rotated else 0, ha="right" if rotated else "center")
+    axes.set_xticks(
+        places, names, rotation=25 if rotated else 0, ha="right" if rotated else "center"
+    )
     if x_axis.log:
         axes.tick_params(axis="x", which="minor", length=0)
 
 
 def wrapped(name: str, count: int) -> str:
     """A tick label wrapped so that `count` labels fit below the axis without overlap."""
-    return textwrap.fill(name, max(LABEL_WIDTH // count, 8)) if count <= MAX_WRAPPED_LABELS else name
+    return (
+        textwrap.fill(name, max(LABEL_WIDTH // count, 8)) if count <= MAX_WRAPPED_LABELS else name
+    )
 
 
 def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
@@ -258,8 +300,15 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
                 text += f"\nn={cells.values[row, column]}" if cells.few[row, column] else ""
                 axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
-        step = max(math.ceil(len(one.levels) / most), 1) if len(one.levels) > MAX_CELLS_WITH_TEXT else 1
-        names = [wrapped(one.tick_label(level), max(columns, 4) if which == "x" else 4) for level in one.levels[::step]]
+        step = (
+            max(math.ceil(len(one.levels) / most), 1)
+            if len(one.levels) > MAX_CELLS_WITH_TEXT
+            else 1
+        )
+        names = [
+            wrapped(one.tick_label(level), max(columns, 4) if which == "x" else 4)
+            for level in one.levels[::step]
+        ]
         getattr(axes, f"set_{which}ticks")(range(0, len(one.levels), step), names)
         getattr(axes, f"set_{which}label")(one.label)
     axes.grid(False)
@@ -268,9 +317,13 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
 
 def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study) -> None:
     """Draw sampled points over two factors, colored by response."""
-    axes, points = fig.subplots(), shown_points(lines, figure, study)
+    axes = fig.subplots()
+    points = shown_points(lines, figure, study)
     x, y = (axis(study, lines, name) for name in (figure.x, figure.y))
-    places = [(x.coordinate(line.levels[figure.x]), y.coordinate(line.levels[figure.y])) for line in points]
+    places = [
+        (x.coordinate(line.levels[figure.x]), y.coordinate(line.levels[figure.y]))
+        for line in points
+    ]
     values = np.array([line.responses[figure.value].value for line in points])
     xy = np.array(places).reshape(-1, 2)
     size = float(np.clip(6000 / max(len(xy), 1), 4, 45))
@@ -297,14 +350,17 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
 
 def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
     """Draw two bars per factor, with their intervals."""
-    axes, rows = fig.subplots(), np.arange(len(selected))
+    axes = fig.subplots()
+    rows = np.arange(len(selected))
     for shift, name, ink, parts in (
         (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
         (0.19, "total", GRAY, [one.total[:3] for one in selected]),
     ):
         value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
-        axes.hlines(rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1)
+        axes.hlines(
+            rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1
+        )
     bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])
     bounds = bounds[np.isfinite(bounds)]
     axes.set_xlim(min(bounds.min() * 1.05, 0.0), max(min(bounds.max() * 1.05, 2.0), 0.1))
@@ -322,8 +378,11 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
     """Responses of an optimization against candidate number, stacked panels; Pareto points marked, bounds dashed."""
 
     def draw(fig: Any) -> None:
-        x, marked = np.array(points, dtype=float), np.isin(points, front)
-        for axes, (name, one) in zip(np.ravel(fig.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True):
+        x = np.array(points, dtype=float)
+        marked = np.isin(points, front)
+        for axes, (name, one) in zip(
+            np.ravel(fig.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True
+        ):
             set_up_y_axis(axes, name, [one._replace(value=np.append(one.value, one.bounds))], False)
             axes.set_ylabel(one.label.replace(", ", "\n"))
             draw_bars(axes, one, GRAY, axes.transData, x)
@@ -337,7 +396,11 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
 
 
 def pareto_png(
-    one: Panel, other: Panel, points: Sequence[int], front: Sequence[int], also: Mapping[str, Floats] | None = None
+    one: Panel,
+    other: Panel,
+    points: Sequence[int],
+    front: Sequence[int],
+    also: Mapping[str, Floats] | None = None,
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 
@@ -346,20 +409,30 @@ def pareto_png(
     from matplotlib.patheffects import withStroke
 
     def draw(fig: Any) -> None:
-        axes, marked = fig.subplots(), np.flatnonzero(np.isin(points, front))
+        axes = fig.subplots()
+        marked = np.flatnonzero(np.isin(points, front))
         axes.plot(one.value, other.value, "o", color=GRAY, label="candidate")
         marked = marked[np.argsort(one.value[marked], kind="stable")]
         heights = [other.value, *(values[:, 1] for values in (also or {}).values())]
-        axes.set_ylim(*layout.limits(heights, [other.low[marked], other.high[marked]], False, False))
+        axes.set_ylim(
+            *layout.limits(heights, [other.low[marked], other.high[marked]], False, False)
+        )
         for name, values in (also or {}).items():
-            axes.plot(*values.T, "s:", color=INK[0], markerfacecolor="none", markersize=4, label=name)
+            axes.plot(
+                *values.T, "s:", color=INK[0], markerfacecolor="none", markersize=4, label=name
+            )
         low_m, high_m = drawn_interval(axes, Panel("", other.value, other.low, other.high, []))
-        axes.vlines(one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1)
+        axes.vlines(
+            one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1
+        )
         axes.plot(one.value[marked], other.value[marked], "D--", color=ORANGE, label="front")
         for n in marked.tolist() if len(marked) <= MAX_LABELED_POINTS else ():
-            coordinate, halo = (one.value[n], other.value[n]), [withStroke(linewidth=2.5, foreground="white")]
+            coordinate = (one.value[n], other.value[n])
+            halo = [withStroke(linewidth=2.5, foreground="white")]
             style = {"fontsize": 8, "color": ORANGE, "path_effects": halo}
-            axes.annotate(str(points[n]), coordinate, xytext=(5, 5), textcoords="offset points", **style)
+            axes.annotate(
+                str(points[n]), coordinate, xytext=(5, 5), textcoords="offset points", **style
+            )
         axes.set_xlabel(one.label)
         axes.set_ylabel(other.label)
         fig.legend(loc="outside right upper")

@@ -29,12 +29,20 @@ from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 
-MAX_X_WITH_BARS = 12  # maximum number of x values for error bars; with more, intervals are drawn as a band
+MAX_X_WITH_BARS = (
+    12  # maximum number of x values for error bars; with more, intervals are drawn as a band
+)
 MAX_POINTS_WITH_BARS = 60  # sampled points with error bars; with more, a running median is drawn
-MOST_LINES = 7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
+MOST_LINES = (
+    7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
+)
 MOST_FIGURES = 24  # maximum number of automatic figures
-LOG_RESPONSE_RATIO = 30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
-FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
+LOG_RESPONSE_RATIO = (
+    30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
+)
+FAR_RATIO = (
+    30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
+)
 
 
 class Series(NamedTuple):
@@ -110,14 +118,20 @@ def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
         pairs = [(x, by, y) for y in study.responses]
     # If there are too many figures, show fewer responses, each with all of its figures.
     most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
-    return [automatic_figure(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]]
+    return [
+        automatic_figure(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]
+    ]
 
 
-def automatic_figure(x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[PointRow]) -> Figure:
+def automatic_figure(
+    x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[PointRow]
+) -> Figure:
     """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
     values = values[np.isfinite(values)]
-    log = bool(len(values) and values.min() > 0 and values.max() > LOG_RESPONSE_RATIO * values.min())
+    log = bool(
+        len(values) and values.min() > 0 and values.max() > LOG_RESPONSE_RATIO * values.min()
+    )
     if by is not None and len(axes[by].levels) > MOST_LINES:
         return Heat(kind="heat", x=x, y=by, value=y, log=log)
     return Curve(kind="curve", x=x, y=y, by=by, log=log)
@@ -125,7 +139,8 @@ def automatic_figure(x: str, by: str | None, y: str, axes: Mapping[str, Axis], l
 
 def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Series]:
     """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of GROUPS equal groups."""
-    x_axis, chosen = axis(study, lines, figure.x), shown_points(lines, figure, study)
+    x_axis = axis(study, lines, figure.x)
+    chosen = shown_points(lines, figure, study)
     groups = {"": chosen}
     if figure.by is not None:
         groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
@@ -134,7 +149,9 @@ def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Serie
         ordered = sorted(group, key=lambda line: x_axis.coordinate(line.levels[figure.x]))
         if ordered:
             x = np.array([x_axis.coordinate(line.levels[figure.x]) for line in ordered])
-            value, low, high = np.array([line.responses[figure.y][:3] for line in ordered], dtype=float).T
+            value, low, high = np.array(
+                [line.responses[figure.y][:3] for line in ordered], dtype=float
+            ).T
             count = np.array([line.responses[figure.y].trials for line in ordered])
             few = np.array([has_few_values(line, figure.y) for line in ordered])
             found.append(Series(name, x, value, low, high, count, few))
@@ -143,18 +160,29 @@ def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Serie
 
 def grid(lines: Sequence[PointRow], figure: Heat, study: Study) -> Grid:
     """The axes and cell values of a heat map."""
-    x, y = axis(study, lines, figure.x), axis(study, lines, figure.y)
-    columns, rows = ({one.coordinate(level): n for n, level in enumerate(one.levels)} for one in (x, y))
+    x = axis(study, lines, figure.x)
+    y = axis(study, lines, figure.y)
+    columns, rows = (
+        {one.coordinate(level): n for n, level in enumerate(one.levels)} for one in (x, y)
+    )
     shape = len(rows), len(columns)
-    value, count, few = np.full(shape, np.nan), np.zeros(shape, int), np.zeros(shape, bool)
+    value = np.full(shape, np.nan)
+    count = np.zeros(shape, int)
+    few = np.zeros(shape, bool)
     for line in shown_points(lines, figure, study):
-        cell = rows[y.coordinate(line.levels[figure.y])], columns[x.coordinate(line.levels[figure.x])]
-        value[cell], count[cell] = line.responses[figure.value].value, line.responses[figure.value].trials
+        cell = (
+            rows[y.coordinate(line.levels[figure.y])],
+            columns[x.coordinate(line.levels[figure.x])],
+        )
+        value[cell] = line.responses[figure.value].value
+        count[cell] = line.responses[figure.value].trials
         few[cell] = has_few_values(line, figure.value)
     return Grid(x, y, value, count, few)
 
 
-def limits(values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share: bool) -> tuple[float, float]:
+def limits(
+    values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share: bool
+) -> tuple[float, float]:
     """Axis limits that include all values and all finite interval bounds, with padding.
 
     A proportion has all of 0 to 1, so that figures of a study compare by eye. On a logarithmic axis nonpositive
@@ -163,14 +191,17 @@ def limits(values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share:
     if share and not log:
         return -0.03, 1.03
     inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
-    inner, outer = inner[np.isfinite(inner)], outer[np.isfinite(outer)]
+    inner = inner[np.isfinite(inner)]
+    outer = outer[np.isfinite(outer)]
     if log:
-        inner, outer = inner[inner > 0], outer[outer > 0]
+        inner = inner[inner > 0]
+        outer = outer[outer > 0]
         outer = outer[outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO]
     numbers = np.concatenate([inner, outer])
     if not len(numbers):
         return (0.1, 1.0) if log else (0.0, 1.0)
-    low, high = float(numbers.min()), float(numbers.max())
+    low = float(numbers.min())
+    high = float(numbers.max())
     if log:
         pad = max((high / low) ** 0.06, 1.15 if high > 2 * low else 1.5)
         return low / pad, high * pad
@@ -188,13 +219,17 @@ def expected_value(name: str) -> float | None:
 # Candidates of an optimization.
 
 
-def panels(lines: Sequence[PointRow], search: Search, costs: Mapping[int, float] | None) -> dict[str, Panel]:
+def panels(
+    lines: Sequence[PointRow], search: Search, costs: Mapping[int, float] | None
+) -> dict[str, Panel]:
     """One panel per objective, constrained response and, if costs are given, cost; by name."""
     names = dict.fromkeys(search.responses + ["cost"] * (costs is not None))
     return {name: panel(name, lines, search, costs or {}) for name in names}
 
 
-def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[int, float]) -> Panel:
+def panel(
+    name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[int, float]
+) -> Panel:
     """The panel of one response, or of `cost`, over the candidates."""
     nan = float("nan")
     if name == "cost":
@@ -203,7 +238,9 @@ def panel(name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[i
         summaries = [line.responses[name][:3] for line in lines]
     ends = [(one.at_least, one.at_most) for one in search.constraints if one.response == name]
     bounds = [bound for pair in ends for bound in pair if bound is not None]
-    better = next((f", {one.better} is better" for one in search.objectives if one.response == name), "")
+    better = next(
+        (f", {one.better} is better" for one in search.objectives if one.response == name), ""
+    )
     value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
     return Panel(label(name) + better, value, low, high, bounds)
 
@@ -220,7 +257,11 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     counts = [one.trials for one in summaries if one.trials]
     if not counts:
         return f"{text}. No trial of it is in yet."
-    text += f". n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "") + " a point"
+    text += (
+        f". n = {min(counts)}"
+        + (f" to {max(counts)}" if max(counts) > min(counts) else "")
+        + " a point"
+    )
     if isinstance(figure, Curve):
         text += curve_note(figure, study, lines, summaries)
     text += "."
@@ -247,13 +288,17 @@ def caption_title(figure: Figure) -> str:
 
 def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
-    varied = {name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1}
+    varied = {
+        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+    }
     fixed = fixed_levels(figure, study, lines).items()
     at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
     return f", at {at}" if at else ""
 
 
-def curve_note(figure: Curve, study: Study, lines: Sequence[PointRow], summaries: Sequence[Summary]) -> str:
+def curve_note(
+    figure: Curve, study: Study, lines: Sequence[PointRow], summaries: Sequence[Summary]
+) -> str:
     """What the lines and bars of a curve are."""
     x_axis = axis(study, lines, figure.x)
     if draws_medians(study, x_axis, len(summaries)):

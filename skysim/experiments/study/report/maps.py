@@ -67,7 +67,9 @@ class DirectionMap(NamedTuple):
 # Contents.
 
 
-def direction_maps(lines: Sequence[PointRow], figure: Map, study: Study, columns_of: ColumnsOf) -> list[DirectionMap]:
+def direction_maps(
+    lines: Sequence[PointRow], figure: Map, study: Study, columns_of: ColumnsOf
+) -> list[DirectionMap]:
     """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
     chosen = shown_points(lines, figure, study)
     groups = {"": chosen}
@@ -83,16 +85,25 @@ def direction_maps(lines: Sequence[PointRow], figure: Map, study: Study, columns
 def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
     in_dome, in_sky = (
-        np.isfinite(columns[name]) if columns else np.zeros(0, bool) for name in ("body_tilt_deg", "boresight_dec_deg")
+        np.isfinite(columns[name]) if columns else np.zeros(0, bool)
+        for name in ("body_tilt_deg", "boresight_dec_deg")
     )
     if in_dome.any() and in_sky.any():
-        raise InputError(f"map of {response}", "trials under a dome and under the stars", "where, to choose one")
-    sky, known = bool(in_sky.any()), in_dome | in_sky
+        raise InputError(
+            f"map of {response}", "trials under a dome and under the stars", "where, to choose one"
+        )
+    sky = bool(in_sky.any())
+    known = in_dome | in_sky
     if not known.any():
         return DirectionMap(label, sky, [], [])
-    radial, around = ("boresight_dec_deg", "boresight_ra_deg") if sky else ("body_tilt_deg", "body_azimuth_deg")
-    radial_deg, around_deg = columns[radial], columns[around]
-    summarize, cells, least = metrics.response(response), [], least_values(response)
+    radial, around = (
+        ("boresight_dec_deg", "boresight_ra_deg") if sky else ("body_tilt_deg", "body_azimuth_deg")
+    )
+    radial_deg = columns[radial]
+    around_deg = columns[around]
+    summarize = metrics.response(response)
+    cells = []
+    least = least_values(response)
     count = int(known.sum() * min(CELL_TRIALS / (SPARE * least), 1.0))
     ranges = list(partition(*radial_range(radial_deg[known], sky), count, sky))
     number = cell_numbers(ranges, radial_deg, around_deg)
@@ -116,14 +127,17 @@ def least_values(response: str) -> int:
 
 def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
     """Range of tilts or declinations to draw: that of the trials in whole degrees; to the poles if near them."""
-    low, high = math.floor(float(radial_deg.min())), math.floor(float(radial_deg.max())) + 1
+    low = math.floor(float(radial_deg.min()))
+    high = math.floor(float(radial_deg.max())) + 1
     if not sky:
         return (0.0 if low <= 1 else float(low)), float(high)
     bottom, top = SKY_RANGE_DEG
     return (bottom if low < bottom + 5 else float(low)), (top if high > top - 5 else float(high))
 
 
-def partition(low_deg: float, high_deg: float, trials: int, sky: bool) -> Iterator[tuple[float, float, float, float]]:
+def partition(
+    low_deg: float, high_deg: float, trials: int, sky: bool
+) -> Iterator[tuple[float, float, float, float]]:
     """Cells of about equal solid angle, about as wide as high: low, high, left and right of each in degrees.
 
     A ring between two tilts has the solid angle 2 pi (cos a - cos b), between two declinations 2 pi (sin b - sin a).
@@ -147,7 +161,8 @@ def cell_numbers(
     ranges: Sequence[tuple[float, float, float, float]], radial_deg: Floats, around_deg: Floats
 ) -> NDArray[np.int16]:
     """(N,) number of the cell that each trial is in, by the ranges of `partition`; -1 for none."""
-    number, first = np.full(len(radial_deg), -1, np.int16), 0
+    number = np.full(len(radial_deg), -1, np.int16)
+    first = 0
     for (low, high), group in itertools.groupby(ranges, key=lambda one: one[:2]):
         lefts = [left for _, _, left, _ in group]
         ring = np.flatnonzero((radial_deg >= low) & (radial_deg < high))
@@ -162,7 +177,8 @@ def cell_numbers(
 
 def size_in(panels: Sequence[DirectionMap]) -> tuple[float, float]:
     """Width and height of the figure in inches."""
-    count, sky = max(len(panels), 1), bool(panels) and panels[0].sky
+    count = max(len(panels), 1)
+    sky = bool(panels) and panels[0].sky
     width = min((6.5 if sky else 4.4) * count, 12.5)
     return width + 1.0, width / count * (0.5 if sky else 1.0) + 0.25
 
@@ -201,10 +217,13 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
     """
     around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
     if not sky:
-        return np.stack(np.broadcast_arrays(radial_deg * np.cos(around), radial_deg * np.sin(around)), axis=-1)
+        return np.stack(
+            np.broadcast_arrays(radial_deg * np.cos(around), radial_deg * np.sin(around)), axis=-1
+        )
     dec = np.radians(radial_deg)
     divisor = np.sqrt(1 + np.cos(dec) * np.cos(around / 2))
-    x, y = 2 * math.sqrt(2) * np.cos(dec) * np.sin(around / 2) / divisor, math.sqrt(2) * np.sin(dec) / divisor
+    x = 2 * math.sqrt(2) * np.cos(dec) * np.sin(around / 2) / divisor
+    y = math.sqrt(2) * np.sin(dec) / divisor
     return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
 
@@ -220,21 +239,32 @@ def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
     axes.add_collection(PolyCollection(empty, **HATCHED))
     for cell in panel.cells if len(panel.cells) <= MAX_NUMBERED else ():
         dark = cell.shown and np.dot(colors.to_rgba(cell.value)[:3], (0.299, 0.587, 0.114)) < 0.5
-        text = {"ha": "center", "va": "center", "fontsize": 6.5, "color": "#eeeeee" if dark else "#333333"}
+        text = {
+            "ha": "center",
+            "va": "center",
+            "fontsize": 6.5,
+            "color": "#eeeeee" if dark else "#333333",
+        }
         around_deg = (cell.left_deg + cell.right_deg) / 2
-        axes.text(*place((cell.low_deg + cell.high_deg) / 2, around_deg, panel.sky), str(cell.values), **text)
+        axes.text(
+            *place((cell.low_deg + cell.high_deg) / 2, around_deg, panel.sky),
+            str(cell.values),
+            **text,
+        )
 
 
 def outline(cell: Cell, sky: bool) -> Floats:
     """(K, 2) outline of a cell in the drawing."""
-    left, right, low, high = cell.left_deg, cell.right_deg, cell.low_deg, cell.high_deg
-    around, radial = np.linspace(left, right, EDGE_POINTS), np.linspace(low, high, EDGE_POINTS)
-    bottom, end, top, begin = (
-        place(low, around, sky),
-        place(radial, right, sky),
-        place(high, around[::-1], sky),
-        place(radial[::-1], left, sky),
-    )
+    left = cell.left_deg
+    right = cell.right_deg
+    low = cell.low_deg
+    high = cell.high_deg
+    around = np.linspace(left, right, EDGE_POINTS)
+    radial = np.linspace(low, high, EDGE_POINTS)
+    bottom = place(low, around, sky)
+    end = place(radial, right, sky)
+    top = place(high, around[::-1], sky)
+    begin = place(radial[::-1], left, sky)
     return np.concatenate([bottom, end, top, begin])
 
 
@@ -247,7 +277,9 @@ def draw_dome_labels(axes: Any, panel: DirectionMap) -> None:
         text = f"{azimuth_deg}°" + {0: " (x)", 90: " (y)"}.get(azimuth_deg, "")
         axes.text(*place(1.09 * edges[-1], azimuth_deg, False), text, **LABEL)
     for edge in edges:
-        axes.text(*place(edge, RING_LABEL_DEG, False), f"{edge:.3g}°", path_effects=[halo()], **LABEL)
+        axes.text(
+            *place(edge, RING_LABEL_DEG, False), f"{edge:.3g}°", path_effects=[halo()], **LABEL
+        )
 
 
 def draw_sky_labels(axes: Any, panel: DirectionMap) -> None:
@@ -268,7 +300,14 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
         xy = place(one.tilt_deg, one.azimuth_deg, False)
         if panel.sky:
             xy = place(one.dec_deg, (one.ra_deg - 180) % 360 + 180, True)
-        axes.plot(*xy, "o", markersize=8, markerfacecolor="none", markeredgecolor=MARK, path_effects=[halo()])
+        axes.plot(
+            *xy,
+            "o",
+            markersize=8,
+            markerfacecolor="none",
+            markeredgecolor=MARK,
+            path_effects=[halo()],
+        )
         text = {"fontsize": 8, "color": MARK, "path_effects": [halo()]}
         axes.annotate(str(rank), xy, xytext=(5, 4), textcoords="offset points", **text)
 
@@ -276,7 +315,9 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
 # Caption.
 
 
-def caption(panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Sequence[PointRow]) -> str:
+def caption(
+    panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Sequence[PointRow]
+) -> str:
     """Caption of a map: its response, the fixed levels, what its directions are, and the numbers in its cells."""
     text = caption_title(figure) + fixed_text(figure, study, lines)
     cells = [cell for panel in panels for cell in panel.cells]
@@ -284,10 +325,16 @@ def caption(panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Se
         return f"{text}. No trial of it is in yet."
     counts = [cell.values for cell in cells]
     axis_text = (
-        "boresight, RA increasing to the left" if panels[0].sky else "body's z axis, tilt outward, seen from above"
+        "boresight, RA increasing to the left"
+        if panels[0].sky
+        else "body's z axis, tilt outward, seen from above"
     )
     text += f". Directions of the {axis_text}. n = {min(counts)} to {max(counts)} in a cell"
     if max(len(panel.cells) for panel in panels) <= MAX_NUMBERED:
         text += ", written in it"
-    text += f"; hatched: fewer than {least_values(figure.value)}" if any(not cell.shown for cell in cells) else ""
+    text += (
+        f"; hatched: fewer than {least_values(figure.value)}"
+        if any(not cell.shown for cell in cells)
+        else ""
+    )
     return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")

@@ -51,14 +51,18 @@ def overview(plan: Plan) -> Overview:
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
     leds: dict[str, int] = {}
-    checked, may_be_ambiguous, fixed = 0, False, dict[str, None]()
+    checked = 0
+    may_be_ambiguous = False
+    fixed = dict[str, None]()
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
             break
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             lab = build_lab(scene, UserParts(plan.spec.programs))
-            found_here = checks.check(lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab))
+            found_here = checks.check(
+                lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab)
+            )
         except InputError:
             continue
         checked += 1
@@ -69,14 +73,21 @@ def overview(plan: Plan) -> Overview:
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    findings = [finding_text([(line, with_leds(at, leds)) for line, at in one], checked) for one in found.values()]
+    findings = [
+        finding_text([(line, with_leds(at, leds)) for line, at in one], checked)
+        for one in found.values()
+    ]
     return Overview(rows, findings, may_be_ambiguous, tuple(fixed))
 
 
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
     drawn = trial.start if isinstance(trial, FlightTrial) else trial
-    return None if drawn is None or not isinstance(scene.light, DomeConfig) else float(np.max(drawn.tilt_deg))
+    return (
+        None
+        if drawn is None or not isinstance(scene.light, DomeConfig)
+        else float(np.max(drawn.tilt_deg))
+    )
 
 
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
@@ -89,7 +100,8 @@ def with_leds(levels: str, leds: Mapping[str, int]) -> str:
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:
     """One finding, which differs in its numbers at some levels: the first one, and the levels at which it was found."""
-    (line, first), others = at[0], [levels for _, levels in at[1:]]
+    others = [levels for _, levels in at[1:]]
+    (line, first) = at[0]
     if len(at) == checked and len({text for text, _ in at}) == 1:
         return line
     if len(at) == checked:
@@ -105,7 +117,9 @@ def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
         return np.zeros(3)
     # A random axis is taken between the camera's x and y: rows of a rolling shutter are both sheared and stretched.
     axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
-    return np.asarray(lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam))
+    return np.asarray(
+        lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam)
+    )
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
@@ -116,14 +130,19 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
     first = {name: options(factor)[0] for name, factor in factors.items()}
     yield "first levels", make_point(first)
     for name, factor in factors.items():
-        rates = [option for option in options(factor) if isinstance(option[1].get(RATE), int | float)]
+        rates = [
+            option for option in options(factor) if isinstance(option[1].get(RATE), int | float)
+        ]
         fastest = max(rates, key=lambda option: float(str(option[1][RATE])), default=None)
         if fastest is not None and fastest != first[name]:
             yield f"{name} = {format_level(fastest[0])}", make_point(first | {name: fastest})
     for name, factor in factors.items():
         for value, settings in options(factor)[1:]:
             if any(not key.startswith("trial.") for key in settings):
-                yield f"{name} = {format_level(value)}", make_point(first | {name: (value, settings)})
+                yield (
+                    f"{name} = {format_level(value)}",
+                    make_point(first | {name: (value, settings)}),
+                )
 
 
 def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
@@ -138,7 +157,8 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
 
 def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
     """The scene of a lab, with what the check's facts say of its tracker; how the study varies and repeats it."""
-    study, scene = plan.study, lab.scene
+    study = plan.study
+    scene = lab.scene
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
     attitudes = f"{'the same' if study.paired else 'other'} attitudes at every point"
@@ -149,7 +169,10 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
         ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
         ("tracker", tracker_text(scene)),
         *((fact.name, "; ".join(fact.lines)) for fact in facts if fact.name == TRACKER_KNOWS),
-        ("trial", ", ".join(f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items())),
+        (
+            "trial",
+            ", ".join(f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items()),
+        ),
         *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
         ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
         *([("drawn in every trial", ", ".join(study.hardware))] if study.hardware else []),
@@ -160,7 +183,8 @@ def light_text(scene: Scene, lab: Lab) -> str:
     """The light source in words."""
     light = scene.light
     if isinstance(light, DomeConfig):
-        surface, layout = light.surface, light.layout
+        surface = light.surface
+        layout = light.layout
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
         cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
@@ -174,7 +198,9 @@ def light_text(scene: Scene, lab: Lab) -> str:
 def camera_text(camera: CameraConfig) -> str:
     """The camera in words: pixels, field of view and scale."""
     sides = (camera.width_px, camera.height_px)
-    field = " × ".join(f"{2 * math.degrees(math.atan(side / 2 / camera.focal_px)):.3g}°" for side in sides)
+    field = " × ".join(
+        f"{2 * math.degrees(math.atan(side / 2 / camera.focal_px)):.3g}°" for side in sides
+    )
     scale = 1 / camera.focal_px / ARCSEC_RAD
     lens = f"{1e3 * camera.focal_length_m:.4g} mm f/{camera.f_number:.3g}"
     return f"{sides[0]} × {sides[1]} px, {lens}, field {field}, {scale:.3g}″ a pixel"
@@ -195,11 +221,19 @@ def factor_text(factor: Factor) -> str:
         return f"{factor.from_} to {factor.to} ({keys})"
     if isinstance(factor, Distribution):
         return f"{factor.distribution} ({keys})"
-    return ", ".join(format_level(value) for value, _ in factor.options()) + (f" ({keys})" if keys else "")
+    return ", ".join(format_level(value) for value, _ in factor.options()) + (
+        f" ({keys})" if keys else ""
+    )
 
 
 def format_setting(value: object) -> str:
     """A value of a key on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items()) + "}"
-    return f"[{', '.join(map(format_setting, value))}]" if isinstance(value, list | tuple) else str(value)
+        return (
+            "{" + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items()) + "}"
+        )
+    return (
+        f"[{', '.join(map(format_setting, value))}]"
+        if isinstance(value, list | tuple)
+        else str(value)
+    )

@@ -13,13 +13,20 @@ from skysim.results.metrics import MORE_IS_BETTER, split_name
 
 SHARE_COLORS = "cividis"  # color map of all proportions
 COLORS = "YlOrRd"  # of other responses, dark where they are bad: reversed where more is better
-HATCHED: Any = {"facecolor": "#eeeeee", "edgecolor": "#b8b8b8", "hatch": "////", "linewidth": 0}  # a cell without value
+HATCHED: Any = {
+    "facecolor": "#eeeeee",
+    "edgecolor": "#b8b8b8",
+    "hatch": "////",
+    "linewidth": 0,
+}  # a cell without value
 
 
 def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> None:
     """Add the color bar, labeled with the response."""
     locator, formatter = ticks(image.norm.vmin, image.norm.vmax) if figure.log else (None, None)
-    fig.colorbar(image, label=label(figure.response), ticks=locator, format=formatter, **where).minorticks_off()
+    fig.colorbar(
+        image, label=label(figure.response), ticks=locator, format=formatter, **where
+    ).minorticks_off()
 
 
 def color_scale(values: Floats, figure: Heat | Map) -> dict[str, Any]:
@@ -52,7 +59,11 @@ def ticks(low: float, high: float) -> tuple[Any, Any]:
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-    where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)) if high > 8 * low else MaxNLocator(5)
+    where = (
+        LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,))
+        if high > 8 * low
+        else MaxNLocator(5)
+    )
     return where, FuncFormatter(lambda value, _: f"{value:.6g}")
 
 

@@ -23,7 +23,20 @@ from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.results.report import Block, Cell, Code, Column, Facts, Figure, Items, Report, Section, Table, Text, Verdict
+from skysim.results.report import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Report,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 from skysim.results.report.blocks import Kind, Tone
 
 POINTS = "Points"  # titles of sections
@@ -68,7 +81,9 @@ def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = N
     return compose(plan.study, store, analyze(plan, store, command), command)
 
 
-def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Callable[[str], str]:
+def commands(
+    plan: Plan, store: Store, study: str = "", out: Path | None = None
+) -> Callable[[str], str]:
     """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
 
     study, out : what the command names; by default the study's name or path, and the store's folder
@@ -81,17 +96,28 @@ def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None)
 
 def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], verb: str) -> str:
     """The shell command that applies `verb` to a study."""
-    changed = [f"--set={key}={value}" for key, value in overrides.items()] if verb in ("run", "optimize") else []
-    return shlex.join(["skysim", "study", verb, study, *(["--out", str(out)] if out else []), *changed])
+    changed = (
+        [f"--set={key}={value}" for key, value in overrides.items()]
+        if verb in ("run", "optimize")
+        else []
+    )
+    return shlex.join(
+        ["skysim", "study", verb, study, *(["--out", str(out)] if out else []), *changed]
+    )
 
 
 def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
     """The analysis of the trials in a store. command : see `commands`"""
-    study, about = plan.study, overview(plan)
+    study = plan.study
+    about = overview(plan)
     lines = tables.table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
     headline = answer.headline(study, lines, about.may_be_ambiguous, command("worst"))
     headline += answer.one_unit(about.fixed) if headline else []
-    indices = sensitivity.indices(plan, store) if study.design.kind == "saltelli" and not study.optimize else []
+    indices = (
+        sensitivity.indices(plan, store)
+        if study.design.kind == "saltelli" and not study.optimize
+        else []
+    )
     result = search.collect_result(plan, store) if study.optimize else None
     return Analysis(lines, about, headline, answer.ranges(study, lines), indices, result)
 
@@ -99,7 +125,13 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
 def responses(study: Study) -> list[str]:
     """The study's responses and those used by its figures, thresholds, objectives and constraints, without `cost`."""
     searched = study.optimize.responses if study.optimize else []
-    names = dict.fromkeys([*study.responses, *(one.response for one in (*study.figures, *study.thresholds)), *searched])
+    names = dict.fromkeys(
+        [
+            *study.responses,
+            *(one.response for one in (*study.figures, *study.thresholds)),
+            *searched,
+        ]
+    )
     return [name for name in names if name != "cost"]
 
 
@@ -128,9 +160,16 @@ def compose(
         verdict(study, store),
         failures(store, command("replay")),
         Items(found.headline, "Answer"),
-        Section("Figures", [*drawn, Text(left and f"In the table alone: {left}.")], on_terminal=False),
-        Section("Scene", [Facts([*scene, ("code version", [store.meta("code")])])], on_terminal=False),
-        Section("Checks of the scene", [warnings if found.about.findings else Text("Nothing to warn of.")]),
+        Section(
+            "Figures", [*drawn, Text(left and f"In the table alone: {left}.")], on_terminal=False
+        ),
+        Section(
+            "Scene", [Facts([*scene, ("code version", [store.meta("code")])])], on_terminal=False
+        ),
+        Section(
+            "Checks of the scene",
+            [warnings if found.about.findings else Text("Nothing to warn of.")],
+        ),
         Section("Ranges of the responses", [Items(found.ranges)], on_terminal=False),
         Section("Sobol indices", [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
@@ -156,14 +195,17 @@ def verdict(study: Study, store: Store) -> Verdict:
     trials = study.trial_count(len(store.points()))
     finished = 0 < trials <= counts["done"]
     tone: Tone = "good" if finished else "warning"
-    text = "{done} of {} trials, {failed} failed, {wrong} wrong attitudes (over 10′).".format(trials, **counts)
+    text = "{done} of {} trials, {failed} failed, {wrong} wrong attitudes (over 10′).".format(
+        trials, **counts
+    )
     text += "" if finished else " Not finished: what follows is of the trials that are in."
     return Verdict(text, "bad" if counts["failed"] else tone)
 
 
 def failures(store: Store, replay: str) -> Items:
     """The first failed trials, and the command that repeats one."""
-    count, listed = store.counts()["failed"], store.failures()[:LISTED]
+    count = store.counts()["failed"]
+    listed = store.failures()[:LISTED]
     lines = [f"trial {trial}: {error}" for trial, error in listed]
     if lines:
         lines.append(f"`{replay} {listed[0][0]}` does one again and keeps its frames.")
@@ -194,7 +236,11 @@ def points_section(
     if costs is not None:
         columns.append(Column("cost", format=".4g"))
         rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
-    more = f"And {len(lines) - ROWS} points more: `skysim study export` writes them all." if len(lines) > ROWS else ""
+    more = (
+        f"And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+        if len(lines) > ROWS
+        else ""
+    )
     note = "In brackets intervals of 95 %." + (" Tinted: the front." if front else "")
     table = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
@@ -202,7 +248,11 @@ def points_section(
 
 def index_table(indices: Sequence[Index]) -> Table:
     """The Sobol indices, the largest total of each error first."""
-    columns = [Column("error", kind="text"), Column("factor", kind="text"), Column("alone, rms", "″", ".3g")]
+    columns = [
+        Column("error", kind="text"),
+        Column("factor", kind="text"),
+        Column("alone, rms", "″", ".3g"),
+    ]
     columns += [Column("first order"), Column("total")]
     rows = [
         [one.response, one.factor, one.rms_arcsec, with_key(one.first), with_key(one.total)]
@@ -221,9 +271,13 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
     if result is None:
         return []
     feasible = sum(one.feasible for one in result.candidates)
-    text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + ("; the front:" if feasible else ".")
+    text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + (
+        "; the front:" if feasible else "."
+    )
     heads, rows = search.front_cells(study, result)
-    table = Table([Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads)))
+    table = Table(
+        [Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads))
+    )
     return [Text(text), table]
 
 
@@ -236,7 +290,9 @@ def runs_section(store: Store) -> Section:
     """The runs that filled the store."""
     columns = [Column("engine", kind="text"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
-    rows = [[run[name] for name in ("engine", "workers", "trials", "seconds")] for run in store.runs()]
+    rows = [
+        [run[name] for name in ("engine", "workers", "trials", "seconds")] for run in store.runs()
+    ]
     for row in rows:
         row.append(row[2] / row[3] if row[3] else None)
     untimed = store.counts()["done"] - sum(run["trials"] for run in store.runs())
@@ -247,7 +303,9 @@ def runs_section(store: Store) -> Section:
 # Figures.
 
 
-def study_figures(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str) -> list[Block]:
+def study_figures(
+    lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str
+) -> list[Block]:
     """The study's figures: maps with their worst trials, others with their numbers. columns_of : trials of a point"""
     blocks: list[Block] = []
     for one in layout.figures(study, lines):
@@ -256,17 +314,30 @@ def study_figures(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf
             picture = Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))
             blocks += [picture, worst_table(panels, replay)]
             continue
-        blocks.append(Figure(figures.figure_png(lines, one, study), layout.caption(one, study, lines)))
+        blocks.append(
+            Figure(figures.figure_png(lines, one, study), layout.caption(one, study, lines))
+        )
         if not is_sampled(study):
-            blocks.append(Section("The figure's numbers", [pivot_table(one, lines, study)], folded=True))
+            blocks.append(
+                Section("The figure's numbers", [pivot_table(one, lines, study)], folded=True)
+            )
     return blocks
 
 
 def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
-    columns = [Column("worst", kind="text"), Column("lights", format=".0f"), Column("what happened", kind="text")]
+    columns = [
+        Column("worst", kind="text"),
+        Column("lights", format=".0f"),
+        Column("what happened", kind="text"),
+    ]
     rows = [
-        [f"{panel.label}: " * bool(panel.label) + one.direction, one.lights, one.event, f"`{replay} {one.trial}`"]
+        [
+            f"{panel.label}: " * bool(panel.label) + one.direction,
+            one.lights,
+            one.event,
+            f"`{replay} {one.trial}`",
+        ]
         for panel in panels
         for one in panel.worst
     ]
@@ -282,12 +353,17 @@ def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -
 
     def text(x: Any, level: Any) -> str:
         for line in chosen:
-            if same(line.levels[figure.x], x) and (other is None or same(line.levels[other], level)):
+            if same(line.levels[figure.x], x) and (
+                other is None or same(line.levels[other], level)
+            ):
                 return format_response(line, figure.response)
         return ""
 
     levels = down.levels if down else [None]
-    rows = [[down.tick_label(one) if down else "", *(text(x, one) for x in across.levels)] for one in levels]
+    rows = [
+        [down.tick_label(one) if down else "", *(text(x, one) for x in across.levels)]
+        for one in levels
+    ]
     heads = [Column(across.tick_label(x)) for x in across.levels]
     return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
 
@@ -295,7 +371,9 @@ def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -
 def sobol_figures(indices: Sequence[Index]) -> list[Figure]:
     """Sobol indices, one image per response."""
     named = dict.fromkeys(one.response for one in indices)
-    return [Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name) for name in named]
+    return [
+        Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name) for name in named
+    ]
 
 
 def search_figures(
@@ -308,13 +386,17 @@ def search_figures(
     """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
     if study.optimize is None or not lines:
         return []
-    panels, points = layout.panels(lines, study.optimize, costs), [line.point for line in lines]
-    named, marked = [one.response for one in study.optimize.objectives], ", ".join(map(str, front))
+    panels = layout.panels(lines, study.optimize, costs)
+    points = [line.point for line in lines]
+    named = [one.response for one in study.optimize.objectives]
+    marked = ", ".join(map(str, front))
     best = f"none beats {marked} in all objectives" if front else "no candidate is marked yet"
     text = f"Every candidate; {best}. Dashed: bounds."
     shown = [Figure(figures.search_png(panels, points, front), text, name="candidates")]
     if len(named) == 2:
         one, other = (panels[name] for name in named)
         text = f"{named[1]} against {named[0]}: the Pareto front of {len(front)} among {len(lines)} candidates."
-        shown.insert(0, Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto"))
+        shown.insert(
+            0, Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto")
+        )
     return shown

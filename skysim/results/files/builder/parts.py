@@ -72,7 +72,9 @@ class Design(NamedTuple):
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
         meridian = mean_meridian(self.surface, math.radians(self.cap_deg))
         tilt_rad = np.arctan2(np.hypot(place_m[:, 0], place_m[:, 1]), place_m[:, 2])
-        return np.asarray(meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m))
+        return np.asarray(
+            meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m)
+        )
 
 
 def parts_list(scene: Scene, prices: Prices) -> PartsList:
@@ -82,7 +84,15 @@ def parts_list(scene: Scene, prices: Prices) -> PartsList:
         one = prices.of(part)
         bought = quantity if one.unit != "each" else float(math.ceil(quantity / one.serves))
         lines.append(
-            Line(part, bought, one.unit, one.price, one.fixed, round(one.fixed + bought * one.price, 2), one.what)
+            Line(
+                part,
+                bought,
+                one.unit,
+                one.price,
+                one.fixed,
+                round(one.fixed + bought * one.price, 2),
+                one.what,
+            )
         )
     return PartsList(lines)
 
@@ -90,9 +100,14 @@ def parts_list(scene: Scene, prices: Prices) -> PartsList:
 def quantities(scene: Scene, prices: Prices) -> Quantities:
     """How much of each part the scene's dome needs, in its unit; of electronics the LEDs or channels to be served."""
     design = build_design(scene)
-    layout, leds = design.light.layout, len(design.leds)
+    layout = design.light.layout
+    leds = len(design.leds)
     shell = SHELLS.get(design.light.surface.kind, "shell")
-    found: Quantities = {} if isinstance(layout, LcdConfig) else {shell: cap_area_m2(design.surface, design.cap_deg)}
+    found: Quantities = (
+        {}
+        if isinstance(layout, LcdConfig)
+        else {shell: cap_area_m2(design.surface, design.cap_deg)}
+    )
     found |= MOUNTED.get(layout.kind, single_leds)(design)
     if not isinstance(layout, LcdConfig):
         found |= electronics(design) | {"power_supply": leds}
@@ -119,22 +134,34 @@ def build_design(scene: Scene) -> Design:
 def single_leds(design: Design) -> Quantities:
     """LEDs one by one, each in its hole."""
     count = len(design.leds)
-    return {"led": count, "mounting_led": count, "wire": float(design.to_rim_m(design.leds.place[:, :3]).sum())}
+    return {
+        "led": count,
+        "mounting_led": count,
+        "wire": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
+    }
 
 
 def boards(design: Design) -> Quantities:
     """Patch boards; a board's wire goes to its LED next to the rim."""
     length_m = nearest_m(design.to_rim_m(design.leds.place[:, :3]), design.leds.id // HOLES)
     count = len(length_m)
-    return {"board": count, "led": len(design.leds), "mounting_board": count, "wire": float(length_m.sum())}
+    return {
+        "board": count,
+        "led": len(design.leds),
+        "mounting_board": count,
+        "wire": float(length_m.sum()),
+    }
 
 
 def tape(design: Design) -> Quantities:
     """LED tape, cut between LEDs: a pitch of it for each, also for those that are covered."""
     layout = design.light.layout
     assert isinstance(layout, StringConfig)
-    wound = wind(layout.model_copy(update={"pitch_error": 0.0, "glue_scatter_m": 0.0}), design.surface)
-    length_m, kind = layout.pitch_m * len(wound.place_m), "tape_addressable" if is_addressable(design) else "tape"
+    wound = wind(
+        layout.model_copy(update={"pitch_error": 0.0, "glue_scatter_m": 0.0}), design.surface
+    )
+    length_m = layout.pitch_m * len(wound.place_m)
+    kind = "tape_addressable" if is_addressable(design) else "tape"
     wire_m = nearest_m(design.to_rim_m(wound.place_m), wound.tape).sum()
     return {kind: length_m, "mounting_tape": length_m, "wire": float(wire_m)}
 
@@ -142,7 +169,11 @@ def tape(design: Design) -> Quantities:
 def fibers(design: Design) -> Quantities:
     """LEDs at the rim, each with a fiber to its hole."""
     count = len(design.leds)
-    return {"led": count, "fiber": float(design.to_rim_m(design.leds.place[:, :3]).sum()), "mounting_led": count}
+    return {
+        "led": count,
+        "fiber": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
+        "mounting_led": count,
+    }
 
 
 def panel(design: Design) -> Quantities:
@@ -165,14 +196,16 @@ def nearest_m(length_m: Floats, group: Ints) -> Floats:
 
 def is_addressable(design: Design) -> bool:
     """Whether the LEDs of a tape need a driver each: they differ in brightness, or in time."""
-    layout, led = design.light.layout, design.light.led
+    layout = design.light.layout
+    led = design.light.led
     assert isinstance(layout, StringConfig)
     return led.code is not None or led.drive.kind != "direct" or len(set(layout.dimming)) > 1
 
 
 def electronics(design: Design) -> Quantities:
     """What drives the LEDs: by the drive, the code and the layout."""
-    led, count = design.light.led, float(len(design.leds))
+    led = design.light.led
+    count = float(len(design.leds))
     if isinstance(design.light.layout, StringConfig):
         return {"tape_controller": count} if is_addressable(design) else {}
     if isinstance(led.drive, SequentialConfig):

@@ -16,11 +16,17 @@ ASSUMED = "assumed"
 SURVEY = "survey"  # a line whose part begins so is a way to survey the LEDs
 UNITS = {
     **dict.fromkeys(("shell", "shell_bent", "shell_flat"), "m2"),
-    **dict.fromkeys(("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"), "each"),
-    **dict.fromkeys(("driver", "microcontroller", "sequencer", "tape_controller", "trigger", "power_supply"), "each"),
+    **dict.fromkeys(
+        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"), "each"
+    ),
+    **dict.fromkeys(
+        ("driver", "microcontroller", "sequencer", "tape_controller", "trigger", "power_supply"),
+        "each",
+    ),
     **dict.fromkeys(("tape", "tape_addressable", "fiber", "mounting_tape", "wire"), "m"),
 }
-NEEDED, FURTHER = ("part", "unit", "price"), ("fixed", "serves", "sigma_mm", "what")
+NEEDED = ("part", "unit", "price")
+FURTHER = ("fixed", "serves", "sigma_mm", "what")
 LARGEST = 1e9
 
 
@@ -77,7 +83,12 @@ def read_prices(path: Path) -> Prices:
     """Read a table: comments begin with #, then the columns' names and one line a part. Raises InputError, one line."""
     lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
     names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
-    if {*NEEDED} - {*names} or {*names} - {*NEEDED, *FURTHER} or len({*names}) < len(names) or len(lines) < 2:
+    if (
+        {*NEEDED} - {*names}
+        or {*names} - {*NEEDED, *FURTHER}
+        or len({*names}) < len(names)
+        or len(lines) < 2
+    ):
         raise InputError(
             path,
             "not a table of prices",
@@ -104,15 +115,20 @@ def parse_line(line: str, names: list[str]) -> tuple[str, Price]:
     if len(cells) != len(names):
         raise InputError("", f"{len(cells)} cells", f"{len(names)}, one a column")
     cell = dict(zip(names, (one.strip() for one in cells), strict=True))
-    part, unit = cell["part"], cell["unit"]
+    part = cell["part"]
+    unit = cell["unit"]
     survey = part.startswith(SURVEY)
     if part not in UNITS and not survey:
         known = [*UNITS, f"{SURVEY}_NAME"]
-        raise InputError("", f"unknown part {excerpt(part)}{suggestion(part, known)}", ", ".join(known))
+        raise InputError(
+            "", f"unknown part {excerpt(part)}{suggestion(part, known)}", ", ".join(known)
+        )
     if unit != UNITS.get(part, "each"):
         raise InputError(f"unit of {part}", f"{unit!r}", UNITS.get(part, "each"))
     if survey != bool(cell.get("sigma_mm")):
-        raise InputError(f"sigma_mm of {part}", cell.get("sigma_mm") or "none", f"of a {SURVEY}, which needs it")
+        raise InputError(
+            f"sigma_mm of {part}", cell.get("sigma_mm") or "none", f"of a {SURVEY}, which needs it"
+        )
     price, fixed = (number(cell, key, 0.0) for key in ("price", "fixed"))
     serves = number(cell, "serves", 1.0)
     if serves < 1 or serves % 1:

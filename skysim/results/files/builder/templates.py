@@ -36,9 +36,13 @@ LEAST_GORES = 6
 STEPS = 64  # of a polyline whose length is measured
 EDGE_DEG = 0.5  # spacing of an edge's points
 FROM_INSIDE = np.array([-1.0, 1.0])  # seen from inside with the apex up, azimuths grow to the left
-MARGIN_MM, GAP_MM, CAPTION_MM = 10.0, 5.0, 12.0
+MARGIN_MM = 10.0
+GAP_MM = 5.0
+CAPTION_MM = 12.0
 RULE_MM = 100.0  # of the scale that is to be measured after printing
-RINGS, SECTORS = 60, 180  # of the shell's mesh
+# of the shell's mesh
+RINGS = 60
+SECTORS = 180
 MARK_M = 4e-3  # size of an LED's mark on the mesh
 
 
@@ -63,8 +67,12 @@ def template(lab: Lab, ending: str) -> str:
         raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
-    cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))  # boards stand out
-    dome = Dome(lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2)
+    cap_deg = max(
+        float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
+    )  # boards stand out
+    dome = Dome(
+        lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2
+    )
     return TEMPLATES[ending](dome)
 
 
@@ -85,12 +93,18 @@ def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     aside_rad = np.arcsin(np.clip(np.sin(tilt_rad) * np.sin(azimuth_rad), -1, 1))
     foot_rad = np.arctan2(np.sin(tilt_rad) * np.cos(azimuth_rad), np.cos(tilt_rad))
     steps = np.linspace(0, 1, STEPS + 1)
-    along = at(surface, directions(foot_rad[:, None] * steps, np.full((len(rays), STEPS + 1), meridian_rad)))
+    along = at(
+        surface,
+        directions(foot_rad[:, None] * steps, np.full((len(rays), STEPS + 1), meridian_rad)),
+    )
     foot = directions(foot_rad, np.full(len(rays), meridian_rad))
     across = np.array([-math.sin(meridian_rad), math.cos(meridian_rad), 0.0])
     turn = aside_rad[:, None] * steps
-    perpendicular = at(surface, np.cos(turn)[..., None] * foot[:, None] + np.sin(turn)[..., None] * across)
-    x_m, y_m = np.sign(aside_rad) * length_m(perpendicular), np.sign(foot_rad) * length_m(along)
+    perpendicular = at(
+        surface, np.cos(turn)[..., None] * foot[:, None] + np.sin(turn)[..., None] * across
+    )
+    x_m = np.sign(aside_rad) * length_m(perpendicular)
+    y_m = np.sign(foot_rad) * length_m(along)
     return np.column_stack([x_m, y_m])
 
 
@@ -111,15 +125,19 @@ def gores(dome: Dome) -> Drawing:
     count = gore_count(dome.surface, dome.cap_deg)
     rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
     nearest = np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
-    shapes, left_mm, bottom_mm = list[Shape](), MARGIN_MM, 0.0
+    shapes = list[Shape]()
+    left_mm = MARGIN_MM
+    bottom_mm = 0.0
     for gore in range(count):
-        own, meridian_rad = nearest == gore, 2 * math.pi / count * gore
+        own = nearest == gore
+        meridian_rad = 2 * math.pi / count * gore
         outline_mm, leds_mm = (
             1e3 * on_paper_m(dome.surface, some, meridian_rad)
             for some in (outline(meridian_rad, math.pi / count, dome.cap_deg), rays[own])
         )
         shift_mm = np.array([left_mm + outline_mm[:, 0].max(), MARGIN_MM + CAPTION_MM])
-        outline_mm, leds_mm = shift_mm + FROM_INSIDE * outline_mm, shift_mm + FROM_INSIDE * leds_mm
+        outline_mm = shift_mm + FROM_INSIDE * outline_mm
+        leds_mm = shift_mm + FROM_INSIDE * leds_mm
         shapes += gore_shapes(outline_mm, f"{gore + 1}: {math.degrees(meridian_rad):.4g} deg")
         shapes += marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m)
         left_mm += float(np.ptp(outline_mm[:, 0])) + GAP_MM
@@ -165,21 +183,32 @@ def shell_obj(dome: Dome) -> str:
     """
     tilt_rad = np.radians(np.linspace(0, dome.cap_deg, RINGS + 1))[1:]
     azimuth_rad = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-    rings_m = at(dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))).reshape(-1, 3)
+    rings_m = at(
+        dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    ).reshape(-1, 3)
     vertices_m = np.concatenate([at(dome.surface, np.array([[0.0, 0.0, 1.0]])), rings_m])
-    lines = [f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up", "o shell"]
+    lines = [
+        f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up",
+        "o shell",
+    ]
     lines += vertex_lines(vertices_m)
     around = np.arange(SECTORS)
     onward = (around + 1) % SECTORS
     lines += [f"f 1 {b} {a}" for a, b in zip(around + 2, onward + 2, strict=True)]
     for ring in range(RINGS - 1):
-        low, high = 2 + ring * SECTORS, 2 + (ring + 1) * SECTORS
+        low = 2 + ring * SECTORS
+        high = 2 + (ring + 1) * SECTORS
         corners = zip(around + low, onward + low, onward + high, around + high, strict=True)
         lines += [f"f {a} {b} {c} {d}" for a, b, c, d in corners]
     used = len(vertices_m)
-    for number, place_m, inward in zip(dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True):
+    for number, place_m, inward in zip(
+        dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True
+    ):
         lines += [f"o led_{number}", *vertex_lines(pyramid_m(place_m, inward))]
-        lines += [f"f {used + a} {used + b} {used + c}" for a, b, c in ((1, 2, 3), (1, 4, 2), (2, 4, 3), (3, 4, 1))]
+        lines += [
+            f"f {used + a} {used + b} {used + c}"
+            for a, b, c in ((1, 2, 3), (1, 4, 2), (2, 4, 3), (3, 4, 1))
+        ]
         used += 4
     return "\n".join([*lines, ""])
 

@@ -36,7 +36,9 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
     """Warn where the camera is outside of the dome at the start (lab_from_body), so that its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
-    if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(camera_m):
+    if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(
+        camera_m
+    ):
         return ""
     return (
         f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"

@@ -26,7 +26,9 @@ ALIKE = 0.9  # fraction of coincident LEDs
 BELOW = ALIKE - 1e-9
 SIGMAS = 3.0  # within which two LEDs coincide
 MAX_ALIKE = 0.05  # share of the fields that gives no warning
-MAX_WORK = 20_000  # fields that are compared, those at the least tilts, times LEDs in a field: some 0.2 s
+MAX_WORK = (
+    20_000  # fields that are compared, those at the least tilts, times LEDs in a field: some 0.2 s
+)
 MIN_LEDS = 5  # in a field, on average: with fewer, any two fields are alike
 
 
@@ -43,7 +45,11 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
     if why_not_compared(context, samples):
         return None
     found, coincidence_m = compared(context, samples, BELOW, MAX_WORK)
-    return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m) if len(found.led) else None
+    return (
+        Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m)
+        if len(found.led)
+        else None
+    )
 
 
 def why_not_compared(context: Context, samples: Samples) -> str:
@@ -58,20 +64,25 @@ def why_not_compared(context: Context, samples: Samples) -> str:
     return ""
 
 
-def compared(context: Context, samples: Samples, least: float, most_work: int) -> tuple[Ambiguity, float]:
+def compared(
+    context: Context, samples: Samples, least: float, most_work: int
+) -> tuple[Ambiguity, float]:
     """The most similar other field of each field within the greatest tilt, and what coincides, m.
 
     least : fraction below which none is sought;  most_work : fields compared, those at the least tilts, times LEDs in
     a field
     """
-    lab, camera = context.lab, context.camera.optics.camera
+    lab = context.lab
+    camera = context.camera.optics.camera
     sigma_px = [
         believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
         for view in samples.reach.used
         if len(view)
     ]
     distance_m = float(np.median(samples.reach.joined("distance_m")))
-    coincidence_m = SIGMAS * float(np.median(np.concatenate(sigma_px))) * distance_m / camera.focal_px
+    coincidence_m = (
+        SIGMAS * float(np.median(np.concatenate(sigma_px))) * distance_m / camera.focal_px
+    )
     place_m = context.beliefs.lights.place[:, :3]
     most = int(most_work / np.mean([len(view) for view in samples.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
@@ -89,7 +100,9 @@ def compared(context: Context, samples: Samples, least: float, most_work: int) -
 
 def fact(found: Lookalike) -> Fact:
     """How many fields look like another one."""
-    share = f"{100 * found.share:.0f} % of {found.fields}" if found.share else f"none of {found.fields}"
+    share = (
+        f"{100 * found.share:.0f} % of {found.fields}" if found.share else f"none of {found.fields}"
+    )
     text = f"{share}: {100 * ALIKE:.0f} % of the LEDs coincide within {short(1e3 * found.coincidence_m, 2)} mm"
     return Fact("fields alike", [text], found._asdict())
 

@@ -12,15 +12,19 @@ from skysim.simulation.lights.wall import IMAGES, Mirror
 
 def mirror_images(context: Context, samples: Samples) -> str:
     """Warn where images of LEDs in the wall are bright enough to be taken for LEDs: false lights."""
-    lab, frames = context.lab, samples.frames
+    lab = context.lab
+    frames = samples.frames
     mirror = find_light(lab.camera.lights, Mirror)
     found = {n: others[IMAGES] for n, others in enumerate(frames.others) if IMAGES in others}
     if mirror is None or not found:
         return ""
     n = max(found, key=lambda n: len(found[n]))
-    peak_e = max(float(images.peak_e.max()) for images in found.values()) - context.camera.background_e
+    peak_e = (
+        max(float(images.peak_e.max()) for images in found.values()) - context.camera.background_e
+    )
     share = threshold_e(context) / peak_e
-    specular, cure = mirror.dome.config.specular, "make the wall matt"
+    specular = mirror.dome.config.specular
+    cure = "make the wall matt"
     key = "specular" if specular else "refractive_index"
     if specular:
         cure = f"change it to {short(share * specular, 2)}"

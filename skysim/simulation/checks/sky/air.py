@@ -24,17 +24,23 @@ def refraction(context: Context, samples: Samples) -> str:
     The attitude errs by the refraction at the boresight, and the field's height is shortened by the difference of the
     refractions at its two ends.
     """
-    lab, at = context.lab, samples.frames.attitudes
+    lab = context.lab
+    at = samples.frames.attitudes
     atmosphere = find_light(lab.camera.lights, Atmosphere)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
     boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-    zenith = np.array([atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures])
+    zenith = np.array(
+        [atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures]
+    )
     altitude_rad = np.arcsin(np.sum(boresight * zenith, axis=1))
     n = int(altitude_rad.argmin())
-    zenith_rad, half_rad = math.pi / 2 - altitude_rad[n], context.camera.optics.field_rad
+    zenith_rad = math.pi / 2 - altitude_rad[n]
+    half_rad = context.camera.optics.field_rad
     around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
-    middle, low, high = atmosphere.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+    middle, low, high = (
+        atmosphere.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+    )
     expected_arcsec = samples.frames.error.rms_arcsec()[0]
     if not middle > max(MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec):
         return ""

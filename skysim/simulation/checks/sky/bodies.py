@@ -21,7 +21,8 @@ NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray 
 
 def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
     """A line for each body: the frame at which it is nearest to the boresight, if it is in the field or near it."""
-    lab, at = context.lab, samples.frames.attitudes
+    lab = context.lab
+    at = samples.frames.attitudes
     cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
     closest: dict[str, tuple[float, int, BodyLight]] = {}
     for n, beam in enumerate(samples.frames.beams):
@@ -30,7 +31,8 @@ def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
             closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])
     for name, (off_rad, n, body) in closest.items():
-        seen, where = body.truth(), attitudes.describe(at, n, lab.scene, lab.camera.mount)
+        seen = body.truth()
+        where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
         if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera):
@@ -44,15 +46,24 @@ def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> 
     if direction_cam[2] <= 0:
         return False
     xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
-    half_px = np.array([camera.width_px, camera.height_px]) / 2 + camera.focal_px * math.tan(radius_rad)
+    half_px = np.array([camera.width_px, camera.height_px]) / 2 + camera.focal_px * math.tan(
+        radius_rad
+    )
     return bool((xy_px < half_px).all())
 
 
 def peak_fill(context: Context, body: BodyLight) -> float:
     """Electrons in the brightest pixel of a body at rest over saturation; a phase is a disk of its bright area."""
-    camera, scene = context.camera, context.lab.scene
+    camera = context.camera
+    scene = context.lab.scene
     lit = (1 + math.cos(body.place.phase_rad)) / 2
     radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
-    lens2_px2, radius, none = np.array([camera.lens_px**2]), np.array([radius_px]), np.zeros(1)
+    lens2_px2 = np.array([camera.lens_px**2])
+    radius = np.array([radius_px])
+    none = np.zeros(1)
     electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
-    return electrons * float(peak_share(lens2_px2, radius, none, none)[0]) / full_scale_e(scene.camera.detector)
+    return (
+        electrons
+        * float(peak_share(lens2_px2, radius, none, none)[0])
+        / full_scale_e(scene.camera.detector)
+    )

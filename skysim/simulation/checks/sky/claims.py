@@ -66,10 +66,15 @@ def floor_too_small(context: Context, samples: Samples) -> str:
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
     if factor <= MAX_FACTOR:
         return ""
-    low, high = context.settings.centroid_sigma_px, LARGEST_FLOOR_PX
+    low = context.settings.centroid_sigma_px
+    high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if expected_nees(samples.reach, context, middle) > TRUE_NEES else (low, middle)
+        low, high = (
+            (middle, high)
+            if expected_nees(samples.reach, context, middle) > TRUE_NEES
+            else (low, middle)
+        )
     return (
         f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"
         f" {nees:.2g}; 3 if true); change it to {short(high, 2)}"

@@ -27,12 +27,14 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
     With n0 the noise without it and s electrons of it the noise is sqrt(n0^2 + s), and the faintest star brighter by
     1.25 log10(1 + s / n0^2) magnitudes.
     """
-    lab, at = context.lab, samples.frames.attitudes
+    lab = context.lab
+    at = samples.frames.attitudes
     if lab.scene.camera.baffle is None:
         return
     by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures]
     stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
-    n, own_e2 = int(stray_e.argmax()), context.camera.noise_e**2 - context.camera.stray_e
+    n = int(stray_e.argmax())
+    own_e2 = context.camera.noise_e**2 - context.camera.stray_e
     loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
     if loss_mag <= MAX_LOSS_MAG:
         return
@@ -49,12 +51,15 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
 
 def exclusion(context: Context, samples: Samples) -> Iterator[str]:
     """Warn where a frame's boresight is within an exclusion angle of the orbit's tracker: the frame nearest to it."""
-    lab, at = context.lab, samples.frames.attitudes
+    lab = context.lab
+    at = samples.frames.attitudes
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
     boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-    angles_deg = np.array([beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)])
+    angles_deg = np.array(
+        [beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)]
+    )
     for column, (name, limit_deg) in enumerate(
         (("sun", limits.sun_deg), ("earth", limits.earth_deg), ("moon", limits.moon_deg))
     ):
@@ -70,6 +75,9 @@ def exclusion(context: Context, samples: Samples) -> Iterator[str]:
 def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time."""
     here = context.lab.camera.viewpoint.observer_at(t_s)
-    sun, moon = (float(angular_separation_deg(boresight, place(name, here).direction)) for name in ("sun", "moon"))
+    sun, moon = (
+        float(angular_separation_deg(boresight, place(name, here).direction))
+        for name in ("sun", "moon")
+    )
     limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
     return np.array([sun, limb_deg, moon])

@@ -63,12 +63,17 @@ def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats)
     corner = np.clip(np.rint(exact_px), 0, pixels - config.block).astype(np.int64)
     # Brightest first, so that `first` is the brightest star of each block.
     order = np.argsort(-level, kind="stable")
-    _, first, block = np.unique(corner[order] @ [1, pixels[0]], return_index=True, return_inverse=True)
+    _, first, block = np.unique(
+        corner[order] @ [1, pixels[0]], return_index=True, return_inverse=True
+    )
     total = np.minimum(np.bincount(block, level[order], len(first)), 1.0)
     star = order[first]
     center_px = corner[star] + (config.block - 1) / 2 - (pixels - 1) / 2
     return PixelBlocks(
-        star, corner[star], center_px, gray_transmission(config, total) * (1 - black_transmission(config))
+        star,
+        corner[star],
+        center_px,
+        gray_transmission(config, total) * (1 - black_transmission(config)),
     )
 
 
@@ -109,7 +114,12 @@ def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
 
 def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
     """The LED as new, on direct current, without scatter: its strength is the level that a layout assigns to a star."""
-    ideal = {"drive": leds.DirectConfig(kind="direct"), "scatter": 0.0, "color_scatter_m": 0.0, "aging": None}
+    ideal = {
+        "drive": leds.DirectConfig(kind="direct"),
+        "scatter": 0.0,
+        "color_scatter_m": 0.0,
+        "aging": None,
+    }
     return led.model_copy(update=ideal)
 
 
@@ -118,7 +128,9 @@ def panel_strength_e_s_sr(led: leds.LedConfig, band: Band) -> float:
     return full_strength_e_s_sr(led, band) * float(aging_factors(led.aging, np.zeros(1))[0])
 
 
-def panel_sources(config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources) -> Sources:
+def panel_sources(
+    config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources
+) -> Sources:
     """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
 
     stars : as LEDs that are always lit, on the panel or near it; they are projected onto it
@@ -172,13 +184,19 @@ def block_sources(
     scatter = strength_factors(
         led.scatter if config.block == 1 else led.scatter / config.block, rng.standard_normal(count)
     )
-    pulses = DRIVES[led.drive.kind](led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng)
+    pulses = DRIVES[led.drive.kind](
+        led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng
+    )
     return Sources(
         id=stars.id[blocks.star],
         place=np.column_stack([patches.place_m, np.ones(count)]),
         normal=patches.normal,
         radius_m=np.broadcast_to(patches.radius_m, (count,)).copy(),
-        strength=panel_strength_e_s_sr(led, band) * config.block**2 * scatter * pulses.strength * patches.gain,
+        strength=panel_strength_e_s_sr(led, band)
+        * config.block**2
+        * scatter
+        * pulses.strength
+        * patches.gain,
         period_s=pulses.period_s,
         start_s=pulses.start_s,
         on_s=pulses.on_s,
@@ -205,15 +223,25 @@ def display_sources(
     Raises InputError if no star is in the field, and for a star nearer to black than to the first gray level.
     """
     stars = stars.to_limit(config.limit_mag)
-    direction = lab_from_icrs(config).apply(star_sources.apparent(stars, time)) if len(stars) else np.zeros((0, 3))
+    direction = (
+        lab_from_icrs(config).apply(star_sources.apparent(stars, time))
+        if len(stars)
+        else np.zeros((0, 3))
+    )
     in_front = direction[:, 2] > 0
-    stars, direction = stars.take(in_front), direction[in_front]
+    stars = stars.take(in_front)
+    direction = direction[in_front]
     on_display_m = direction[:, :2] / direction[:, 2:] * config.focal_length_m
     half_m = np.array(config.pixels) * config.pitch_m / 2
     within = np.all(np.abs(on_display_m) <= half_m, axis=1)
-    stars, on_display_m = stars.take(within), on_display_m[within]
+    stars = stars.take(within)
+    on_display_m = on_display_m[within]
     if not len(stars):
-        raise InputError("light.limit_mag", "no star of the catalog is on the display to this limit", "a fainter one")
+        raise InputError(
+            "light.limit_mag",
+            "no star of the catalog is on the display to this limit",
+            "a fainter one",
+        )
     level = np.minimum(10 ** (-0.4 * (stars.v_mag - config.brightest_mag)), 1.0)
     blocks = draw_blocks(config, on_display_m, level)
     if not np.all(blocks.level > 0):
@@ -223,21 +251,29 @@ def display_sources(
             f"stars of V {stars.v_mag.max():.3g} are black on {config.gray_levels} gray levels",
             f"to {darkest_mag:.3g}",
         )
-    beam = np.column_stack([blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)])
+    beam = np.column_stack(
+        [blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)]
+    )
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))
     beams = beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
     b_v, v_i = (np.full(len(beam), color) for color in SUN)
     return dataclasses.replace(beams, chromatic=star_chromatic(b_v, v_i, band))
 
 
-def beam_sources(config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalog) -> Sources:
+def beam_sources(
+    config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalog
+) -> Sources:
     """Beams along (N, 3) as steady sources at infinity or, for an imperfect collimator, at config.conjugate_m."""
     direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
-    zeros, ones = np.zeros(len(beam)), np.ones(len(beam))
-    place, normal, strength = np.column_stack([direction, zeros]), 0 * direction, flux_e_s_m2
+    zeros = np.zeros(len(beam))
+    ones = np.ones(len(beam))
+    place = np.column_stack([direction, zeros])
+    normal = 0 * direction
+    strength = flux_e_s_m2
     if config.conjugate_m is not None:
         place = np.column_stack([direction * config.conjugate_m, ones])
-        normal, strength = -direction, flux_e_s_m2 * config.conjugate_m**2
+        normal = -direction
+        strength = flux_e_s_m2 * config.conjugate_m**2
     return Sources(
         id=stars.hip,
         place=place,

@@ -36,7 +36,9 @@ def own_from_lab(config: ProjectorConfig) -> Rotation:
     axis = np.array(config.aim_m) - config.position_m
     axis /= np.linalg.norm(axis)
     right = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
-    right = Rotation.from_rotvec(np.radians(config.rotation_deg) * axis).apply(right / np.linalg.norm(right))
+    right = Rotation.from_rotvec(np.radians(config.rotation_deg) * axis).apply(
+        right / np.linalg.norm(right)
+    )
     return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
 
 
@@ -60,7 +62,9 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
         tangent = tangent - excess / (1 + 3 * config.distortion * tangent**2)
     stretch = np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
     own = np.column_stack([chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))])
-    return np.asarray(own_from_lab(config).inv().apply(own / np.linalg.norm(own, axis=1, keepdims=True)))
+    return np.asarray(
+        own_from_lab(config).inv().apply(own / np.linalg.norm(own, axis=1, keepdims=True))
+    )
 
 
 def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
@@ -70,15 +74,19 @@ def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
     return np.asarray((config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch)
 
 
-def spot_radius_m(config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats, normal: Floats) -> Floats:
+def spot_radius_m(
+    config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats, normal: Floats
+) -> Floats:
     """(N,) radius of a uniform disk with the mean square radius of each block's image on the wall.
 
     A parallelogram with the edges a, b has the mean square distance (a^2 + b^2) / 12 from its center, a disk r^2 / 2.
     The edges are traced. The defocus disk is projected along the ray onto the wall: v to v - (n . v) / (n . u) u.
     """
-    position_m, R_own_from_lab = np.array(config.position_m), own_from_lab(config).as_matrix()
+    position_m = np.array(config.position_m)
+    R_own_from_lab = own_from_lab(config).as_matrix()
     ray = rays(config, chip_m)
-    square_m2, half_m = np.zeros(len(chip_m)), config.block * config.pitch_m / 2
+    square_m2 = np.zeros(len(chip_m))
+    half_m = config.block * config.pitch_m / 2
     for axis in np.eye(2):
         ends = [rays(config, chip_m + side * half_m * axis) for side in (1, -1)]
         first_m, last_m = (surface.exit_m(position_m, end)[:, None] * end for end in ends)
@@ -92,7 +100,9 @@ def spot_radius_m(config: ProjectorConfig, surface: Surface, chip_m: Floats, pla
     return np.asarray(np.sqrt(square_m2))
 
 
-def projector_sources(config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band, stars: Sources) -> Sources:
+def projector_sources(
+    config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band, stars: Sources
+) -> Sources:
     """Stars drawn on the nearest blocks of pixels, as disks on the wall where the projector's rays meet it.
 
     stars : as LEDs that are always lit, on the surface. Numbers are theirs; the picture is drawn for the lens's
@@ -102,7 +112,9 @@ def projector_sources(config: ProjectorConfig, surface: Surface, led: LedConfig,
     """
     position_m = np.array(config.position_m)
     if not surface.inside(position_m):
-        raise InputError("light.layout.position", f"{config.position_m} m is outside of the dome", "inside")
+        raise InputError(
+            "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
+        )
     chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.place[:, :3] - position_m))
     if not shown.all():
         raise InputError(
@@ -115,11 +127,15 @@ def projector_sources(config: ProjectorConfig, surface: Surface, led: LedConfig,
     ray = rays(config, drawn_m)
     place_m = surface.meet(position_m, ray)
     if np.isnan(place_m).any():
-        raise InputError("light.layout.points", "a star's pixel is below the dome's rim", "a smaller cap_deg")
+        raise InputError(
+            "light.layout.points", "a star's pixel is below the dome's rim", "a smaller cap_deg"
+        )
     normal = surface.inward(place_m)
     lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
     cos_axis = ray @ own_from_lab(config).as_matrix()[2]
-    patches = Patches(place_m, normal, np.hypot(lens_disk_m, led.disk_diameter_m / 2), cos_axis**config.falloff)
+    patches = Patches(
+        place_m, normal, np.hypot(lens_disk_m, led.disk_diameter_m / 2), cos_axis**config.falloff
+    )
     return block_sources(config, led, band, stars, blocks, patches, 0.0)
 
 

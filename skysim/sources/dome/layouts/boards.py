@@ -39,7 +39,9 @@ class Boards:
     v: Floats
 
 
-def patch_boards(config: PatchBoardsConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def patch_boards(
+    config: PatchBoardsConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """3x3 boards glued flat to the surface, listed or spread evenly, each with its own choice of LEDs and levels.
 
     A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. The glue
@@ -47,7 +49,9 @@ def patch_boards(config: PatchBoardsConfig, surface: Surface, led: LedConfig, ba
     from config.hardware_seed: which LEDs are soldered, their levels and strengths, the phases of their pulses.
     """
     rng = random_stream(config.hardware_seed)
-    boards, holes, level = listed_boards(config, surface) if config.boards else spread_boards(config, surface, rng)
+    boards, holes, level = (
+        listed_boards(config, surface) if config.boards else spread_boards(config, surface, rng)
+    )
     board = np.repeat(np.arange(len(holes)), [len(board_holes) for board_holes in holes])
     hole = np.concatenate(holes)
     if level is None:
@@ -64,7 +68,10 @@ def patch_boards(config: PatchBoardsConfig, surface: Surface, led: LedConfig, ba
     )
     number = (board * HOLES + hole).astype(np.int64)
     return led_sources(
-        PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan)), led, band, rng
+        PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan)),
+        led,
+        band,
+        rng,
     )
 
 
@@ -75,7 +82,8 @@ def spread_boards(
 
     On a spiral each board has a random orientation; on a grid all are aligned with its rows.
     """
-    half, spacing_m = np.radians(config.cap_deg), config.spacing_m or config.pitch_m
+    half = np.radians(config.cap_deg)
+    spacing_m = config.spacing_m or config.pitch_m
     apex_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))[0, 2]
     if config.spread == "grid":
         directions = grid(spacing_m / apex_m, half)
@@ -86,7 +94,10 @@ def spread_boards(
         directions = cap(max(1, round(area_m2 / spacing_m**2)), half)
         rotation = rng.uniform(0, 2 * np.pi, len(directions))
     boards = tangent_boards(surface, project_from_bearing(surface, directions), rotation)
-    holes = [rng.permutation(HOLES)[: rng.integers(config.lit[0], config.lit[1] + 1)] for _ in range(len(rotation))]
+    holes = [
+        rng.permutation(HOLES)[: rng.integers(config.lit[0], config.lit[1] + 1)]
+        for _ in range(len(rotation))
+    ]
     return boards, holes, None
 
 
@@ -100,7 +111,9 @@ def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
     x, y = (axis.ravel() * spacing_rad for axis in np.meshgrid(*2 * [np.arange(-steps, steps + 1)]))
     radius2 = x**2 + y**2
     within = radius2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
-    x, y, radius2 = x[within], y[within], radius2[within]
+    x = x[within]
+    y = y[within]
+    radius2 = radius2[within]
     # Inverse of the map: at the radius rho, z = 1 - rho^2 / 2, at the distance rho sqrt(1 - rho^2 / 4) from the axis.
     scale = np.sqrt(1 - radius2 / 4)
     return np.column_stack([x * scale, y * scale, 1 - radius2 / 2])
@@ -135,10 +148,8 @@ def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> 
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(normal, across)
     rotation = rotation_rad[:, None]
-    u, v = (
-        across * np.cos(rotation) + along * np.sin(rotation),
-        along * np.cos(rotation) - across * np.sin(rotation),
-    )
+    u = across * np.cos(rotation) + along * np.sin(rotation)
+    v = along * np.cos(rotation) - across * np.sin(rotation)
     return Boards(center_m, normal, u, v)
 
 
@@ -149,4 +160,9 @@ def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boa
     azimuth = rng.uniform(0, 2 * np.pi, count)[:, None]
     axis = boards.u * np.cos(azimuth) + boards.v * np.sin(azimuth)
     rotation = Rotation.from_rotvec(angle[:, None] * axis)
-    return replace(boards, normal=rotation.apply(boards.normal), u=rotation.apply(boards.u), v=rotation.apply(boards.v))
+    return replace(
+        boards,
+        normal=rotation.apply(boards.normal),
+        u=rotation.apply(boards.u),
+        v=rotation.apply(boards.v),
+    )

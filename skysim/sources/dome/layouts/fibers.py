@@ -21,7 +21,9 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig
 from skysim.sources.dome.shell.surface import Surface, perpendicular
 
-SHELL_STREAM = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
+SHELL_STREAM = (
+    2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
+)
 AIMING_STREAM = 5  # spawn key of the laser's errors
 
 
@@ -33,18 +35,27 @@ def displace_ends(config: FibersConfig, surface: Surface, fibers: Sources) -> So
     error is along the line of sight sees an end displaced by up to (r / R) v rad (JHU/APL's .4 % of 4 ft, 50 mm off:
     34"). Normals are those of the design. The random stream is that of config.points.hardware_seed.
     """
-    seed, place_m = config.points.hardware_seed, fibers.place[:, :3]
-    fraction = config.radius_variation * random_stream(seed, SHELL_STREAM).uniform(-1, 1, len(fibers))
+    seed = config.points.hardware_seed
+    place_m = fibers.place[:, :3]
+    fraction = config.radius_variation * random_stream(seed, SHELL_STREAM).uniform(
+        -1, 1, len(fibers)
+    )
     outward_m = fraction * np.linalg.norm(place_m, axis=1)
     if config.aiming is None:
         moved = place_m - outward_m[:, None] * fibers.normal
     else:
-        moved = marked_m(config.aiming, surface, place_m, outward_m, random_stream(seed, AIMING_STREAM))
+        moved = marked_m(
+            config.aiming, surface, place_m, outward_m, random_stream(seed, AIMING_STREAM)
+        )
     return dataclasses.replace(fibers, place=np.column_stack([moved, fibers.place[:, 3]]))
 
 
 def marked_m(
-    config: AimingConfig, surface: Surface, place_m: Floats, outward_m: Floats, rng: np.random.Generator
+    config: AimingConfig,
+    surface: Surface,
+    place_m: Floats,
+    outward_m: Floats,
+    rng: np.random.Generator,
 ) -> Floats:
     """(N, 3) places of holes that a laser marks for designed places (N, 3) of a surface that is outward_m off there.
 
@@ -56,16 +67,23 @@ def marked_m(
     """
     laser_m = np.array(config.laser_m)
     if not surface.inside(laser_m):
-        raise InputError("light.layout.aiming.laser", f"{config.laser_m} m is outside of the dome", "inside")
+        raise InputError(
+            "light.layout.aiming.laser", f"{config.laser_m} m is outside of the dome", "inside"
+        )
     sight_m = place_m - laser_m
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
     common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
-    angles = scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2))) * ARCSEC_RAD
+    angles = (
+        scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
+        * ARCSEC_RAD
+    )
     line = Rotation.from_rotvec(common).apply(line + along_two_axes(line, angles))
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
-        raise InputError("light.layout.aiming", "the laser's line passes below the rim", "a smaller cap_deg")
+        raise InputError(
+            "light.layout.aiming", "the laser's line passes below the rim", "a smaller cap_deg"
+        )
     normal = surface.inward(mark_m)
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line
     drill_m = scaled_errors(config.drill_sigma_m, rng.standard_normal((len(line), 2)))

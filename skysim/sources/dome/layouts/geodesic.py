@@ -36,7 +36,8 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
     turned = azimuth_rad[order] + np.radians(config.rotation_deg)
-    ring, z = np.sin(tilt_rad[order]), np.cos(tilt_rad[order])
+    ring = np.sin(tilt_rad[order])
+    z = np.cos(tilt_rad[order])
     directions = np.column_stack([ring * np.cos(turned), ring * np.sin(turned), z])
     return lit_sources(config, surface, project_from_bearing(surface, directions), led, band)
 
@@ -44,10 +45,14 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
 def geodesic_vertices(frequency: int, class_: str) -> Floats:
     """(10 T + 2, 3) unit vectors of all vertices; see the module's docstring. frequency is even in class II."""
     corners = icosahedron()
-    weights: set[tuple[tuple[int, int], ...]] = set()  # corners with their weights: the same from every face
+    weights: set[tuple[tuple[int, int], ...]] = (
+        set()
+    )  # corners with their weights: the same from every face
     for face in icosahedron_faces():
         for lattice in lattice_points(frequency, class_):
-            weights.add(tuple(sorted((corner, n) for corner, n in zip(face, lattice, strict=True) if n)))
+            weights.add(
+                tuple(sorted((corner, n) for corner, n in zip(face, lattice, strict=True) if n))
+            )
     points = np.array([sum(n * corners[corner] for corner, n in each) for each in sorted(weights)])
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
@@ -64,7 +69,8 @@ def lattice_points(frequency: int, class_: str) -> Iterator[tuple[int, int, int]
 
 def icosahedron() -> Floats:
     """(12, 3) unit vectors: the zenith, five at z = 1 / sqrt 5, five at -1 / sqrt 5 between them, the nadir."""
-    z, ring = 1 / np.sqrt(5), 2 / np.sqrt(5)
+    z = 1 / np.sqrt(5)
+    ring = 2 / np.sqrt(5)
     azimuth = np.arange(5) * (2 * np.pi / 5)
     upper = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(5, z)])
     between = azimuth + np.pi / 5
@@ -77,7 +83,10 @@ def icosahedron_faces() -> list[tuple[int, int, int]]:
     faces = []
     for n in range(5):
         following = (n + 1) % 5
-        upper, next_upper, lower, next_lower = 1 + n, 1 + following, 6 + n, 6 + following
+        upper = 1 + n
+        next_upper = 1 + following
+        lower = 6 + n
+        next_lower = 6 + following
         faces += [(0, upper, next_upper), (upper, lower, next_upper)]
         faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
     return faces

@@ -16,13 +16,19 @@ from skysim.sources.dome.led import full_strength_e_s_sr
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
-BUILT = {"glue_scatter_m": 0.0, "glue_tilt_deg": 0.0, "pitch_error": 0.0}  # errors of a layout as built
+BUILT = {
+    "glue_scatter_m": 0.0,
+    "glue_tilt_deg": 0.0,
+    "pitch_error": 0.0,
+}  # errors of a layout as built
 AIMED = {"aiming": None, "radius_variation": 0.0}  # and of places that a laser marks
 HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt
 # from the zenith, seen from there; level: nominal brightness, 1 at the full drive{tape}.
 """
-TAPE = "; tape: number of the\n# tape from the zenith; tape_m: from its first LED, along the surface"
+TAPE = (
+    "; tape: number of the\n# tape from the zenith; tape_m: from its first LED, along the surface"
+)
 
 
 def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
@@ -33,12 +39,17 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     """
     leds = design_leds(config, build_surface(config.surface), band)
     place_m = leds.place[:, :3]
-    level = leds.strength / max(full_strength_e_s_sr(ideal_led(config.led), band), float(leds.strength.max()))
+    level = leds.strength / max(
+        full_strength_e_s_sr(ideal_led(config.led), band), float(leds.strength.max())
+    )
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
     tilt_deg = np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
     columns = {
         "id": [f"{number}" for number in leds.id],
-        **{f"{axis}_m": [f"{value:.12f}" for value in place_m[:, n]] for n, axis in enumerate("xyz")},
+        **{
+            f"{axis}_m": [f"{value:.12f}" for value in place_m[:, n]]
+            for n, axis in enumerate("xyz")
+        },
         "azimuth_deg": [f"{value:.6f}" for value in azimuth_deg],
         "tilt_deg": [f"{value:.6f}" for value in tilt_deg],
     }
@@ -57,7 +68,9 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
 def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
     """The LEDs of a dome as designed: without their scatter, and without errors of glue, tape and laser."""
     errors = AIMED if getattr(config.layout, "aiming", None) else BUILT
-    layout = config.layout.model_copy(update={key: none for key, none in errors.items() if hasattr(config.layout, key)})
+    layout = config.layout.model_copy(
+        update={key: none for key, none in errors.items() if hasattr(config.layout, key)}
+    )
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 

@@ -53,7 +53,9 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
         coordinates = np.array(config.positions_m or config.directions_deg)
     directions = coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
     check_cap(key, directions, config.cap_deg)
-    place_m = coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
+    place_m = (
+        coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
+    )
     check_on_surface(key, surface, place_m)
     level = level if level is not None and len(level) else np.ones(len(place_m))
     placed = on_surface(surface, place_m, level)
@@ -67,7 +69,11 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
     offset_m = np.linalg.norm(project_from_bearing(surface, directions) - place_m, axis=1)
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
     if len(far):
-        raise InputError(f"{key}.{far[0]}", f"{offset_m[far[0]]:.3g} m from the surface", f"{MAX_SURFACE_OFFSET_M:g} m")
+        raise InputError(
+            f"{key}.{far[0]}",
+            f"{offset_m[far[0]]:.3g} m from the surface",
+            f"{MAX_SURFACE_OFFSET_M:g} m",
+        )
 
 
 def read_csv(path: Path) -> LedFile:
@@ -81,14 +87,23 @@ def read_csv(path: Path) -> LedFile:
         text = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            "light.layout.file", f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
+            "light.layout.file",
+            f"{path} cannot be read: {getattr(error, 'strerror', None) or error}",
         ) from None
-    lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
+    lines = [
+        (n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")
+    ]
     names = split_row(lines[0][1]) if lines else []
     chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)
     brightness = [name for name in names if name in BRIGHTNESS]
     known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
-    if chosen is None or len(brightness) > 1 or len({*names}) < len(names) or {*names} - known or len(lines) < 2:
+    if (
+        chosen is None
+        or len(brightness) > 1
+        or len({*names}) < len(names)
+        or {*names} - known
+        or len(lines) < 2
+    ):
         raise InputError(
             path,
             "not a list of LEDs",
@@ -100,7 +115,11 @@ def read_csv(path: Path) -> LedFile:
     level = column.get("level")
     if "magnitude" in column:
         level = np.array(relative_levels(column["magnitude"].tolist()))
-    return LedFile(np.column_stack([column[name] for name in chosen]), level, led_numbers(path, column.get("id")))
+    return LedFile(
+        np.column_stack([column[name] for name in chosen]),
+        level,
+        led_numbers(path, column.get("id")),
+    )
 
 
 def split_row(line: str) -> list[str]:

@@ -47,7 +47,9 @@ class PlacedLeds:
     magnitude: Floats
 
 
-def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.Generator) -> Sources:
+def led_sources(
+    placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.Generator
+) -> Sources:
     """Sources of placed LEDs: strength with its scatter from LED to LED, and the drive's pulse timing.
 
     rng is the hardware's.
@@ -80,7 +82,9 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.G
 def on_surface(surface: Surface, place_m: Floats, level: Floats) -> PlacedLeds:
     """LEDs at (N, 3) places with the surface's normals there, numbered from 0."""
     number = np.arange(len(place_m), dtype=np.int64)
-    return PlacedLeds(number, place_m, surface.inward(place_m), level, np.full(len(place_m), np.nan))
+    return PlacedLeds(
+        number, place_m, surface.inward(place_m), level, np.full(len(place_m), np.nan)
+    )
 
 
 def dimmed_sources(
@@ -100,10 +104,14 @@ def dimmed_sources(
     return led_sources(on_surface(surface, place_m, level), led, band, rng)
 
 
-def lit_sources(config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band) -> Sources:
+def lit_sources(
+    config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band
+) -> Sources:
     """Sources of the drawn fraction of LEDs at (N, 3) places; each keeps its number among all places."""
     rng = random_stream(config.hardware_seed)
-    number = np.sort(rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)])
+    number = np.sort(
+        rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)]
+    )
     return replace(dimmed_sources(config, surface, place_m[number], led, band, rng), id=number)
 
 
@@ -112,20 +120,25 @@ def cap(count: int, half_angle_rad: float) -> Floats:
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(half_angle_rad))
     ring = np.sqrt(1 - z**2)
-    return np.column_stack([ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z])
+    return np.column_stack(
+        [ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z]
+    )
 
 
 def scattered_cap(count: int, half_angle_rad: float, rng: np.random.Generator) -> Floats:
     """(count, 3) independent unit vectors, uniform over a cap about +z: uniform in z and in azimuth."""
     z = 1 - rng.random(count) * (1 - np.cos(half_angle_rad))
-    azimuth, ring = rng.uniform(0, 2 * np.pi, count), np.sqrt(1 - z**2)
+    azimuth = rng.uniform(0, 2 * np.pi, count)
+    ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
 
 
 def directions_from_angles(directions_deg: Any) -> Floats:
     """(N, 3) unit vectors from the bearing, for (N, 2) azimuth from +x toward +y and tilt from +z."""
     azimuth, tilt = np.radians(np.asarray(directions_deg, dtype=float)).T
-    return np.column_stack([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+    return np.column_stack(
+        [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
+    )
 
 
 def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
@@ -146,6 +159,8 @@ def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
     place_m = surface.meet(np.zeros(3), directions)
     if np.isnan(place_m).any():
         raise InputError(
-            "light.layout", "exceeds the surface", "a smaller cap_deg, a larger surface or rim, or kind listed"
+            "light.layout",
+            "exceeds the surface",
+            "a smaller cap_deg, a larger surface or rim, or kind listed",
         )
     return place_m

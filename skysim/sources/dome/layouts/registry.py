@@ -51,7 +51,9 @@ def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: B
 
 def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """Ends of optical fibers at another layout's points, with the errors of shell and holes: `displace_ends`."""
-    return displace_ends(config, surface, LAYOUTS[config.points.kind](config.points, surface, led, band))
+    return displace_ends(
+        config, surface, LAYOUTS[config.points.kind](config.points, surface, led, band)
+    )
 
 
 def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:

@@ -11,17 +11,33 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.layouts import FibonacciConfig, OptimizedConfig, PoissonDiskConfig, RandomPlacesConfig
+from skysim.scene.sections.layouts import (
+    FibonacciConfig,
+    OptimizedConfig,
+    PoissonDiskConfig,
+    RandomPlacesConfig,
+)
 from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.layouts.placing import cap, dimmed_sources, project_from_bearing, scattered_cap
+from skysim.sources.dome.layouts.placing import (
+    cap,
+    dimmed_sources,
+    project_from_bearing,
+    scattered_cap,
+)
 from skysim.sources.dome.placement import optimize
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
-DARTS_PER_SPACING2 = 100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
+DARTS_PER_SPACING2 = (
+    100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
+)
 MAX_DARTS = 3_000_000
 DARTS_PER_LED = 30  # random points per LED, if a count is given
-UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}  # brightness does not move an LED
+UNDIMMED = {
+    "levels": None,
+    "magnitudes": None,
+    "unique_neighbors": None,
+}  # brightness does not move an LED
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
@@ -32,14 +48,20 @@ def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: B
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-def random_places(config: RandomPlacesConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def random_places(
+    config: RandomPlacesConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     rng = random_stream(config.hardware_seed)
-    place_m = project_from_bearing(surface, scattered_cap(config.count, np.radians(config.cap_deg), rng))
+    place_m = project_from_bearing(
+        surface, scattered_cap(config.count, np.radians(config.cap_deg), rng)
+    )
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def poisson_disk(
+    config: PoissonDiskConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -62,11 +84,17 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, ba
     # solid angle are sparsest on the surface, so this maximum sets how many are needed.
     slant = -np.einsum("nj,nj->n", surface.inward(points), directions)
     meters2_sr = np.sum(points**2, axis=1) / slant
-    dart_count = DARTS_PER_SPACING2 * 2 * np.pi * (1 - np.cos(half)) * meters2_sr.max() / config.spacing_m**2
+    dart_count = (
+        DARTS_PER_SPACING2 * 2 * np.pi * (1 - np.cos(half)) * meters2_sr.max() / config.spacing_m**2
+    )
     if not 0 < dart_count <= MAX_DARTS:
-        min_spacing_m = config.spacing_m * np.sqrt(dart_count / MAX_DARTS) if dart_count > 0 else np.inf
+        min_spacing_m = (
+            config.spacing_m * np.sqrt(dart_count / MAX_DARTS) if dart_count > 0 else np.inf
+        )
         raise InputError(
-            "light.layout.spacing", f"{config.spacing_m:g} m gives too many LEDs", f"{min_spacing_m:.3g} m or more"
+            "light.layout.spacing",
+            f"{config.spacing_m:g} m gives too many LEDs",
+            f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
     place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]
@@ -79,17 +107,29 @@ def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: B
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
-    config_of_places, rng = config.model_copy(update=UNDIMMED), random_stream(config.hardware_seed)
+    config_of_places = config.model_copy(update=UNDIMMED)
+    rng = random_stream(config.hardware_seed)
     reach = optimize.field_reach_rad(config, surface)
-    sites = project_from_bearing(surface, scattered_cap(optimize.OPTIONS.sites_per_led * config.count, reach, rng))
-    spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
-    place_m, state = optimized_places(config_of_places, *(points.tobytes() for points in (sites, *spirals)))
+    sites = project_from_bearing(
+        surface, scattered_cap(optimize.OPTIONS.sites_per_led * config.count, reach, rng)
+    )
+    spirals = [
+        project_from_bearing(surface, cap(config.count, half))
+        for half in (np.radians(config.cap_deg), reach)
+    ]
+    place_m, state = optimized_places(
+        config_of_places, *(points.tobytes() for points in (sites, *spirals))
+    )
     rng.bit_generator.state = state
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-@lru_cache(maxsize=32)  # seconds each: a study's trials, its costs and its report ask for the same ones
-def optimized_places(config: OptimizedConfig, sites: bytes, *spirals: bytes) -> tuple[Floats, Mapping[str, Any]]:
+@lru_cache(
+    maxsize=32
+)  # seconds each: a study's trials, its costs and its report ask for the same ones
+def optimized_places(
+    config: OptimizedConfig, sites: bytes, *spirals: bytes
+) -> tuple[Floats, Mapping[str, Any]]:
     """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
 
     sites, spirals : (K, 3) points, m, as bytes, because arrays have no hash

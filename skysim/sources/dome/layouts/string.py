@@ -27,7 +27,8 @@ from skysim.sources.photometry import Band
 STEPS_PER_TURN = 720
 STEPS_PER_PITCH = 16
 MAX_STEPS = 1_000_000  # of all turns
-MERIDIAN_STEPS, MERIDIANS = 400, 36
+MERIDIAN_STEPS = 400
+MERIDIANS = 36
 TAPE_STREAM = 3  # spawn key of the errors of tapes, which leave levels and gaps unchanged
 GLUE_M = 0.3  # of tape over which its sideways error is the same, assumed
 
@@ -60,7 +61,9 @@ class Tape(NamedTuple):
 
     def rays(self, at_m: Floats) -> Floats:
         """(N, 3) unit vectors from the bearing to places along it."""
-        tilt_rad, azimuth_rad = (np.interp(at_m, self.length_m, one) for one in (self.tilt_rad, self.azimuth_rad))
+        tilt_rad, azimuth_rad = (
+            np.interp(at_m, self.length_m, one) for one in (self.tilt_rad, self.azimuth_rad)
+        )
         return directions(tilt_rad, azimuth_rad)
 
 
@@ -82,8 +85,14 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     meridian = mean_meridian(surface, np.radians(config.cap_deg))
     tapes = WINDINGS[config.winding](config, surface, meridian)
     if not tapes:
-        return Wound(project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]])), np.zeros(1, np.int64), np.zeros(1))
-    design_m = [config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float) for tape in tapes]
+        return Wound(
+            project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]])),
+            np.zeros(1, np.int64),
+            np.zeros(1),
+        )
+    design_m = [
+        config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float) for tape in tapes
+    ]
     rng = random_stream(config.hardware_seed, TAPE_STREAM)
     stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
     place_m = [
@@ -122,7 +131,9 @@ def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Flo
 def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
     """(..., 3) unit vectors from the bearing."""
     ring = np.sin(tilt_rad)
-    return np.stack([ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)], axis=-1)
+    return np.stack(
+        [ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)], axis=-1
+    )
 
 
 def mean_meridian(surface: Surface, half_rad: float) -> Meridian:
@@ -151,12 +162,23 @@ def check_length(length_m: float, turns: float, config: StringConfig) -> None:
 def circles(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
     """Tapes on circles of equal tilt, each from azimuth 0."""
     arcs_m = np.arange(config.spacing_m / 2, meridian.arc_m[-1], config.spacing_m)
-    check_length(2 * np.pi * float(np.interp(arcs_m, meridian.arc_m, meridian.ring_m).sum()), len(arcs_m), config)
+    check_length(
+        2 * np.pi * float(np.interp(arcs_m, meridian.arc_m, meridian.ring_m).sum()),
+        len(arcs_m),
+        config,
+    )
     tapes = []
     for tilt_rad in np.interp(arcs_m, meridian.arc_m, meridian.tilt_rad):
         ring_m = float(np.interp(tilt_rad, meridian.tilt_rad, meridian.ring_m))
         steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * 2 * np.pi * ring_m / config.pitch_m))
-        tapes.append(lay(surface, np.full(steps + 1, tilt_rad), np.linspace(0, 2 * np.pi, steps + 1), closed=True))
+        tapes.append(
+            lay(
+                surface,
+                np.full(steps + 1, tilt_rad),
+                np.linspace(0, 2 * np.pi, steps + 1),
+                closed=True,
+            )
+        )
     return tapes
 
 
@@ -165,7 +187,9 @@ def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     turns = float(meridian.arc_m[-1]) / config.spacing_m
     arc_m = np.linspace(0, meridian.arc_m[-1], int(20 * turns) + 1000)
     azimuth_rad = 2 * np.pi * arc_m / config.spacing_m
-    per_rad_m = np.hypot(np.interp(arc_m, meridian.arc_m, meridian.ring_m), config.spacing_m / (2 * np.pi))
+    per_rad_m = np.hypot(
+        np.interp(arc_m, meridian.arc_m, meridian.ring_m), config.spacing_m / (2 * np.pi)
+    )
     check_length(float(np.trapezoid(per_rad_m, azimuth_rad)), turns, config)
     # Steps of equal length, and of equal azimuth near the apex, where the tape is most curved.
     per_rad = np.maximum(STEPS_PER_TURN / (2 * np.pi), STEPS_PER_PITCH * per_rad_m / config.pitch_m)
@@ -180,15 +204,20 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
 
     Every second one begins where all are half a spacing apart, half of the others where these are, and so on.
     """
-    count, widest_m = 4, np.maximum.accumulate(meridian.ring_m)
+    count = 4
+    widest_m = np.maximum.accumulate(meridian.ring_m)
     while 2 * np.pi * widest_m[-1] > count * config.spacing_m:
         count *= 2
     check_length(count * float(meridian.arc_m[-1]), count, config)
     steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m))
     tapes = []
     for number in range(count):
-        neighbors = count // math.gcd(number, count // 4)  # strips of the coarsest set that holds this one
-        first_rad = np.interp(neighbors * config.spacing_m / (4 * np.pi), widest_m, meridian.tilt_rad)
+        neighbors = count // math.gcd(
+            number, count // 4
+        )  # strips of the coarsest set that holds this one
+        first_rad = np.interp(
+            neighbors * config.spacing_m / (4 * np.pi), widest_m, meridian.tilt_rad
+        )
         tilt_rad = np.linspace(first_rad, meridian.tilt_rad[-1], steps + 1)
         tapes.append(lay(surface, tilt_rad, np.full(steps + 1, 2 * np.pi * number / count)))
     return tapes

@@ -78,7 +78,9 @@ def field_ambiguity(
     return Ambiguity(fields.center, fields.center[other], fraction)
 
 
-def fields_about(place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float) -> Fields:
+def fields_about(
+    place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float
+) -> Fields:
     """The neighbors of every LED within the tilt, as seen with that LED on the boresight."""
     range_m = np.linalg.norm(place_m, axis=1)
     up = place_m / range_m[:, None]
@@ -86,12 +88,14 @@ def fields_about(place_m: Floats, height_m: float, tilt_rad: float, radius_rad: 
     # Image axes: x = y_lab x boresight, which is defined because the tilt stays below 90 deg.
     across = np.cross([0.0, 1.0, 0.0], up[center])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    x_m, y_m = across @ place_m.T, np.cross(up[center], across) @ place_m.T
+    x_m = across @ place_m.T
+    y_m = np.cross(up[center], across) @ place_m.T
     ahead_m = up[center] @ place_m.T - height_m
     radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
     radius[np.arange(len(center)), center] = np.nan  # the center LED is not its own neighbor
     row, led = np.nonzero(radius <= math.tan(radius_rad))
-    radius, angle_rad = radius[row, led], np.arctan2(y_m[row, led], x_m[row, led])
+    radius = radius[row, led]
+    angle_rad = np.arctan2(y_m[row, led], x_m[row, led])
     order = np.lexsort((radius, row))
     first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(center)))])
     tolerance = coincidence_m / (range_m[center] - height_m)
@@ -102,17 +106,22 @@ def fields_about(place_m: Floats, height_m: float, tilt_rad: float, radius_rad: 
 def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
     """(C,) greatest fraction of each field that another field shows too, at least `least`, and (C,) that field."""
     count = len(fields.center)
-    fraction, other = np.full(count, least), np.arange(count)
+    fraction = np.full(count, least)
+    other = np.arange(count)
     for i in range(count):
         for j in range(i, count):
-            larger = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])
+            larger = 1 + max(
+                fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j]
+            )
             # The exact search is needed only if the pair can raise the maximum of one of its two fields.
             threshold = min(fraction[i], fraction[j]) * larger
             overlap = (1 + max_coincident(fields, i, j, threshold - 1, least > 0)) / larger
             if overlap > fraction[i]:
-                fraction[i], other[i] = overlap, j
+                fraction[i] = overlap
+                other[i] = j
             if overlap > fraction[j]:
-                fraction[j], other[j] = overlap, i
+                fraction[j] = overlap
+                other[j] = i
     return fraction, other
 
 
@@ -123,10 +132,14 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bo
     farther : try only the rotations of the farther half of n neighbors, or of n - threshold if those are more. They
               are more accurate than those of near ones, and of any n - threshold neighbors one must coincide.
     """
-    first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
+    first = fields.first
+    radius = fields.radius
+    angle = fields.angle_rad
+    tolerance = fields.tolerance[i]
     if upper_bound(fields, i, j) <= threshold:
         return 0
-    most, begin = 0, first[j]
+    most = 0
+    begin = first[j]
     inner = max(min(int(threshold), (first[i + 1] - first[i]) // 2), 0) if farther else 0
     for k in range(first[i] + inner, first[i + 1]):
         # Radii ascend, so the window of equal radii in field j only moves forward.
@@ -136,7 +149,9 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bo
         while n < first[j + 1] and radius[n] <= radius[k] + tolerance:
             # The identity, a field laid on itself without rotation, is no ambiguity.
             if i != j or n != k:
-                most = max(most, count_coincident(fields, i, j, angle[n] - angle[k], max(most, threshold)))
+                most = max(
+                    most, count_coincident(fields, i, j, angle[n] - angle[k], max(most, threshold))
+                )
             n += 1
     return most
 
@@ -144,8 +159,11 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bo
 @jit
 def upper_bound(fields: Fields, i: int, j: int) -> int:
     """Upper bound of `count_coincident` over all rotations: neighbors of i with a neighbor of j at an equal radius."""
-    first, radius, tolerance = fields.first, fields.radius, fields.tolerance[i]
-    total, n = 0, first[j]
+    first = fields.first
+    radius = fields.radius
+    tolerance = fields.tolerance[i]
+    total = 0
+    n = first[j]
     for k in range(first[i], first[i + 1]):
         while n < first[j + 1] and radius[n] < radius[k] - tolerance:
             n += 1
@@ -156,8 +174,12 @@ def upper_bound(fields: Fields, i: int, j: int) -> int:
 @jit
 def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, threshold: float) -> int:
     """Neighbors of i that coincide with one of j after i is rotated; fewer if no more than the threshold do."""
-    first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
-    total, begin = 0, first[j]
+    first = fields.first
+    radius = fields.radius
+    angle = fields.angle_rad
+    tolerance = fields.tolerance[i]
+    total = 0
+    begin = first[j]
     for k in range(first[i], first[i + 1]):
         if total + first[i + 1] - k <= threshold:
             break

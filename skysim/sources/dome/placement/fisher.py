@@ -25,7 +25,9 @@ from skysim.core.types import Floats
 
 Ints = NDArray[np.int64]
 
-PRIOR_INFORMATION = 1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
+PRIOR_INFORMATION = (
+    1e-6  # prior information, rad^-2, that keeps M invertible when too few LEDs are in view
+)
 HARDNESS = 10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
 COLUMNS = 4  # columns of the attitude index per half width of the search window
 MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field lacks of the minimum
@@ -60,8 +62,10 @@ def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
     """Write the information of one LED at b (body axes) to out (7,): J'J and a 1. The module docstring derives J."""
     # gx = b x (dx, 0, x) and gy = b x (0, dy, y): the rows of J.
     ahead_m = b[2] - camera_m[2]
-    dx, dy = 1 / ahead_m, 1 / ahead_m
-    x, y = -(b[0] - camera_m[0]) / ahead_m**2, -(b[1] - camera_m[1]) / ahead_m**2
+    dx = 1 / ahead_m
+    dy = 1 / ahead_m
+    x = -(b[0] - camera_m[0]) / ahead_m**2
+    y = -(b[1] - camera_m[1]) / ahead_m**2
     gx = (b[1] * x, b[2] * dx - b[0] * x, -b[1] * dx)
     gy = (b[1] * y - b[2] * dy, -b[0] * y, b[0] * dy)
     for i in range(3):
@@ -94,15 +98,20 @@ def visible_from(
     Only attitudes whose boresight is within the chord `max_chord` of the site are tested. To find them, the boresights
     are sorted into columns of lab x, and by lab y within each column.
     """
-    b, chord = np.empty(3), max_chord(sites_m, camera_m, tan_half)
+    b = np.empty(3)
+    chord = max_chord(sites_m, camera_m, tan_half)
     columns = max(int(2 * COLUMNS / chord), 1)
-    column = np.minimum(((R_body_from_lab[:, 2, 0] + 1) / 2 * columns).astype(np.int64), columns - 1)
+    column = np.minimum(
+        ((R_body_from_lab[:, 2, 0] + 1) / 2 * columns).astype(np.int64), columns - 1
+    )
     # |y| <= 1, so the factor 4 keeps the columns apart in one sort key.
     order = np.argsort(4.0 * column + R_body_from_lab[:, 2, 1])
-    R, y = R_body_from_lab[order], R_body_from_lab[order, 2, 1]
+    R = R_body_from_lab[order]
+    y = R_body_from_lab[order, 2, 1]
     first = np.searchsorted(column[order], np.arange(columns + 1))
     start = np.zeros(len(sites_m) + 1, dtype=np.int64)
-    attitude, information = np.empty(1024, dtype=np.int64), np.empty((1024, 7))
+    attitude = np.empty(1024, dtype=np.int64)
+    information = np.empty((1024, 7))
     m = 0
     for k in range(len(sites_m)):
         direction = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
@@ -126,7 +135,9 @@ def visible_from(
     return start, attitude[:m], information[:m]
 
 
-def total_information(place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats) -> Floats:
+def total_information(
+    place_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
+) -> Floats:
     """(A, 7) information of all LEDs in the field of each attitude; the last column is their number."""
     visibility = Visibility(*visible_from(place_m, R_body_from_lab, camera_m, tan_half))
     return sum_information(np.arange(len(place_m)), visibility, len(R_body_from_lab))
@@ -138,14 +149,12 @@ def variance(m: Floats) -> float:
 
     Principal minors over the determinant, with PRIOR_INFORMATION added to the diagonal.
     """
-    a, b, c, d, e, f = (
-        m[0] + PRIOR_INFORMATION,
-        m[1] + PRIOR_INFORMATION,
-        m[2] + PRIOR_INFORMATION,
-        m[3],
-        m[4],
-        m[5],
-    )
+    a = m[0] + PRIOR_INFORMATION
+    b = m[1] + PRIOR_INFORMATION
+    c = m[2] + PRIOR_INFORMATION
+    d = m[3]
+    e = m[4]
+    f = m[5]
     minors = (a * b - d * d) + (a * c - e * e) + (b * c - f * f)
     determinant = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
     return minors / max(determinant, 1e-30)
@@ -197,7 +206,9 @@ def add_led(site: int, sign: int, visibility: Visibility, total: Floats) -> None
 
 
 @jit
-def update_costs(site: int, visibility: Visibility, total: Floats, attitude_cost: Floats, min_leds: int) -> float:
+def update_costs(
+    site: int, visibility: Visibility, total: Floats, attitude_cost: Floats, min_leds: int
+) -> float:
     """Recompute the cost of the attitudes that see a site, in place, and return the change of the sum."""
     change = 0.0
     for m in range(visibility.start[site], visibility.start[site + 1]):

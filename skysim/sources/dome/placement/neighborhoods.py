@@ -33,10 +33,13 @@ def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.
             return level
         tried = level.copy()
         some = rng.permutation(alike)[: max(len(alike) // 10, 1)]  # fewer at a time toward the end
-        tried[rng.choice(np.append(around[some].ravel(), some), len(some))] = rng.integers(0, levels, len(some))
+        tried[rng.choice(np.append(around[some].ravel(), some), len(some))] = rng.integers(
+            0, levels, len(some)
+        )
         after = alike_leds(tried, around, levels)
         if len(after) <= len(alike):
-            level, alike = tried, after
+            level = tried
+            alike = after
     raise InputError(
         "light.layout.unique_neighbors",
         f"{nearest} with {levels} levels leave some of {count} LEDs alike",
@@ -58,7 +61,9 @@ def neighbors(position_m: Floats, nearest: int) -> Ints:
 
 def alike_leds(level: Ints, around: Ints, levels: int) -> Ints:
     """LEDs with a neighborhood that another LED has too."""
-    _, number, count = np.unique(neighborhoods(level, around, levels), return_inverse=True, return_counts=True)
+    _, number, count = np.unique(
+        neighborhoods(level, around, levels), return_inverse=True, return_counts=True
+    )
     return np.flatnonzero(count[number] > 1)
 
 

@@ -138,7 +138,11 @@ class PlacementScore(NamedTuple):
 
         The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
-        variance = np.sort(variances(total_information(place_m, self.R_body_from_lab, *camera_geometry(self.config))))
+        variance = np.sort(
+            variances(
+                total_information(place_m, self.R_body_from_lab, *camera_geometry(self.config))
+            )
+        )
         tail = math.ceil(self.options.tail_fraction * len(variance))
         return float(variance[-tail:].mean()) / self.reference
 
@@ -153,7 +157,8 @@ class PlacementScore(NamedTuple):
         In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
         sees fewer than two LEDs; the tail variance, times 1 + the fraction of ambiguous fields.
         """
-        tail, ambiguity = self.tail_variance(place_m), layout_ambiguity(self.config, place_m)
+        tail = self.tail_variance(place_m)
+        ambiguity = layout_ambiguity(self.config, place_m)
         hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
         fewest = total_information(place_m, hardest, *camera_geometry(self.config))[:, 6].min()
         ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
@@ -215,7 +220,9 @@ def optimize_places(
         else (options.dense_steps, options.dense_field)
     )
     search = Search(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
-    count = np.clip(options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes)
+    count = np.clip(
+        options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes
+    )
     best_m = best([best_m, *descend(search, start_m, int(count), rng)])
     return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
 
@@ -233,7 +240,10 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     """
     direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     z = 1 - fraction * (1 - direction[:, 2])
-    xy = direction[:, :2] * np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))[:, None]
+    xy = (
+        direction[:, :2]
+        * np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))[:, None]
+    )
     site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
     return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
 
@@ -253,16 +263,23 @@ class Search(NamedTuple):
         spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
         low, high = np.log(self.steps)
         step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
-        return self.sites_m[self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]]
+        return self.sites_m[
+            self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]
+        ]
 
 
-def descend(search: Search, place_m: Floats, attitude_count: int, rng: np.random.Generator) -> list[Floats]:
+def descend(
+    search: Search, place_m: Floats, attitude_count: int, rng: np.random.Generator
+) -> list[Floats]:
     """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
 
     attitude_count : number of attitudes in the first generation's cost
     """
-    config, options, field_fraction = search.config, search.options, search.field_fraction
-    candidates, R_body_from_lab = [], sample_attitudes(config, attitude_count, rng)
+    config = search.config
+    options = search.options
+    field_fraction = search.field_fraction
+    candidates = []
+    R_body_from_lab = sample_attitudes(config, attitude_count, rng)
     last_rounds = np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
     for n in range(config.rounds):
         if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
@@ -274,8 +291,11 @@ def descend(search: Search, place_m: Floats, attitude_count: int, rng: np.random
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
         # Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
         both_m = np.concatenate([place_m, search.propose(place_m, rng)])
-        visibility = Visibility(*visible_from(both_m, R_body_from_lab, *camera_geometry(config, field_fraction)))
-        chosen, order = np.arange(config.count), rng.permutation(config.count)
+        visibility = Visibility(
+            *visible_from(both_m, R_body_from_lab, *camera_geometry(config, field_fraction))
+        )
+        chosen = np.arange(config.count)
+        order = rng.permutation(config.count)
         try_moves(
             chosen,
             both_m,
@@ -290,7 +310,9 @@ def descend(search: Search, place_m: Floats, attitude_count: int, rng: np.random
     return [*candidates, place_m]
 
 
-def visible_fraction(config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
+def visible_fraction(
+    config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator
+) -> float:
     """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
     total = total_information(sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config))
     return float(total[:, 6].mean()) / len(sites_m)
@@ -316,7 +338,8 @@ def hardest_attitudes(
     sample = sample_attitudes(config, options.fresh_attitudes, rng)
     sample_cost = attitude_costs(sample)
     worst = np.argsort(sample_cost)[-options.hardest_attitudes :]
-    hardest, cost = sample[worst], sample_cost[worst]
+    hardest = sample[worst]
+    cost = sample_cost[worst]
     half = tan_half(config)
     step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
     for _ in range(options.perturbations):
@@ -324,11 +347,14 @@ def hardest_attitudes(
         perturbed = perturbation.as_matrix() @ hardest
         new_cost = attitude_costs(perturbed)
         harder = (new_cost > cost) & (perturbed[:, 2, 2] >= math.cos(math.radians(config.tilt_deg)))
-        hardest[harder], cost[harder] = perturbed[harder], new_cost[harder]
+        hardest[harder] = perturbed[harder]
+        cost[harder] = new_cost[harder]
     return hardest
 
 
-def sample_attitudes(config: layouts.OptimizedConfig, count: int, rng: np.random.Generator) -> Floats:
+def sample_attitudes(
+    config: layouts.OptimizedConfig, count: int, rng: np.random.Generator
+) -> Floats:
     """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
     # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
     unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
@@ -337,7 +363,9 @@ def sample_attitudes(config: layouts.OptimizedConfig, count: int, rng: np.random
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
 
 
-def camera_geometry(config: layouts.OptimizedConfig, field_fraction: float = 1.0) -> tuple[Floats, Floats]:
+def camera_geometry(
+    config: layouts.OptimizedConfig, field_fraction: float = 1.0
+) -> tuple[Floats, Floats]:
     """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `field_fraction`."""
     return np.array(config.camera_m), field_fraction * tan_half(config)
 
@@ -354,12 +382,17 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
     in all azimuths and at every yaw.
     """
-    half_diagonal, azimuth = np.hypot(*tan_half(config)), np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    cone = np.column_stack([half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)])
+    half_diagonal = np.hypot(*tan_half(config))
+    azimuth = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    cone = np.column_stack(
+        [half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)]
+    )
     angles = [(a, math.radians(config.tilt_deg), yaw) for a in azimuth for yaw in azimuth[::2]]
     reach = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", angles):
-        met_m = surface.meet(lab_from_body.apply(np.array(config.camera_m)), lab_from_body.apply(cone))
+        met_m = surface.meet(
+            lab_from_body.apply(np.array(config.camera_m)), lab_from_body.apply(cone)
+        )
         met_m = met_m[np.isfinite(met_m[:, 0])]
         reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
     return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
@@ -392,7 +425,8 @@ def try_moves(
     total = sum_information(chosen, visibility, attitude_count)
     attitude_cost = costs(total, min_leds)
     for n in range(len(moved)):
-        old, new = chosen[moved[n]], target[n]
+        old = chosen[moved[n]]
+        new = target[n]
         if old == new or not has_room(new, moved[n], chosen, sites_m, spacing_m):
             continue
         # Only attitudes that see the old or the new site change. The cost is a sum over attitudes, so the changes at
@@ -415,14 +449,16 @@ def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> In
     Fewer than `count` if even spacing_m does not leave room for them.
     """
     chosen = thin(sites_m, spacing_m, count)
-    low_m, high_m = spacing_m, float(np.ptp(sites_m, axis=0).max())
+    low_m = spacing_m
+    high_m = float(np.ptp(sites_m, axis=0).max())
     for _ in range(bisections):
         middle_m = (low_m + high_m) / 2
         wider = thin(sites_m, middle_m, count)
         if len(wider) < count:
             high_m = middle_m
         else:
-            low_m, chosen = middle_m, wider
+            low_m = middle_m
+            chosen = wider
     return chosen
 
 
@@ -431,7 +467,8 @@ def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 
     This is random sequential adsorption where the sites are in random order.
     """
-    tree, free = cKDTree(sites_m), np.ones(len(sites_m), dtype=bool)
+    tree = cKDTree(sites_m)
+    free = np.ones(len(sites_m), dtype=bool)
     taken: list[int] = []
     for site in range(len(sites_m)):
         if free[site] and (count is None or len(taken) < count):
@@ -447,19 +484,26 @@ def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambigu
     """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
     assert config.camera_m is not None, "completed by the scene"
-    return field_ambiguity(place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m)
+    return field_ambiguity(
+        place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m
+    )
 
 
-def reduce_ambiguity(scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator) -> Floats:
+def reduce_ambiguity(
+    scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator
+) -> Floats:
     """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess_overlap`.
 
     A field is ambiguous if more than `max_overlap` of its LEDs coincide with another field's. The worst variances may
     rise by `variance_slack` in total, but not beyond those of the best even layout. Ambiguity that remains after
     `ambiguity_trials` is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
     """
-    config, options, tree = scorer.config, scorer.options, cKDTree(sites_m)
+    config = scorer.config
+    options = scorer.options
+    tree = cKDTree(sites_m)
     ambiguity = layout_ambiguity(config, place_m)
-    tail, under_two = scorer.tail_variance(place_m), scorer.under_two(place_m)
+    tail = scorer.tail_variance(place_m)
+    under_two = scorer.under_two(place_m)
     max_tail = max(tail, min(1.0, tail * (1 + options.variance_slack)))
     for _ in range(options.ambiguity_trials):
         ambiguous = np.flatnonzero(ambiguity.fraction > options.max_overlap)
@@ -480,7 +524,8 @@ def reduce_ambiguity(scorer: PlacementScore, place_m: Floats, sites_m: Floats, r
         if not less_excess or scorer.under_two(trial_m) > under_two:
             continue
         if scorer.tail_variance(trial_m) <= max_tail:
-            place_m, ambiguity = trial_m, trial_ambiguity
+            place_m = trial_m
+            ambiguity = trial_ambiguity
     return place_m
 
 

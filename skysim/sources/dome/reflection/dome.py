@@ -22,6 +22,11 @@ def reflecting_dome(light: object, leds: Sources) -> ReflectingDome | None:
     """The reflecting dome of a scene's light and its LEDs; None if nothing reflects."""
     if not isinstance(light, DomeConfig) or light.reflection is None:
         return None
-    config, wall = light.reflection, build_surface(light.surface)
-    diffuse = diffuse_light(config, wall, leds, light.led.lobe) if config.diffuse or config.floor else None
+    config = light.reflection
+    wall = build_surface(light.surface)
+    diffuse = (
+        diffuse_light(config, wall, leds, light.led.lobe)
+        if config.diffuse or config.floor
+        else None
+    )
     return ReflectingDome(config, wall, diffuse)

@@ -59,10 +59,14 @@ class DiffuseLight(NamedTuple):
 
     def irradiance_e_s_m2(self, points_m: Floats, normals: Floats) -> Floats:
         """(M,) mean irradiance of points on the wall or the floor, in photo-electrons s^-1 m^-2."""
-        return irradiance(points_m, normals, self.leds) + irradiance(points_m, normals, self.patches)
+        return irradiance(points_m, normals, self.leds) + irradiance(
+            points_m, normals, self.patches
+        )
 
 
-def diffuse_light(config: ReflectionConfig, wall: Surface, leds: Sources, lobe: Lobe) -> DiffuseLight:
+def diffuse_light(
+    config: ReflectionConfig, wall: Surface, leds: Sources, lobe: Lobe
+) -> DiffuseLight:
     """Solve the radiosity equation for the mean light of a dome's LEDs, without their flicker."""
     patches = wall_patches(wall, config.diffuse)
     if config.floor:
@@ -90,11 +94,15 @@ def patch_emitters(patches: Patches, irradiance_e_s_m2: Floats) -> Emitters:
 
 def wall_patches(wall: Surface, reflectance: float) -> Patches:
     """Some PATCHES patches of the wall, of equal solid angle as seen from the bearing's center."""
-    share = max(float(np.isfinite(wall.meet(np.zeros(3), spiral(2000))[:, 0]).mean()), PATCHES / MAX_DIRECTIONS)
+    share = max(
+        float(np.isfinite(wall.meet(np.zeros(3), spiral(2000))[:, 0]).mean()),
+        PATCHES / MAX_DIRECTIONS,
+    )
     toward = spiral(round(PATCHES / share))
     met = wall.meet(np.zeros(3), toward)
     on_wall = np.isfinite(met[:, 0])
-    place_m, normal = met[on_wall], wall.inward(met[on_wall])
+    place_m = met[on_wall]
+    normal = wall.inward(met[on_wall])
     cosine = -np.sum(toward[on_wall] * normal, axis=1)
     area_m2 = np.sum(place_m**2, axis=1) * (4 * np.pi / len(toward)) / cosine
     return Patches(place_m, normal, area_m2, np.full(len(area_m2), reflectance))
@@ -104,9 +112,13 @@ def floor_patches(config: FloorConfig) -> Patches:
     """PATCHES patches of the floor, of equal area, on a spiral."""
     radius_m = config.radius_m * np.sqrt((np.arange(PATCHES) + 0.5) / PATCHES)
     azimuth = np.arange(PATCHES) * GOLDEN_ANGLE_RAD
-    place_m = np.column_stack([radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), 0 * radius_m - config.depth_m])
+    place_m = np.column_stack(
+        [radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), 0 * radius_m - config.depth_m]
+    )
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
-    return Patches(place_m, np.tile([0.0, 0.0, 1.0], (PATCHES, 1)), area_m2, np.full(PATCHES, config.share))
+    return Patches(
+        place_m, np.tile([0.0, 0.0, 1.0], (PATCHES, 1)), area_m2, np.full(PATCHES, config.share)
+    )
 
 
 def joined(wall: Patches, floor: Patches) -> Patches:
@@ -139,7 +151,9 @@ def kernel(patches: Patches) -> Floats:
 
 def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
     """(M,) irradiance of points with unit normals (M, 3) by all emitters, in photo-electrons s^-1 m^-2."""
-    return np.asarray(_irradiance(np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters))
+    return np.asarray(
+        _irradiance(np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters)
+    )
 
 
 @jit(parallel=True)
@@ -157,12 +171,16 @@ def _irradiance(
     for m in numba.prange(len(points_m)):
         total = 0.0
         for n in range(len(place_m)):
-            x, y, z = points_m[m, 0] - place_m[n, 0], points_m[m, 1] - place_m[n, 1], points_m[m, 2] - place_m[n, 2]
+            x = points_m[m, 0] - place_m[n, 0]
+            y = points_m[m, 1] - place_m[n, 1]
+            z = points_m[m, 2] - place_m[n, 2]
             square = x * x + y * y + z * z
             if square < 1e-24:
                 continue
             distance = np.sqrt(square)
-            emission = (x * emitter_normal[n, 0] + y * emitter_normal[n, 1] + z * emitter_normal[n, 2]) / distance
+            emission = (
+                x * emitter_normal[n, 0] + y * emitter_normal[n, 1] + z * emitter_normal[n, 2]
+            ) / distance
             incidence = -(x * normals[m, 0] + y * normals[m, 1] + z * normals[m, 2]) / distance
             if emission > 0 and incidence > 0:
                 at = min(emission, 1.0) * last

@@ -63,7 +63,9 @@ class Image(NamedTuple):
     along: Floats
 
 
-def mirrored(config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: Floats, grid: Floats) -> Sources:
+def mirrored(
+    config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: Floats, grid: Floats
+) -> Sources:
     """The images of the LEDs that the camera sees in the wall; their numbers are in `false_lights.MIRRORED`.
 
     camera_m : (3,) the entrance pupil;  grid : (h, w, 3) unit vectors that cover the field
@@ -75,7 +77,9 @@ def mirrored(config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: F
     sources = leds.take(images.led)
     normal = wall.inward(images.wall_m) if len(images.led) else np.zeros((0, 3))
     across = np.sum(sources.normal * normal, axis=1, keepdims=True)
-    place = np.column_stack([camera_m + images.toward * images.distance_m[:, None], np.ones(len(sources))])
+    place = np.column_stack(
+        [camera_m + images.toward * images.distance_m[:, None], np.ones(len(sources))]
+    )
     return replace(
         sources,
         id=sources.id + MIRRORED * numbered(images.led),
@@ -99,7 +103,8 @@ def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
     if n is None:
         return np.full(len(cosine), config.specular)
     refracted = np.sqrt(1 - (1 - cosine**2) / n**2)
-    r_s, r_p = (cosine - n * refracted) / (cosine + n * refracted), (n * cosine - refracted) / (n * cosine + refracted)
+    r_s = (cosine - n * refracted) / (cosine + n * refracted)
+    r_p = (n * cosine - refracted) / (n * cosine + refracted)
     return np.asarray((r_s**2 + r_p**2) / 2)
 
 
@@ -116,9 +121,12 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
     offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
     rays = reflect(wall, camera_m, toward)
     to_led = led_m[led] - rays.wall_m
-    far_m, path_m = np.linalg.norm(to_led, axis=1), np.linalg.norm(rays.wall_m - camera_m, axis=1)
+    far_m = np.linalg.norm(to_led, axis=1)
+    path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
     solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
-    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0]) & (np.sum(to_led * rays.along, axis=1) > 0)
+    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0]) & (
+        np.sum(to_led * rays.along, axis=1) > 0
+    )
     solved &= cosines_to_grid(toward, grid) > 0
     distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
     found = distinct(led, toward, solved & (distance_m > 0))
@@ -126,11 +134,15 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
     return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
 
 
-def distinct(led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]) -> NDArray[np.int64]:
+def distinct(
+    led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """Rows of the solutions, each once, sorted by LED and direction."""
     rows = np.flatnonzero(solved)
     rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
-    same = (np.diff(led[rows]) == 0) & (np.linalg.norm(np.diff(toward[rows], axis=0), axis=1) < 3 * SAME_RAD)
+    same = (np.diff(led[rows]) == 0) & (
+        np.linalg.norm(np.diff(toward[rows], axis=0), axis=1) < 3 * SAME_RAD
+    )
     return rows[~np.concatenate([[False], same])] if len(rows) else rows
 
 
@@ -150,7 +162,9 @@ def nearest_rays(
     spacing_rad = float(np.arccos(np.clip(np.sum(grid[1:] * grid[:-1], axis=2), -1, 1)).max())
     limit = np.cos(min(REACH * spacing_rad, np.pi))
     shape = (*grid.shape[:2], 3)
-    found = _minima(np.ascontiguousarray(led_m), rays.wall_m.reshape(shape), rays.along.reshape(shape), limit)
+    found = _minima(
+        np.ascontiguousarray(led_m), rays.wall_m.reshape(shape), rays.along.reshape(shape), limit
+    )
     return found[:, 0], found[:, 1]
 
 
@@ -163,7 +177,8 @@ def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
     for n in range(len(led_m)):
         for i in range(rows):
             for j in range(columns):
-                square, dot = 0.0, 0.0
+                square = 0.0
+                dot = 0.0
                 for k in range(3):
                     offset = led_m[n, k] - wall_m[i, j, k]
                     square += offset * offset
@@ -186,7 +201,9 @@ def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
     return out
 
 
-def linearized(wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats) -> tuple[Floats, Floats, Floats]:
+def linearized(
+    wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats
+) -> tuple[Floats, Floats, Floats]:
     """(K, 2) offsets of LEDs (K, 3) from the reflected rays, across them, (K, 2, 2) their derivatives with respect to
     two angles of the direction, and (K, 2, 3) the axes of these angles.
     """
@@ -195,7 +212,8 @@ def linearized(wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats) -
     shifted = toward + np.stack([0 * toward, first, -first, second, -second])
     shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
     rays = reflect(wall, camera_m, shifted.reshape(-1, 3))
-    wall_m, along = rays.wall_m.reshape(shifted.shape), rays.along.reshape(shifted.shape)
+    wall_m = rays.wall_m.reshape(shifted.shape)
+    along = rays.along.reshape(shifted.shape)
     # The LEDs' offsets from the nearest points of the rays.
     to_led = led_m - wall_m
     offset = to_led - np.sum(to_led * along, axis=2, keepdims=True) * along

@@ -6,7 +6,8 @@ import numpy as np
 
 from skysim.sources.dome.shell.surface import Plane, Surface
 
-RINGS, SECTORS = 200, 180
+RINGS = 200
+SECTORS = 180
 
 
 def cap_area_m2(surface: Surface, cap_deg: float) -> float:
@@ -31,7 +32,8 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     rays = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])
-    place_m, rays = place_m[met], rays[met]
+    place_m = place_m[met]
+    rays = rays[met]
     element_m2 = np.sum(place_m**2, axis=1) / -np.sum(rays * surface.inward(place_m), axis=1)
     solid = np.repeat(weight, SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / SECTORS)
     return float(element_m2 @ solid)

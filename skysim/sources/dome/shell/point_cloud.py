@@ -53,7 +53,8 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 
     Raises ValueError for points in a plane.
     """
-    mean_m, scale_m = points_m.mean(axis=0), np.ptp(points_m, axis=0).max()
+    mean_m = points_m.mean(axis=0)
+    scale_m = np.ptp(points_m, axis=0).max()
     scaled = (points_m - mean_m) / scale_m
     # Algebraic fit, linear in the center c and r^2 - |c|^2: |x|^2 = 2 c . x + (r^2 - |c|^2).
     design = np.column_stack([2 * scaled, np.ones(len(scaled))])
@@ -66,7 +67,9 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
         return np.asarray(np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3])
 
     start = np.append(algebraic[:3], radius)
-    solution = scipy.optimize.least_squares(residual, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    solution = scipy.optimize.least_squares(
+        residual, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
     rms_m = float(scale_m * np.sqrt(np.mean(solution.fun**2)))
     return FittedSphere(mean_m + scale_m * solution.x[:3], float(scale_m * solution.x[3]), rms_m)
 
@@ -79,7 +82,9 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
     sphere = fit_sphere(points_m)
 
     def residual_m(parameters: Floats) -> Floats:
-        axes = np.exp(parameters[3:]) * sphere.radius_m  # logarithms as parameters keep the semi-axes positive
+        axes = (
+            np.exp(parameters[3:]) * sphere.radius_m
+        )  # logarithms as parameters keep the semi-axes positive
         w = (points_m - sphere.center_m - sphere.radius_m * parameters[:3]) / axes
         norm = np.linalg.norm(w, axis=1)
         return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))
@@ -101,12 +106,17 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
     """
     w = disk[:, 0] + 1j * disk[:, 1]
     q = np.abs(w) ** 2
-    values, slopes = [], []
+    values = []
+    slopes = []
     for n in range(degree + 1):
         for m in range(n % 2, n + 1, 2):
             pairs = (n - m) // 2
-            powers = [(-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, pairs - k) for k in range(pairs + 1)]
-            radial, radial_slope = np.polyval(powers, q), np.polyval(np.polyder(powers), q)
+            powers = [
+                (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, pairs - k)
+                for k in range(pairs + 1)
+            ]
+            radial = np.polyval(powers, q)
+            radial_slope = np.polyval(np.polyder(powers), q)
             angular = m * w ** max(m - 1, 0) * radial
             value = w**m * radial
             slope = [
@@ -188,7 +198,8 @@ class SurfaceFit:
     def edge_m(self) -> Floats:
         """(M, 3) points on the edge of the area that the points cover, relative to its center."""
         azimuth = np.arange(EDGE_POINTS) * (2 * np.pi / EDGE_POINTS)
-        ring, up = np.sin(self.radius.cover_rad), np.full(EDGE_POINTS, np.cos(self.radius.cover_rad))
+        ring = np.sin(self.radius.cover_rad)
+        up = np.full(EDGE_POINTS, np.cos(self.radius.cover_rad))
         unit = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), up])
         return np.asarray(self.radius.evaluate(unit)[0][:, None] * unit)
 
@@ -204,7 +215,9 @@ def read(file: str, unit: str) -> Floats:
         if points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError("not three finite numbers in each line")
     except (OSError, ValueError) as error:
-        raise InputError(KEY, f"{file}: not a point file ({error})", "a line of names, then lines of x,y,z") from None
+        raise InputError(
+            KEY, f"{file}: not a point file ({error})", "a line of names, then lines of x,y,z"
+        ) from None
     return points * UNIT_M[unit]
 
 
@@ -219,16 +232,23 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     terms = (degree + 1) * (degree + 2) // 2
     needed = max(POINTS_PER_TERM * terms, 8)
     if len(points_m) < needed:
-        raise InputError(KEY, f"{file}: {len(points_m)} points", f"at least {needed} for degree {degree}")
+        raise InputError(
+            KEY, f"{file}: {len(points_m)} points", f"at least {needed} for degree {degree}"
+        )
     try:
         sphere = fit_sphere(points_m)
     except ValueError as error:
-        raise InputError(KEY, f"{file}: {error}", "points of a dome (a panel is kind flat)") from None
+        raise InputError(
+            KEY, f"{file}: {error}", "points of a dome (a panel is kind flat)"
+        ) from None
     relative_m = points_m - sphere.center_m
     radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
     angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
-    sector = np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    sector = (
+        np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int)
+        % SECTORS
+    )
     # Covered angle: of the farthest point in each sector of azimuth, the least.
     cover_rad = min(float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS))
     half_rad = float(angle.max())
@@ -237,7 +257,9 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     # A large ratio of singular values means polynomials that the points do not determine: an area without points.
     if cover_rad < half_rad / 2 or singular[-1] * MAX_CONDITION < singular[0]:
         raise InputError(
-            KEY, f"{file}: parts of the dome have no points", f"points all around +z, or a degree below {degree}"
+            KEY,
+            f"{file}: parts of the dome have no points",
+            f"points all around +z, or a degree below {degree}",
         )
     return SurfaceFit(
         sphere.center_m,

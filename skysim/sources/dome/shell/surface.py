@@ -26,7 +26,9 @@ from skysim.sources.dome.shell import point_cloud
 from skysim.sources.dome.shell.point_cloud import FittedEllipsoid, fit_ellipsoid
 
 FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
-RINGS, SECTORS = 60, 72  # of the samples to which an ellipsoid is fitted
+# of the samples to which an ellipsoid is fitted
+RINGS = 60
+SECTORS = 72
 MAX_STEPS = 200  # of the ray intersection
 SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 
@@ -53,7 +55,9 @@ class Rim:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         from_bearing_m = own_m - self.bearing_m
         slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
-        return np.asarray((own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0))
+        return np.asarray(
+            (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +95,8 @@ class Surface(ABC):
         """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
         R_lab_from_own = self.lab_from_own.as_matrix()
         # A rotation keeps lengths, so the distance along the ray is the same in both frames.
-        start, along = (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
+        start = (origin_m - self.center_m) @ R_lab_from_own
+        along = rays @ R_lab_from_own
         distance = self.distance(start, along)
         within = self.within(start + distance[:, None] * along)
         return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
@@ -119,7 +124,9 @@ class Surface(ABC):
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
         z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
         ring = np.sqrt(1 - z**2)
-        rays = self.lab_from_own.apply(np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z]))
+        rays = self.lab_from_own.apply(
+            np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+        )
         met = self.meet(np.zeros(3), rays)
         return met[np.isfinite(met[:, 0])]
 
@@ -145,7 +152,9 @@ def exit_distance(start: Floats, along: Floats) -> Floats:
     With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
     """
     # a s^2 + 2 b s + c = 0
-    a, b, c = np.sum(along**2, axis=1), along @ start, start @ start - 1
+    a = np.sum(along**2, axis=1)
+    b = along @ start
+    c = start @ start - 1
     discriminant = b**2 - a * c
     q = np.abs(b) + np.sqrt(np.where((discriminant >= 0) & (a > 0), discriminant, np.nan))
     q = np.where(q > 0, q, np.nan)
@@ -265,9 +274,15 @@ class Shell:
         ring = np.hypot(unit[:, 0], unit[:, 1])
         angle = np.arctan2(ring, unit[:, 2])
         slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
-        radius = self.max_m - self.inner_fraction * self.thickness_m[0] + slope * np.minimum(angle, self.base_rad)
+        radius = (
+            self.max_m
+            - self.inner_fraction * self.thickness_m[0]
+            + slope * np.minimum(angle, self.base_rad)
+        )
         # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
-        tangent = np.column_stack([unit[:, :2] * (unit[:, 2] / np.where(ring > 0, ring, np.inf))[:, None], -ring])
+        tangent = np.column_stack(
+            [unit[:, :2] * (unit[:, 2] / np.where(ring > 0, ring, np.inf))[:, None], -ring]
+        )
         return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * tangent
 
 
@@ -290,7 +305,9 @@ class Radial(Surface):
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
         """(N,) level |x| - r and (N, 3) its gradient x/|x| - (grad r - its part along x) / |x|."""
         distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
-        distance_m = np.where(distance_m > 0, distance_m, np.finfo(float).tiny)  # avoids 0 / 0 at the center
+        distance_m = np.where(
+            distance_m > 0, distance_m, np.finfo(float).tiny
+        )  # avoids 0 / 0 at the center
         unit = own_m / distance_m
         radius, slope = self.radius.evaluate(unit)
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
@@ -308,31 +325,34 @@ class Radial(Surface):
         level larger than a few roundings remains. A ray leaves a convex inside only once; otherwise one of several
         crossings is found.
         """
-        low, high = (
-            np.zeros(len(along)),
-            exit_distance(start_m / self.radius.max_m, along / self.radius.max_m),
-        )
+        low = np.zeros(len(along))
+        high = exit_distance(start_m / self.radius.max_m, along / self.radius.max_m)
         if self.level(start_m[None])[0] >= 0:
             return np.full(len(along), np.nan)
-        distance, before = high.copy(), np.full(len(along), np.inf)
+        distance = high.copy()
+        before = np.full(len(along), np.inf)
         for _ in range(MAX_STEPS):
             level, gradient = self.level_and_gradient(start_m + distance[:, None] * along)
             # Rays that have not converged; those that have keep their distance.
             unconverged = np.abs(level) > 16 * np.finfo(float).eps * self.radius.max_m
             if not unconverged.any():
                 return distance
-            low, high = np.where(level < 0, distance, low), np.where(level > 0, distance, high)
+            low = np.where(level < 0, distance, low)
+            high = np.where(level > 0, distance, high)
             slope = np.sum(gradient * along, axis=1)
             step = distance - level / np.where(slope > 0, slope, np.nan)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
             before = np.abs(level)
             distance = np.where(unconverged, np.where(newton, step, (low + high) / 2), distance)
-        raise ArithmeticError(f"no convergence on the surface for {unconverged.sum()} rays in {MAX_STEPS} steps")
+        raise ArithmeticError(
+            f"no convergence on the surface for {unconverged.sum()} rays in {MAX_STEPS} steps"
+        )
 
 
 def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]:
     """Arguments common to all surfaces: center, rim, tilt, survey error. center_m is the height above the bearing."""
-    height_m, half_deg = getattr(config, "rim_height_m", None), getattr(config, "rim_deg", None)
+    height_m = getattr(config, "rim_height_m", None)
+    half_deg = getattr(config, "rim_deg", None)
     lowest_m = -math.inf if height_m is None else height_m - center_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)
     return {
@@ -347,7 +367,8 @@ def sphere(config: light.SphereSurfaceConfig) -> Surface:
     """A sphere with its top at part.apex_m above the bearing, or the inner face of a formed wall."""
     if config.wall is None:
         return Ellipsoid(
-            semi_axes_m=np.full(3, config.radius_m), **pose_and_rim(config, config.apex_m - config.radius_m)
+            semi_axes_m=np.full(3, config.radius_m),
+            **pose_and_rim(config, config.apex_m - config.radius_m),
         )
     thickness_m = (config.wall.thickness_apex_m, config.wall.thickness_base_m)
     inner_fraction = {"outside": 1.0, "mid_wall": 0.5}[config.wall.radius_of]
@@ -366,7 +387,9 @@ def ellipsoid(config: light.EllipsoidSurfaceConfig) -> Surface:
 
 def flat(config: light.FlatSurfaceConfig) -> Surface:
     """A panel with its center at part.apex_m above the bearing."""
-    size_m = [math.inf if side_m is None else side_m for side_m in (config.width_m, config.height_m)]
+    size_m = [
+        math.inf if side_m is None else side_m for side_m in (config.width_m, config.height_m)
+    ]
     return Plane(half_m=np.array(size_m) / 2, **pose_and_rim(config, config.apex_m))
 
 
@@ -375,7 +398,9 @@ def cylinder(config: light.CylinderSurfaceConfig) -> Surface:
     half_m = math.inf if config.length_m is None else config.length_m / 2
     below_m = half_m if config.axis == "z" else config.radius_m
     pose = pose_and_rim(config, config.apex_m - below_m)
-    return Cylinder(radius_m=config.radius_m, axis="xyz".index(config.axis), half_length_m=half_m, **pose)
+    return Cylinder(
+        radius_m=config.radius_m, axis="xyz".index(config.axis), half_length_m=half_m, **pose
+    )
 
 
 def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
@@ -422,5 +447,7 @@ def build_surface(config: light.SurfaceConfig) -> Surface:
         place = "not below the panel" if isinstance(surface, Plane) else "outside of the dome"
         raise InputError("light.surface", f"the bearing's center is {place}; check {check}")
     if not len(surface.samples_m()):
-        raise InputError("light.surface", "no part of it is above the bearing; check rim, width, height, length")
+        raise InputError(
+            "light.surface", "no part of it is above the bearing; check rim, width, height, length"
+        )
     return surface

@@ -27,7 +27,11 @@ def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
     """Surveyed places: the true ones (..., 3) plus an error of this size along each axis; unchanged for 0."""
-    return place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape)) if sigma_m else place_m
+    return (
+        place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape))
+        if sigma_m
+        else place_m
+    )
 
 
 def surface_seed(config: SurveyErrorsConfig) -> int:
@@ -60,7 +64,9 @@ def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig
     displaced_m = place_m - offset_m * surface.inward(place_m) if offset_m else place_m
     if config.instrument is not None:
         sights = standard_normals(config.seed, "sights", place_m.shape)
-        displaced_m = total_station.surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
+        displaced_m = total_station.surveyed_m(
+            config.instrument, displaced_m, sights, setup_errors(config)
+        )
     return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
 
 
@@ -75,7 +81,9 @@ def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | N
     """(N, 3, 3) covariance of each LED's own error; None if it is that of led_sigma alone."""
     if config.instrument is None:
         return None
-    return total_station.covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
+    return total_station.covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(
+        3
+    )
 
 
 def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
@@ -88,7 +96,9 @@ def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
     return np.asarray(np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2))
 
 
-def common_displacements_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
+def common_displacements_m(
+    surface: Surface, place_m: Floats, config: SurveyErrorsConfig
+) -> Floats | None:
     """(M, N, 3) displacement of each LED by one standard deviation of each error that all share; None without any.
 
     The survey error of the surface, along its normals, and the errors of the instrument's set-up.

@@ -43,14 +43,19 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
     level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
     distance_m = np.hypot(level_m, sight_m[:, 2])
     if not np.all(distance_m > 0):
-        raise InputError("tracker.survey.instrument.position", "an LED is there", "a place away from the LEDs")
+        raise InputError(
+            "tracker.survey.instrument.position", "an LED is there", "a place away from the LEDs"
+        )
     return np.arctan2(sight_m[:, 1], sight_m[:, 0]), np.arctan2(level_m, sight_m[:, 2]), distance_m
 
 
 def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Floats]:
     """Unit vectors u along the sight, v toward greater zenith angles, h toward greater directions, (N, 3) each."""
-    cos_h, sin_h, zero = np.cos(direction_rad), np.sin(direction_rad), np.zeros(len(direction_rad))
-    cos_v, sin_v = np.cos(zenith_rad), np.sin(zenith_rad)
+    cos_h = np.cos(direction_rad)
+    sin_h = np.sin(direction_rad)
+    zero = np.zeros(len(direction_rad))
+    cos_v = np.cos(zenith_rad)
+    sin_v = np.sin(zenith_rad)
     return (
         np.column_stack([sin_v * cos_h, sin_v * sin_h, cos_v]),
         np.column_stack([cos_v * cos_h, cos_v * sin_h, -sin_v]),
@@ -60,8 +65,16 @@ def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Flo
 
 def setup_sigmas(config: TotalStationConfig) -> list[float]:
     """Sizes of the common errors in SI units: place x, y, z; rotation about x, y, z; scale; zero point."""
-    level, orientation = config.leveling_sigma_arcsec, config.orientation_sigma_arcsec
-    return [*3 * [config.centering_m], level, level, orientation, config.distance_ppm, config.zero_sigma_m]
+    level = config.leveling_sigma_arcsec
+    orientation = config.orientation_sigma_arcsec
+    return [
+        *3 * [config.centering_m],
+        level,
+        level,
+        orientation,
+        config.distance_ppm,
+        config.zero_sigma_m,
+    ]
 
 
 SETUP_UNITS = np.array([1, 1, 1, ARCSEC_RAD, ARCSEC_RAD, ARCSEC_RAD, PPM, 1])  # of setup_sigmas
@@ -69,14 +82,19 @@ SETUP_UNITS = np.array([1, 1, 1, ARCSEC_RAD, ARCSEC_RAD, ARCSEC_RAD, PPM, 1])  #
 
 def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
     """(8,) errors of the set-up, SI units, from standard normal numbers (8,)."""
-    drawn = [float(scaled_errors(sigma, one)) for sigma, one in zip(setup_sigmas(config), normal, strict=True)]
+    drawn = [
+        float(scaled_errors(sigma, one))
+        for sigma, one in zip(setup_sigmas(config), normal, strict=True)
+    ]
     return np.array(drawn) * SETUP_UNITS
 
 
 def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Floats:
     """(..., 3) places moved as a rigid body by the set-up's errors: station's place, leveling and orientation."""
     station_m = np.array(config.position_m)
-    return np.asarray(station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m))
+    return np.asarray(
+        station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
+    )
 
 
 def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
@@ -87,7 +105,9 @@ def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: 
     """
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])
-    distance_m = distance_m * (1 + setup[6]) + setup[7] + scaled_errors(config.distance_sigma_m, own[:, 2])
+    distance_m = (
+        distance_m * (1 + setup[6]) + setup[7] + scaled_errors(config.distance_sigma_m, own[:, 2])
+    )
     along, _, _ = axes(direction_rad + angles_rad[:, 0], zenith_rad + angles_rad[:, 1])
     return moved_m(config, np.array(config.position_m) + distance_m[:, None] * along, setup)
 

@@ -28,7 +28,9 @@ from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig, Light
 
-LONGEST_ON_S = HOUR_S  # a controller was switched on up to so long before the run; many times any period
+LONGEST_ON_S = (
+    HOUR_S  # a controller was switched on up to so long before the run; many times any period
+)
 FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
@@ -48,9 +50,18 @@ class Clocks:
     filter_s: Floats | None = None
 
     @classmethod
-    def draw(cls, config: ClockConfig, count: int, hardware_seed: int, seed: int, stream: int = LED_CLOCKS) -> Clocks:
+    def draw(
+        cls,
+        config: ClockConfig,
+        count: int,
+        hardware_seed: int,
+        seed: int,
+        stream: int = LED_CLOCKS,
+    ) -> Clocks:
         """Draw the offsets from the hardware's seed, drifts and switch-on times from the run's."""
-        offset_ppm = scaled_errors(config.offset_ppm, random_stream(hardware_seed, stream).standard_normal(count))
+        offset_ppm = scaled_errors(
+            config.offset_ppm, random_stream(hardware_seed, stream).standard_normal(count)
+        )
         rng = random_stream(seed, stream)
         on_s = rng.uniform(0, LONGEST_ON_S, count)
         drift_ppm_h = scaled_errors(config.drift_ppm_h, rng.standard_normal(count))
@@ -79,20 +90,26 @@ class Clocks:
         # In the controller's time t_s lies (tau - start) mod period after the beginning of a pulse.
         since_s = np.mod(tau_s - sources.start_s, sources.period_s)
         return replace(
-            sources, period_s=sources.period_s / rate, start_s=t_s - since_s / rate, on_s=sources.on_s / rate
+            sources,
+            period_s=sources.period_s / rate,
+            start_s=t_s - since_s / rate,
+            on_s=sources.on_s / rate,
         )
 
 
 def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: float) -> Floats:
     """(N,) mean of the filters' voltages, 1 if always on, from begin to end."""
-    period_s, on_s = pulses.period_s, np.minimum(pulses.on_s, pulses.period_s)
+    period_s = pulses.period_s
+    on_s = np.minimum(pulses.on_s, pulses.period_s)
     rise = np.exp(-(period_s - on_s) / filter_s)
     first = (rise - np.exp(-period_s / filter_s)) / -np.expm1(-period_s / filter_s)
 
     def lit_s_and_voltage(t_s: float) -> tuple[Floats, Floats]:
         cycles, since_s = np.divmod(t_s - pulses.start_s, period_s)
         lit_s = np.minimum(since_s, on_s)
-        voltage = (1 - (1 - first) * np.exp(-lit_s / filter_s)) * np.exp((lit_s - since_s) / filter_s)
+        voltage = (1 - (1 - first) * np.exp(-lit_s / filter_s)) * np.exp(
+            (lit_s - since_s) / filter_s
+        )
         return cycles * on_s + lit_s, voltage
 
     (lit0_s, voltage0), (lit1_s, voltage1) = lit_s_and_voltage(begin_s), lit_s_and_voltage(end_s)
@@ -101,7 +118,11 @@ def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: flo
 
 def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
     """The clocks of a dome's controllers in the run of that seed; None where all light is steady."""
-    if not isinstance(light, DomeConfig) or isinstance(light.led.drive, DirectConfig) or not len(sources):
+    if (
+        not isinstance(light, DomeConfig)
+        or isinstance(light.led.drive, DirectConfig)
+        or not len(sources)
+    ):
         return None
     hardware = hardware_seed(light.layout)
     clocks = Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware, seed)
@@ -109,7 +130,9 @@ def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
     if low_pass is None:
         return clocks
     normal = random_stream(hardware, FILTER_STREAM).standard_normal(len(sources))
-    return replace(clocks, filter_s=low_pass.time_constant_s * (1 + scaled_errors(low_pass.error, normal)))
+    return replace(
+        clocks, filter_s=low_pass.time_constant_s * (1 + scaled_errors(low_pass.error, normal))
+    )
 
 
 def hardware_seed(layout: Layout) -> int:

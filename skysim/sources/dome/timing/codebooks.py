@@ -61,7 +61,11 @@ def codebook(config: Code, count: int) -> Words:
     else:
         words = packed(PLAIN[config.kind], count, config.levels)
     if len(words) < count:
-        raise InputError("light.led.code", f"{count} LEDs", f"at most the {len(words)} words of kind {config.kind}")
+        raise InputError(
+            "light.led.code",
+            f"{count} LEDs",
+            f"at most the {len(words)} words of kind {config.kind}",
+        )
     words.flags.writeable = False
     return words
 
@@ -69,12 +73,15 @@ def codebook(config: Code, count: int) -> Words:
 def light_levels(config: Code, words: Words) -> Floats:
     """Part of its light that an LED shows at the levels of words: from 1 - depth to 1, equally spaced in magnitude."""
     steps = getattr(config, "levels", 2) - 1
-    return np.array([(1 - config.depth) ** ((steps - level) / steps) for level in range(steps + 1)])[words]
+    return np.array(
+        [(1 - config.depth) ** ((steps - level) / steps) for level in range(steps + 1)]
+    )[words]
 
 
 def packed(kind: Callable[[int], Words], count: int, levels: int) -> Words:
     """(count, frames) words of a binary code, log2(levels) bits in each level of light, or as many as there are."""
-    bits, wanted = levels.bit_length() - 1, count
+    bits = levels.bit_length() - 1
+    wanted = count
     while True:
         words = kind(wanted)
         symbols = readable(symbols_of(words, bits), levels) if bits > 1 else words
@@ -103,7 +110,8 @@ def de_bruijn(count: int, levels: int) -> Words:
     lexicographic order (Fredricksen and Maiorana).
     """
     k = next(k for k in range(2, 32) if levels**k >= count)
-    word, sequence = [0], [0]
+    word = [0]
+    sequence = [0]
     while word:
         word = (word * k)[:k]
         while word and word[-1] == levels - 1:
@@ -130,7 +138,9 @@ def hamming(count: int) -> Words:
     """
     data = data_bits(count)
     checks = next(r for r in range(2, 32) if 2**r >= data + r + 1)
-    columns = [n for n in range(1, 2**checks) if n & (n - 1)][:data]  # not a power of 2: that is a check bit's own
+    columns = [n for n in range(1, 2**checks) if n & (n - 1)][
+        :data
+    ]  # not a power of 2: that is a check bit's own
     word = bits_of(np.arange(2**data), data)
     parity = word @ bits_of(np.array(columns), checks) % 2
     word = np.hstack([word, parity])
@@ -155,7 +165,8 @@ def cyclic(count: int, distance: int) -> Words:
     The distance between any two words at any shifts, and of a word from itself shifted, is that of the code.
     """
     for degree in PRIMITIVE:
-        generator, length = bch_generator(degree, distance), 2**degree - 1
+        generator = bch_generator(degree, distance)
+        length = 2**degree - 1
         data = min(length - generator.bit_length() + 1, MAX_DATA_BITS)
         # Of every orbit of `length` words about one in `length` has its leading data bits in the part that is listed.
         if data < 1 or 2**data < count:
@@ -178,7 +189,9 @@ def gold(count: int) -> Words:
             continue
         u, v = (maximal_sequence(polynomial, degree) for polynomial in (PRIMITIVE[degree], second))
         family = np.vstack([u, v, *(u ^ np.roll(v, shift) for shift in range(length))])
-        return balanced(np.vstack([np.roll(family, shift, axis=1) for shift in range(length)]))[:count]
+        return balanced(np.vstack([np.roll(family, shift, axis=1) for shift in range(length)]))[
+            :count
+        ]
     return np.zeros((0, 1), np.uint8)
 
 
@@ -222,7 +235,9 @@ def multiply(words: Ints, generator: int) -> Ints:
 
 def orbits(words: Ints, length: int) -> Ints:
     """The least word of each orbit of these words under cyclic shifts, where all `length` shifts differ."""
-    least, shifted, mask = words.copy(), words.copy(), (1 << length) - 1
+    least = words.copy()
+    shifted = words.copy()
+    mask = (1 << length) - 1
     full = np.ones(len(words), bool)
     for _ in range(length - 1):
         shifted = (shifted << 1 | shifted >> (length - 1)) & mask
@@ -250,7 +265,9 @@ def without_constant(words: Words) -> Words:
 def balanced(words: Words) -> Words:
     """The words that have a one and a zero, those with as many of both first."""
     words = without_constant(words)
-    return words[np.argsort(np.abs(2 * words.sum(axis=1, dtype=np.int64) - words.shape[1]), kind="stable")]
+    return words[
+        np.argsort(np.abs(2 * words.sum(axis=1, dtype=np.int64) - words.shape[1]), kind="stable")
+    ]
 
 
 PLAIN: dict[str, Callable[[int], Words]] = {"gray": gray, "hamming": hamming, "gold": gold}

@@ -37,7 +37,9 @@ class LedCodes:
 
     def shown(self, sources: Sources, open_s: float, exposure_s: float, frame: int) -> Sources:
         """The dome's LEDs with their mean light in the exposure of a frame."""
-        return replace(sources, strength=sources.strength * self.mean_level(open_s, exposure_s, frame))
+        return replace(
+            sources, strength=sources.strength * self.mean_level(open_s, exposure_s, frame)
+        )
 
     def mean_level(self, open_s: float, exposure_s: float, frame: int) -> Floats:
         """(N,) mean part of their light in an exposure: sum over its bits of level and share of the time."""
@@ -54,9 +56,12 @@ class LedCodes:
         """(N,) part of their light in bit number `bit` of the code's time."""
         shown = self.words[:, bit % self.words.shape[1]]
         if self.config.dropout:
-            rng, levels = random_stream(self.seed, LED_CODE, bit), int(self.words.max()) + 1
+            rng = random_stream(self.seed, LED_CODE, bit)
+            levels = int(self.words.max()) + 1
             failed = rng.random(len(shown)) < self.config.dropout
-            shown = (shown + failed * (rng.integers(1, levels, len(shown)) if levels > 2 else 1)) % levels
+            shown = (
+                shown + failed * (rng.integers(1, levels, len(shown)) if levels > 2 else 1)
+            ) % levels
         return light_levels(self.config, shown)
 
     def time_s(self, t_s: float) -> float:

@@ -25,31 +25,52 @@ class Excitation(StrEnum):
 def balance(
     scene: SceneArg,
     excite: Annotated[
-        Excitation, typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely.")
+        Excitation,
+        typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
     ] = Excitation.WHEELS,
     estimate_only: Annotated[
         bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
     ] = False,
-    tilt: Annotated[float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")] = 8.0,
-    torque: Annotated[str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")] = "5e-5 N m",
-    flights: Annotated[int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")] = None,
+    tilt: Annotated[
+        float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
+    ] = 8.0,
+    torque: Annotated[
+        str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
+    ] = "5e-5 N m",
+    flights: Annotated[
+        int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")
+    ] = None,
     inertia_bar: Annotated[
-        float, typer.Option(min=0.01, help="Standard deviation that moments of inertia must reach, percent.")
+        float,
+        typer.Option(
+            min=0.01, help="Standard deviation that moments of inertia must reach, percent."
+        ),
     ] = 1.0,
     offset_bar: Annotated[
         str | None,
-        typer.Option(help="Standard deviation that the offset must reach; default: half of the torque over weight."),
+        typer.Option(
+            help="Standard deviation that the offset must reach; default: half of the torque over weight."
+        ),
     ] = None,
     in_flight: Annotated[
-        bool, typer.Option("--in-flight", help="Also run the filter in flight over the last flight.")
+        bool,
+        typer.Option("--in-flight", help="Also run the filter in flight over the last flight."),
     ] = False,
-    inertia_sigma: Annotated[str, typer.Option(help="Standard error of the assumed inertia, a share.")] = "10%",
+    inertia_sigma: Annotated[
+        str, typer.Option(help="Standard error of the assumed inertia, a share.")
+    ] = "10%",
     offset_sigma: Annotated[
         str, typer.Option(help="Standard error of the assumed balance, along each axis.")
     ] = "500 um",
-    wheel_sigma: Annotated[str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")] = "0.1%",
-    mount_sigma: Annotated[str, typer.Option(help="Standard error of the tracker's axes in the body.")] = "0.03 deg",
-    tacho_sigma: Annotated[float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")] = 1.0,
+    wheel_sigma: Annotated[
+        str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")
+    ] = "0.1%",
+    mount_sigma: Annotated[
+        str, typer.Option(help="Standard error of the tracker's axes in the body.")
+    ] = "0.03 deg",
+    tacho_sigma: Annotated[
+        float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")
+    ] = 1.0,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
@@ -63,11 +84,14 @@ def balance(
 
     if estimate_only and flights is not None:
         raise InputError("--flights", "has no effect with --estimate-only", "none")
-    uncertainty = assumptions.parse_uncertainty(inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma)
+    uncertainty = assumptions.parse_uncertainty(
+        inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma
+    )
     bars = procedure.parse_bars(torque, inertia_bar, offset_bar)
     loaded = load(scene, None, seed, set_)
     plan = procedure.Plan(excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only)
-    folder, iterations = output_folder(out, loaded.name), []
+    folder = output_folder(out, loaded.name)
+    iterations = []
     with progress_callback("flying") as watch:
         for one in procedure.balance(loaded, plan, uncertainty, watch):
             iterations.append(one)
@@ -75,8 +99,12 @@ def balance(
                 print_flight(balance_report.flight_row(len(iterations), one))
     statistics = balance_report.statistics(loaded.name, plan, iterations)
     if in_flight:
-        statistics["in_flight"] = balance_report.filter_rows(iterations[-1], procedure.assumed(loaded, uncertainty))
-    report = balance_report.write_all(folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]]))
+        statistics["in_flight"] = balance_report.filter_rows(
+            iterations[-1], procedure.assumed(loaded, uncertainty)
+        )
+    report = balance_report.write_all(
+        folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]])
+    )
     if json:
         print_json(statistics)
     else:

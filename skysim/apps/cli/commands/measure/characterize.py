@@ -22,11 +22,18 @@ def characterize(
             autocompletion=complete_camera,
         ),
     ],
-    darks: Annotated[Path | None, typer.Option(help="Folder of darks, of two exposures or more.")] = None,
-    flats: Annotated[Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")] = None,
-    night: Annotated[Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")] = None,
+    darks: Annotated[
+        Path | None, typer.Option(help="Folder of darks, of two exposures or more.")
+    ] = None,
+    flats: Annotated[
+        Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")
+    ] = None,
+    night: Annotated[
+        Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
+    ] = None,
     frames_to: Annotated[
-        Path | None, typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated.")
+        Path | None,
+        typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
     out: Out = None,
@@ -50,7 +57,9 @@ def characterize(
     found = procedure.measure_sensor(config, *folders)
     sky = procedure.measure_night(config, raw, night, found) if night else None
     name = Path(camera).stem
-    statistics, report = procedure.write_results(output_folder(out, name), config, raw, found, sky, name)
+    statistics, report = procedure.write_results(
+        output_folder(out, name), config, raw, found, sky, name
+    )
     if json:
         print_json(statistics)
     else:

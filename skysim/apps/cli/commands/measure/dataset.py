@@ -8,7 +8,13 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.commands.study import EngineName, Scheduler, Workers, create_engine, start_workers
+from skysim.apps.cli.commands.study import (
+    EngineName,
+    Scheduler,
+    Workers,
+    create_engine,
+    start_workers,
+)
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
@@ -16,14 +22,21 @@ from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 def dataset(
     scene: SceneArg,
     frames: Annotated[int, typer.Option(help="Number of frames.")],
-    out: Annotated[str, typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")],
+    out: Annotated[
+        str, typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
+    ],
     vary: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Variations: YAML with the study's keys set, trial, factors, hardware."),
+        typer.Option(
+            metavar="FILE",
+            help="Variations: YAML with the study's keys set, trial, factors, hardware.",
+        ),
     ] = None,
     to: Annotated[
         list[str] | None,
-        typer.Option("--to", help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."),
+        typer.Option(
+            "--to", help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."
+        ),
     ] = None,
     shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
     seed: Seed = None,
@@ -45,7 +58,13 @@ def dataset(
     Storage(out)  # refuses a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
     made = plan.load(
-        scene, vary, frames, seed=seed, overrides=parse_overrides(set_), frames_per_shard=shard_frames, formats=formats
+        scene,
+        vary,
+        frames,
+        seed=seed,
+        overrides=parse_overrides(set_),
+        frames_per_shard=shard_frames,
+        formats=formats,
     )
     with (
         closing(create_engine(engine, workers, scheduler)) as chosen,
@@ -58,5 +77,7 @@ def dataset(
     else:
         print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
     if progress.failed:
-        print_error(f"{progress.failed} frames are missing: their workers died; the same command tries them again")
+        print_error(
+            f"{progress.failed} frames are missing: their workers died; the same command tries them again"
+        )
         raise typer.Exit(2)

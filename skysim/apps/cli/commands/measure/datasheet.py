@@ -21,17 +21,27 @@ if TYPE_CHECKING:
 
 def datasheet(
     scene: SceneArg,
-    quick: Annotated[bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")
+    ] = False,
     fields: Annotated[
         int | None,
-        typer.Option(min=2, help="Number of fields (attitudes) of each experiment; more narrow the intervals."),
+        typer.Option(
+            min=2,
+            help="Number of fields (attitudes) of each experiment; more narrow the intervals.",
+        ),
     ] = None,
     seed: Seed = None,
     set_: Overrides = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
+    ] = None,
     markdown: Annotated[
-        Path | None, typer.Option(help="Also write a Markdown page, as docs/findings/datasheets/shefex2.md.")
+        Path | None,
+        typer.Option(help="Also write a Markdown page, as docs/findings/datasheets/shefex2.md."),
     ] = None,
     model: Annotated[
         Path | None,
@@ -40,7 +50,10 @@ def datasheet(
         ),
     ] = None,
     fmu: Annotated[
-        bool, typer.Option("--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).")
+        bool,
+        typer.Option(
+            "--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3)."
+        ),
     ] = False,
     open_: OpenReport = False,
     json: Json = False,
@@ -67,7 +80,16 @@ def datasheet(
         def watch(trials: int) -> Callable[[Any], Any]:
             return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
 
-        sheet = run.measure(scene, loaded, overrides, folder, quick=quick, fields=fields, workers=workers, watch=watch)
+        sheet = run.measure(
+            scene,
+            loaded,
+            overrides,
+            folder,
+            quick=quick,
+            fields=fields,
+            workers=workers,
+            watch=watch,
+        )
     statement = state(sheet)
     report = datasheet_report.datasheet_report(statement, quick)
     paths = datasheet_report.write_all(folder, statement, report)
@@ -106,7 +128,10 @@ def print_agreements(agreements: list[Agreement]) -> None:
     ]
     heads = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
     table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
-    print_table(table, "The model, fitted to half of the fields (even or odd numbers), beside the other half")
+    print_table(
+        table,
+        "The model, fitted to half of the fields (even or odd numbers), beside the other half",
+    )
     print_wrapped(
         "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"
         " pairs of frames of the sequences."

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
     from skysim.simulation.lab import Lab
 
-FRAMES, NEXT, CHECKS = 150, 12, 40
+FRAMES = 150
+NEXT = 12
+CHECKS = 40
 
 
 class Attitudes(StrEnum):
@@ -59,19 +61,27 @@ class Request:
 FrameCount = Annotated[
     int | None,
     typer.Option(
-        min=2, help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}."
+        min=2,
+        help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
 PlanOnly = Annotated[
-    bool, typer.Option("--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing.")
+    bool,
+    typer.Option(
+        "--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing."
+    ),
 ]
 Images = Annotated[
     Path | None,
-    typer.Option(help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."),
+    typer.Option(
+        help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."
+    ),
 ]
 CameraFile = Annotated[
     Path | None,
-    typer.Option(help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."),
+    typer.Option(
+        help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."
+    ),
 ]
 Watch = Annotated[
     bool,
@@ -82,24 +92,40 @@ Watch = Annotated[
     ),
 ]
 Repeat = Annotated[
-    int | None, typer.Option(min=2, help="Simulate so many surveys, and compare their errors with the prediction.")
+    int | None,
+    typer.Option(
+        min=2, help="Simulate so many surveys, and compare their errors with the prediction."
+    ),
 ]
-AttitudesBy = Annotated[Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")]
+AttitudesBy = Annotated[
+    Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")
+]
 Next = Annotated[
-    int | None, typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}.")
+    int | None,
+    typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
 ]
 FramesTo = Annotated[
-    Path | None, typer.Option(help="Write the simulated frames and attitudes to a folder, for --images.")
+    Path | None,
+    typer.Option(help="Write the simulated frames and attitudes to a folder, for --images."),
 ]
 Tilt = Annotated[float, typer.Option(help="Maximum tilt of the attitudes, degrees.")]
-ImuSigma = Annotated[str, typer.Option(help="Standard error of the IMU's attitude about each axis.")]
-LedSigma = Annotated[str, typer.Option(help="Standard error of an LED's assumed position along each axis.")]
+ImuSigma = Annotated[
+    str, typer.Option(help="Standard error of the IMU's attitude about each axis.")
+]
+LedSigma = Annotated[
+    str, typer.Option(help="Standard error of an LED's assumed position along each axis.")
+]
 LeverSigma = Annotated[str, typer.Option(help="Standard error of the camera's assumed position.")]
 FocalError = Annotated[str, typer.Option(help="Error of the assumed focal length.")]
-Distortion = Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")]
+Distortion = Annotated[
+    bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
+]
 Checks = Annotated[
     int | None,
-    typer.Option(min=1, help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}."),
+    typer.Option(
+        min=1,
+        help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}.",
+    ),
 ]
 
 
@@ -133,15 +159,22 @@ def survey(
     """
     from skysim.experiments.dome_survey.prior import survey_uncertainty
 
-    given = {"frames": frames, "attitudes": attitudes, "next": next_, "frames-to": frames_to, "checks": checks}
+    given = {
+        "frames": frames,
+        "attitudes": attitudes,
+        "next": next_,
+        "frames-to": frames_to,
+        "checks": checks,
+    }
     chosen = {name for name, value in given.items() if value is not None}
     mode = survey_mode(plan, images, camera, watch, repeat, chosen)
-    loaded, uncertainty = (
-        load(scene, None, seed, set_),
-        survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error),
+    loaded = load(scene, None, seed, set_)
+    uncertainty = survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error)
+    folder = output_folder(out, loaded.name)
+    by = (attitudes or Attitudes.PLAN).value
+    request = Request(
+        loaded, uncertainty, folder, tilt, by, frames or FRAMES, distortion, next_ or NEXT, json
     )
-    folder, by = output_folder(out, loaded.name), (attitudes or Attitudes.PLAN).value
-    request = Request(loaded, uncertainty, folder, tilt, by, frames or FRAMES, distortion, next_ or NEXT, json)
     if images is not None and camera is not None:
         statistics = from_images(request, images, camera, watch)
     elif plan:
@@ -167,14 +200,23 @@ UNUSED = {
 
 
 def survey_mode(
-    plan: bool, images: Path | None, camera: Path | None, watch: bool, repeat: int | None, given: set[str]
+    plan: bool,
+    images: Path | None,
+    camera: Path | None,
+    watch: bool,
+    repeat: int | None,
+    given: set[str],
 ) -> str:
     """The mode that the options choose. Raises InputError for options that exclude one another or have no effect."""
     modes = [name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on]
     if len(modes) > 1:
         raise InputError(f"--{modes[1]}", f"has no effect with --{modes[0]}", "one of them")
     if images is not None and camera is None:
-        raise InputError("--images", "no camera", "with --camera FILE, a scene, camera file or OpenCV calibration")
+        raise InputError(
+            "--images",
+            "no camera",
+            "with --camera FILE, a scene, camera file or OpenCV calibration",
+        )
     if camera is not None and images is None:
         raise InputError("--camera", "has no effect without --images", "the scene's camera is used")
     if watch and images is None:
@@ -209,7 +251,9 @@ def plan_only(request: Request) -> dict[str, Any]:
         "attitudes": findings.stop_rows(plan.lab_from_body, plan.shown),
         "leds": plan.shown.shape[1],
         "noise_px": plan.model.sigma_px,
-        "predicted": [{"frames": n, **findings.accuracy_statistics(one)} for n, one in plan.steps()],
+        "predicted": [
+            {"frames": n, **findings.accuracy_statistics(one)} for n, one in plan.steps()
+        ],
         "plan": str(path),
     }
 
@@ -244,13 +288,19 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     from skysim.tracking import factory
 
     lab, before, plan = planned(request)
-    uncertainty, first_tracker = request.uncertainty, build_tracker(lab.camera)
+    uncertainty = request.uncertainty
+    first_tracker = build_tracker(lab.camera)
     taken = procedure.simulated_frames(lab, uncertainty, plan.lab_from_body, frames_to)
     observations = list(progress(taken, len(plan.shown), "rendering"))
-    with progress_callback("adjusting") as update, coverage_shown(request, observations, before, plan.model.sigma_px):
+    with (
+        progress_callback("adjusting") as update,
+        coverage_shown(request, observations, before, plan.model.sigma_px),
+    ):
         run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
     statistics = write_results(request, run, before, lab)
-    tracker = factory.build_tracker(prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources)
+    tracker = factory.build_tracker(
+        prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources
+    )
     tests = frames.render_stops(
         lab, stops.stop_attitudes(lab.scene, "checks", checks, request.tilt_deg), len(plan.shown)
     )
@@ -262,7 +312,10 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         request,
         run,
         statistics
-        | {"frames": len(plan.shown), "predicted": findings.accuracy_statistics(plan.first(len(plan.shown)))},
+        | {
+            "frames": len(plan.shown),
+            "predicted": findings.accuracy_statistics(plan.first(len(plan.shown))),
+        },
     )
 
 
@@ -284,14 +337,22 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
         pictures = followed(request, images, before, stages)
     else:
         total = len(survey_images.image_files(images))
-        pictures = list(progress(survey_images.read_images(images, camera, stages), total, "reading"))
+        pictures = list(
+            progress(survey_images.read_images(images, camera, stages), total, "reading")
+        )
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
     with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
-        run = procedure.survey_images(pictures, found, before, request.uncertainty, stages, request.distortion, update)
-    return write_report(request, run, write_results(request, run, before, None) | {"frames": len(pictures)})
+        run = procedure.survey_images(
+            pictures, found, before, request.uncertainty, stages, request.distortion, update
+        )
+    return write_report(
+        request, run, write_results(request, run, before, None) | {"frames": len(pictures)}
+    )
 
 
-def followed(request: Request, images: Path, before: CalibrationPrior, stages: Settings) -> list[SurveyImage]:
+def followed(
+    request: Request, images: Path, before: CalibrationPrior, stages: Settings
+) -> list[SurveyImage]:
     """The images of a folder while they are taken, until there are enough or Ctrl-C; prints the coverage so far."""
     from skysim.experiments.dome_survey.folder.watch import WatchedFolder
 
@@ -305,7 +366,9 @@ def followed(request: Request, images: Path, before: CalibrationPrior, stages: S
     return watched.pictures
 
 
-def print_so_far(request: Request, pictures: list[SurveyImage], before: CalibrationPrior, stages: Settings) -> None:
+def print_so_far(
+    request: Request, pictures: list[SurveyImage], before: CalibrationPrior, stages: Settings
+) -> None:
     """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
     from skysim.experiments.dome_survey.folder.images import frames_with_attitude
     from skysim.experiments.dome_survey.results import findings
@@ -328,7 +391,9 @@ def image_camera(path: Path) -> tuple[Camera, tuple[float, float] | None]:
     if config is not None:
         return calibration(config), (stages.gain_e_dn, stages.saturation)
     assert lens is not None
-    return Camera(lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion), None
+    return Camera(
+        lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion
+    ), None
 
 
 @contextmanager
@@ -343,7 +408,9 @@ def coverage_shown(
         yield
     except InputError:
         if frames:
-            so_far = findings.coverage_before(frames, prior, request.uncertainty, noise_px or prior.floor_px)
+            so_far = findings.coverage_before(
+                frames, prior, request.uncertainty, noise_px or prior.floor_px
+            )
             print_blocks(coverage_blocks(with_next(request, so_far, prior)))
         raise
 
@@ -354,7 +421,9 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
     from skysim.experiments.dome_survey.results import findings
 
     margin_px = image_sizes(prior).margin_px
-    further = findings.next_stops(request.scene, so_far, margin_px, request.next_stops, request.tilt_deg)
+    further = findings.next_stops(
+        request.scene, so_far, margin_px, request.next_stops, request.tilt_deg
+    )
     shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
     return {
         "coverage": findings.coverage_statistics(so_far),
@@ -363,7 +432,9 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
     }
 
 
-def write_results(request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None) -> dict[str, Any]:
+def write_results(
+    request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None
+) -> dict[str, Any]:
     """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
     from skysim.core.io import files
     from skysim.experiments.dome_survey import adjust, stops
@@ -371,14 +442,23 @@ def write_results(request: Request, run: SurveyRun, before: CalibrationPrior, la
     from skysim.tracking import dome_map_file
 
     folder = files.make_folder(request.folder)
-    path, picture = folder / "leds.ecsv", folder / "survey.png"
+    path = folder / "leds.ecsv"
+    picture = folder / "survey.png"
     dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
-    so_far, faults = findings.coverage(run), findings.find_faults(run)
+    so_far = findings.coverage(run)
+    faults = findings.find_faults(run)
     statistics = report.survey_statistics(run, before) | with_next(request, so_far, before)
-    statistics |= {"scene": request.scene.name, "faults": asdict(faults), "map": str(path), "picture": str(picture)}
+    statistics |= {
+        "scene": request.scene.name,
+        "faults": asdict(faults),
+        "map": str(path),
+        "picture": str(picture),
+    }
     further = stops.from_rows(statistics["next"])
     errors = report.led_errors(run.survey, before, lab) if lab else None
-    files.write_image(picture, report.survey_figure(so_far, faults, further, errors, report.list_shifts(run)))
+    files.write_image(
+        picture, report.survey_figure(so_far, faults, further, errors, report.list_shifts(run))
+    )
     return statistics
 
 

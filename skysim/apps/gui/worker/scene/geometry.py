@@ -13,7 +13,8 @@ from skysim.dynamics import multibody
 from skysim.dynamics.multibody.view.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
 from skysim.simulation.lab import Lab
 
-MAX_STARS, MAX_LEDS = 600, 4000
+MAX_STARS = 600
+MAX_LEDS = 4000
 WIDE_DEG = 100.0  # of the view from the bearing
 
 
@@ -34,17 +35,24 @@ def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray
     rows = np.argsort(-power, kind="stable")[: MAX_STARS if stars else MAX_LEDS]
     fraction = power[rows] / power.max(initial=1e-300)
     position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else LED_RADIUS_M * np.clip(fraction**0.3, 0.3, 1.0)
+    radius_m = (
+        0.006 + 0.04 * np.sqrt(fraction)
+        if stars
+        else LED_RADIUS_M * np.clip(fraction**0.3, 0.3, 1.0)
+    )
     return sources.id[rows], position_m, radius_m, power[rows] > 0
 
 
 def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above."""
-    camera, mount = lab.scene.camera, lab.camera.mount
+    camera = lab.scene.camera
+    mount = lab.camera.mount
     body_from_cam = mount.cam_from_body.inv()
-    pupil_m, height_m = mount.camera_body_m, np.linalg.norm(model.eye_m - model.target_m)
+    pupil_m = mount.camera_body_m
+    height_m = np.linalg.norm(model.eye_m - model.target_m)
     field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
-    up, north = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    north = np.array([0.0, 1.0, 0.0])
     ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     return {
         "outside": look_from(model.eye_m, model.target_m, up, FOVY_DEG),
@@ -54,6 +62,8 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     }
 
 
-def look_from(eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False) -> LookFrom:
+def look_from(
+    eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
+) -> LookFrom:
     eye, target, upwards = ((float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up))
     return LookFrom(eye, target, upwards, fov_deg, on_vehicle)

@@ -12,7 +12,9 @@ from skysim.tracking import onboard_model
 def check(lab: Lab) -> PlanCheck:
     """The facts of a scene and its warnings, as `skysim check` prints them."""
     found = checks.check(lab)
-    return PlanCheck(tuple((fact.name, tuple(fact.lines)) for fact in found.facts), tuple(found.findings))
+    return PlanCheck(
+        tuple((fact.name, tuple(fact.lines)) for fact in found.facts), tuple(found.findings)
+    )
 
 
 def ambiguity(lab: Lab) -> AmbiguityMap:
@@ -21,5 +23,9 @@ def ambiguity(lab: Lab) -> AmbiguityMap:
     See `skysim.sources.dome.placement.ambiguity`.
     """
     found, coincidence_m = checks.ambiguity_map(lab)
-    ids = onboard_model.assumed_dome(lab.scene, prior.require_dome(lab.scene), lab.camera.sources).id
-    return AmbiguityMap(ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m)
+    ids = onboard_model.assumed_dome(
+        lab.scene, prior.require_dome(lab.scene), lab.camera.sources
+    ).id
+    return AmbiguityMap(
+        ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m
+    )

@@ -16,8 +16,11 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import AttitudeConfig
 from skysim.sources import stars
 
-FINE, COARSE = 0.02, 0.2  # step of an arrow key without and with shift, in fields of view
-ROLL_FINE_DEG, ROLL_COARSE_DEG = 1.0, 10.0
+# step of an arrow key without and with shift, in fields of view
+FINE = 0.02
+COARSE = 0.2
+ROLL_FINE_DEG = 1.0
+ROLL_COARSE_DEG = 10.0
 RANGES = {  # degrees
     "RA": (0.0, 360.0),
     "Dec": (-90.0, 90.0),
@@ -43,7 +46,9 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
     return within_stop(scene, guidance.attitude(start))
 
 
-def moved(scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float) -> Rotation:
+def moved(
+    scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
+) -> Rotation:
     """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
 
     The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
@@ -62,5 +67,7 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
     vehicle = scene.vehicle
     tilt_deg = float(multibody.tilt_deg(lab_from_body))
     if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:
-        raise InputError("", f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg")
+        raise InputError(
+            "", f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg"
+        )
     return lab_from_body

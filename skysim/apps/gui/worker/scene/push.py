@@ -40,8 +40,11 @@ class Push:
         require_vehicle(lab.scene)
         self.lab = lab
         kept_s = self.exposure_s + MAX_ADVANCE_S
-        self.simulation = multibody.Simulation(lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s)
-        self.lab_from_body, self.torque_nm = lab_from_body, np.zeros(3)
+        self.simulation = multibody.Simulation(
+            lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s
+        )
+        self.lab_from_body = lab_from_body
+        self.torque_nm = np.zeros(3)
 
     @property
     def exposure_s(self) -> float:
@@ -68,10 +71,13 @@ class Push:
         end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
         begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
         motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
-        t_s, attitudes, rates = motion.t_s + end_s - self.simulation.now_s, motion.lab_from_body, motion.rate_body_rad_s
+        t_s = motion.t_s + end_s - self.simulation.now_s
+        attitudes = motion.lab_from_body
+        rates = motion.rate_body_rad_s
         start_s = window.open_s - MARGIN_S
         if t_s[0] > start_s:
-            t_s, rates = np.append(start_s, t_s), np.concatenate([np.zeros((1, 3)), rates])
+            t_s = np.append(start_s, t_s)
+            rates = np.concatenate([np.zeros((1, 3)), rates])
             attitudes = Rotation.concatenate([attitudes[:1], attitudes])
         return Trajectory(t_s, attitudes, rates)
 

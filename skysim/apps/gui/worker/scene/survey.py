@@ -54,7 +54,10 @@ class Survey:
 
     def is_of(self, scene: Scene) -> bool:
         """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
-        return self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure}) == scene
+        return (
+            self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure})
+            == scene
+        )
 
     def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
@@ -68,10 +71,12 @@ class Survey:
         taken = [*self.taken, *new]
         frames = self.survey_frames(taken)
         try:
-            run, refusal = adjust.run_survey(frames, self.before, UNCERTAINTY), ""
+            run = adjust.run_survey(frames, self.before, UNCERTAINTY)
+            refusal = ""
             so_far = findings.coverage(run)
         except InputError as error:
-            run, refusal = None, str(error)
+            run = None
+            refusal = str(error)
             so_far = findings.coverage_before(frames, self.before, UNCERTAINTY, self.noise_px)
         counts = findings.coverage_statistics(so_far)
         truth = report.truth_statistics(run, self.before, self.lab) if run else {}
@@ -92,10 +97,13 @@ class Survey:
             known=known_share(run),
             plan=self.next_plan(so_far, len(taken), count),
         )
-        self.taken, self.run = taken, run or self.run
+        self.taken = taken
+        self.run = run or self.run
         return found
 
-    def new_frames(self, flight: Flight, views: Sequence[FrameView]) -> tuple[list[TakenFrame], int]:
+    def new_frames(
+        self, flight: Flight, views: Sequence[FrameView]
+    ) -> tuple[list[TakenFrame], int]:
         """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
 
         Raises InputError if there are none, or the survey has them already.
@@ -109,7 +117,9 @@ class Survey:
             )
         known = {frame.row for frame in self.taken if frame.flown == flight.lab.scene}
         if known >= set(rows):
-            raise InputError("survey", "it has the frames of this flight", "a flight of the next attitudes")
+            raise InputError(
+                "survey", "it has the frames of this flight", "a flight of the next attitudes"
+            )
         settings = tracker_settings.assumed_settings(self.lab.scene)
         camera = onboard_model.assumed_camera(self.lab.scene)
         new = []
@@ -124,19 +134,26 @@ class Survey:
         """Frames with the IMU's attitudes."""
         lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
         measured = imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
-        return [SurveyFrame(frame.lights, at, frame.row) for frame, at in zip(taken, measured, strict=True)]
+        return [
+            SurveyFrame(frame.lights, at, frame.row)
+            for frame, at in zip(taken, measured, strict=True)
+        ]
 
     def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
         margin_px = prior.image_sizes(self.before).margin_px
         further = findings.next_stops(self.scene, so_far, margin_px, count, tilt_deg(self.scene))
         shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
-        return survey_plan(further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),))
+        return survey_plan(
+            further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),)
+        )
 
     def map_file(self) -> bytes:
         """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
         if self.run is None:
-            raise InputError("", "the survey has measured no LED yet: fly its attitudes, then adjust")
+            raise InputError(
+                "", "the survey has measured no LED yet: fly its attitudes, then adjust"
+            )
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "leds.ecsv"
             dome_map_file.write_dome_map(path, adjust.dome_map(self.run.survey, UNCERTAINTY))
@@ -173,7 +190,9 @@ def tilt_deg(scene: Scene) -> float:
     return min(SURVEY_TILT_DEG, scene.vehicle.tilt_stop_deg)
 
 
-def survey_plan(lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]) -> SurveyPlan:
+def survey_plan(
+    lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
+) -> SurveyPlan:
     """A plan as the page has it. shown : (F, N) LEDs that each attitude shows"""
     angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
@@ -201,7 +220,9 @@ def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int
     """
     scene = flight.lab.scene
     motion = scene.motion
-    if not flight.is_over or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
+    if not flight.is_over or not all(
+        isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver
+    ):
         return [], 0
     reference = guidance.plan(motion)
     by_hold: dict[int, int] = {}
