@@ -25,8 +25,8 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solver as plate_solver
-from skysim.core.io.images import Picture
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
+from skysim.core.images import Picture
 
 # level of the sky and full scale in standard deviations of its noise
 SKY = 30.0

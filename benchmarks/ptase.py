@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from benchmarks.timing import verdict
-from skysim.experiments.papers.ptase.monte_carlo import catalog, run_version, simulate, version
+from skysim.experiments.papers.ptase_monte_carlo import catalog, run_version, simulate, version
 
 PAPER = "mf1_2 in the paper: 99.12 +- .25 %, 4.79 (its Frobenius norm 6.77 / sqrt 2), 4.69 +- .14, .962 +- .013"
 PAPER_S = 24.06

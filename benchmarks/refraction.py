@@ -20,13 +20,13 @@ from scipy.optimize import minimize
 from estimator.calibration.star_field import Calibration, StarFrame, calibrate, self_calibrate
 from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir, raised, refraction_constants
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS, ROOT
+from skysim.core import images
+from skysim.core.files import CATALOGS, ROOT
 
 FOLDER = ROOT.parent / "shared" / "real_sky"
 DATE = datetime.datetime(2019, 7, 29, 20, 47, 26)

@@ -20,9 +20,8 @@ from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
 from estimator.catalog.catalog import unit
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,13 +14,13 @@ import numpy as np
 
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers.adapter import (
+from skysim.dynamics.controllers import (
     NO_SOURCE,
+    ControllerSetup,
     ControllerSource,
     ExternalLaw,
     external_law,
 )
-from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuators.fans import Desaturator, MomentumDump

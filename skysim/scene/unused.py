@@ -16,8 +16,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from skysim.core.errors import OVERRIDES, InputError
-from skysim.core.io.yaml_reader import Files, parse_yaml, where_of
 from skysim.core.units import ConfigModel
+from skysim.core.yaml_reader import Files, parse_yaml, where_of
 from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from skysim.sources.bodies import NAMES
 from skysim.sources.orbit.satellites import ID_BASE
-from skysim.sources.solar_system.bodies import NAMES
 
 MIRRORED = 10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
 GHOST = 1_000_000_000_000  # the n-th ghost of a light has n times this number and the light's

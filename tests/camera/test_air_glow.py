@@ -15,7 +15,7 @@ from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.air import AirGlow, Atmosphere
 from skysim.simulation.lights.light import find_light
-from skysim.sources.air.air import Sky
+from skysim.sources.air import Sky
 
 SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from skysim.camera.glow.background import glow_map
-from skysim.camera.glow.faint_stars import (
+from skysim.camera.glow.background import (
     CURVATURE,
     LATITUDE_DEG,
     LN_LIGHT,
     SLOPE,
     faint_starlight_s10,
     galactic_latitude_deg,
+    glow_map,
 )
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError

@@ -9,7 +9,7 @@ import doc_pages as pages
 import pytest
 
 import skysim
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 README = "README.md"
 ARCHITECTURE = "docs/reference/architecture.md"

@@ -7,7 +7,7 @@ import pytest
 from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 
-FISHER = interpreted("skysim.sources.dome.placement.fisher")
+FISHER = interpreted("skysim.sources.dome.layouts.fisher")
 CAMERA_M = np.array([0.03, -0.02, 0.3])
 TAN_HALF = np.array([0.2, 0.1])
 

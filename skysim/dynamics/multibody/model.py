@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.actuators.elements import Hinges, joints
 from skysim.dynamics.multibody.actuators.fans import Fans
+from skysim.dynamics.multibody.actuators.kind import Hinges, joints
 from skysim.dynamics.multibody.actuators.registry import (
     KINDS,
     TORQUES,

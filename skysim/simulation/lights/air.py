@@ -17,9 +17,8 @@ from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.air import AirGlowConfig
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Obstacle, Occluder
-from skysim.simulation.lights.plan import Plan
-from skysim.sources.air.air import Air, Sky
+from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Obstacle, Occluder, Plan
+from skysim.sources.air import Air, Sky
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from labpage import (
 )
 from scipy.interpolate import RegularGridInterpolator
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.scene import loader
 
 FOCUSED = """() => {

@@ -27,7 +27,7 @@ from labpage import (
 )
 
 from skysim.apps.gui.page import history
-from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.views.state import View
 from skysim.core.errors import InputError
 
 pytest_plugins = ["labpage"]

@@ -13,7 +13,7 @@ from laws import SEEDS, law, units
 
 from estimator.catalog import refraction
 from estimator.catalog.refraction import SiteAir
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 
 ARCSEC = erfa.DAS2R
 DATES = some.datetimes(datetime.datetime(1950, 1, 1), datetime.datetime(2060, 1, 1))

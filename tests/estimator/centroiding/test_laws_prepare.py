@@ -11,7 +11,7 @@ from laws import SEEDS, law
 
 from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import dome_invariants
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 
 AFFINE = np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, -0.2], [0.0, 0.0, 1.0]])
 HOMOGRAPHY = AFFINE + np.outer([0.0, 0.0, 1.0], [0.3, -0.2, 0.0])

@@ -9,7 +9,7 @@ from hypothesis import strategies as some
 from laws import law
 
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.detection.detect import to_native
 from estimator.trackers import warm_up
 

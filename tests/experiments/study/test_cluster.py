@@ -19,7 +19,7 @@ from study_stores import contents, done
 from test_engines import ENVIRONMENT, Cluster, cluster_of, on_dask, study
 
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import runner, workers
 from skysim.experiments.study.execution.setups import code_version

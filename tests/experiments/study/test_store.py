@@ -21,11 +21,11 @@ from study_stores import STRAYS, contents, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
-from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import add_motor, all_names, sites
 from skysim.dynamics.multibody.actuators.kind import (
     RANK_TOLERANCE,
     ActuatorKind,
     Actuators,
     ControlInput,
+    add_motor,
+    all_names,
     scale_to_limit,
+    sites,
     unit_columns,
 )
 from skysim.scene.sections.motion import DesaturationConfig

@@ -18,11 +18,14 @@ import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import Hinges, add_motor, joints, member_values
 from skysim.dynamics.multibody.actuators.kind import (
     RANK_TOLERANCE,
     ActuatorKind,
     ControlInput,
+    Hinges,
+    add_motor,
+    joints,
+    member_values,
     positive_values,
     scale_to_limit,
     unit_columns,

@@ -30,9 +30,9 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     RowResult,
+    confidence_interval,
     with_cause,
 )
-from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK

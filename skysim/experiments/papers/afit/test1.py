@@ -28,9 +28,9 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     RowResult,
+    confidence_interval,
     with_cause,
 )
-from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -39,7 +39,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import SlewConfig
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.known import known_light
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Plan
 from skysim.tracking import onboard_model
 
 LEDS = 9

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.setups import code_version, scene_hash
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.execution.trials import Row, Segment, TrialJob
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies

@@ -14,6 +14,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
+from skysim.sources.dome.layouts.neighborhoods import unique_levels
 from skysim.sources.dome.led import (
     DRIVES,
     DriveInput,
@@ -23,8 +24,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.placement.neighborhoods import unique_levels
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 Ints = NDArray[np.int64]
