@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.scale import CMOS
 from skysim.core.types import Floats
-from skysim.experiments import dataset_plan, dataset_run
+from skysim.experiments import dataset_run
 from skysim.experiments.dataset_shards import Storage
 
 FRAMES = 32
@@ -54,7 +54,7 @@ def measure(width_px: int, height_px: int, limit_mag: float) -> Cost:
         "camera.height_px": f"{height_px}",
         "light.limit_mag": f"{limit_mag}",
     }
-    made = dataset_plan.load(
+    made = dataset_run.load(
         "shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES
     )
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import verdict
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.engines import Chunks, Job, Pool
 from skysim.experiments.study.execution.trials import Row
@@ -81,7 +81,7 @@ def run_study(settings: dict[str, Any], workers: int) -> StudyTime:
         path.write_text(STUDY.format(**settings))
         pool = TimedPool(engines.Pool(workers))
         begin = time.perf_counter()
-        study = loader.load(path)
+        study = study_file.load(path)
         with store.writing(path.with_suffix(".sqlite")) as database:
             runner.prepare_store(study, database, False)
             progress = runner.run(study, database, pool)

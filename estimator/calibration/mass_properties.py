@@ -31,9 +31,9 @@ from estimator.calibration.mass_dynamics import (
     MIN_ATTITUDES,
     STATE,
     BearingRecord,
-    Lab,
+    EquationsOfMotion,
+    LabConstants,
     MassEstimate,
-    Motion,
     Prior,
     States,
     inertia_matrix,
@@ -71,7 +71,9 @@ class Reduced(NamedTuple):
     chi2: float
 
 
-def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
+def estimate_mass(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
     """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
     values = prior.values.copy()
     motions = [first_states(record, lab, values) for record in records]
@@ -103,7 +105,9 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
     )
 
 
-def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
+def estimate_with_noise(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
     """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
     A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
@@ -152,9 +156,9 @@ def considered(
     return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
 
 
-def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
+def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
     """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
-    motion = Motion(record, lab, values[:, None], values)
+    motion = EquationsOfMotion(record, lab, values[:, None], values)
     turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(
         record.t_s
     )[:, None]
@@ -167,7 +171,7 @@ def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
 
 
 def reduced(
-    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Reduced:
     """Linearize a record's residuals and eliminate its states."""
     count = len(record.t_s)
@@ -196,7 +200,7 @@ def reduced(
 
 
 def whitened_links(
-    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Floats:
     """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
     residuals, in standard deviations.
@@ -224,7 +228,7 @@ def whitened_links(
 def add_measured(
     record: BearingRecord,
     states: States,
-    lab: Lab,
+    lab: LabConstants,
     values: Floats,
     to: tuple[Floats, Floats, Floats],
 ) -> float:
@@ -275,7 +279,7 @@ START = 20  # attitudes for the batch that begins the filter
 RATE_SIGMA_RAD_S = 0.01  # of the rate by the difference of the attitudes before and after
 
 
-def filter_mass(record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassEstimate]:
+def filter_mass(record: BearingRecord, lab: LabConstants, prior: Prior) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
 
     The parameters begin with the batch estimate from the first START attitudes, the state with the next three alone.
@@ -302,7 +306,7 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
 
 
 def filter_from(
-    begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Prior
+    begun: MassEstimate, record: BearingRecord, lab: LabConstants, prior: Prior
 ) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
     size = len(begun.values)
@@ -329,7 +333,7 @@ def filter_from(
         yield MassEstimate(values, covariance[STATE:, STATE:], chi2 / (3 * (n - 1)))
 
 
-def first_covariance(begun: MassEstimate, record: BearingRecord, lab: Lab) -> Floats:
+def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstants) -> Floats:
     """(9 + P, 9 + P) at the second attitude. H = R (J w + A (1 + e) h): its errors are those of rate and parameters."""
     values = begun.values
     P = begun.covariance

@@ -88,7 +88,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class NextExposure:
     """The next exposure time, and the flags of the frame that it is based on."""
 
     time_s: float
@@ -96,7 +96,7 @@ class Exposure:
     no_stars: bool = False
 
 
-def step(state: Exposure, observation: Observation, control: Control) -> Exposure:
+def step(state: NextExposure, observation: Observation, control: Control) -> NextExposure:
     """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
     saturated = (
         observation.mean_dn > control.mean_dn
@@ -106,7 +106,7 @@ def step(state: Exposure, observation: Observation, control: Control) -> Exposur
     direction = -1 if saturated else int(no_stars)
     target_s = INCREMENT_S * round((state.time_s + direction * control.step_s) / INCREMENT_S)
     time_s = min(max(target_s, control.shortest_s), control.longest_s)
-    return Exposure(time_s, saturated, no_stars)
+    return NextExposure(time_s, saturated, no_stars)
 
 
 def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:

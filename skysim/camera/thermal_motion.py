@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import Optics, ScaledOptics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Mount, Sources
-from skysim.scene.sections.thermal import (
+from skysim.scene.sections.surroundings import (
     LinearTemperatureConfig,
     SineTemperatureConfig,
     SteadyTemperatureConfig,

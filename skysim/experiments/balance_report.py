@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
 from skysim.core import files
 from skysim.core.types import Floats
-from skysim.experiments.balance_flight import BalanceFlight
-from skysim.experiments.balance_prior import Assumptions, largest_tilt_deg
-from skysim.experiments.balance_procedure import Iteration, Plan, filtered
-from skysim.results.report import (
+from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
+from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Column,
     Facts,
     Figure,
-    Report,
     Section,
     Table,
     Text,
@@ -32,7 +31,7 @@ INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
 
 
-def statistics(scene: str, plan: Plan, iterations: Sequence[Iteration]) -> dict[str, Any]:
+def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> dict[str, Any]:
     """All numbers of a balance, SI except where a unit is in the name."""
     last = iterations[-1]
     return {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Floats, SourceTruth
-from skysim.sources.false_lights import light_name
+from skysim.sources.satellites import light_name
 
 # Convert frames to 8-bit images for display, and encode them as JPEG.
 

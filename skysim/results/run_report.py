@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from skysim.core.types import FrameRow
 from skysim.results.plots import figure_png, stacked_axes
-from skysim.results.report import (
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Cell,
     Column,
     Facts,
     Figure,
     Items,
-    Report,
     Section,
     Table,
     Text,

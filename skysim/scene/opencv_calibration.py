@@ -21,7 +21,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class OpencvCalibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
     focal_px   : focal length (strictly, the image distance) over the pixel pitch
@@ -86,7 +86,7 @@ def looks_like_calibration(path: Path) -> bool:
     )
 
 
-def read(path: Path) -> Calibration:
+def read(path: Path) -> OpencvCalibration:
     """Read a file of OpenCV's calibration samples (or of ROS, whose keys are the same).
 
     Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are ignored. Raises InputError
@@ -119,7 +119,7 @@ def read(path: Path) -> Calibration:
             path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS)
         )
     k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
-    return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
+    return OpencvCalibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
 
 
 def parse_file(path: Path) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e12
 
 
-def text(calibration: Calibration) -> str:
+def text(calibration: OpencvCalibration) -> str:
     """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
     fx = calibration.focal_px
     (cx, cy) = calibration.center_px

@@ -19,7 +19,6 @@ from skysim.core.errors import OVERRIDES, InputError
 from skysim.core.units import ConfigModel
 from skysim.core.yaml_reader import Files, parse_yaml, where_of
 from skysim.scene.scene import HEAD_SECTIONS, Scene
-from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
     CelestialConfig,
@@ -32,6 +31,7 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.scene.sections.leds import DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # the solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # the detectors with thresholds of their own

@@ -26,12 +26,12 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.sources.air import weather_of
+from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.codebooks import codebook, light_levels
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.photometry import Band
 from skysim.tracking import dome_map_file
 

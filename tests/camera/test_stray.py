@@ -20,8 +20,8 @@ from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_lab
 from skysim.sources.dome.interreflection import ReflectingDome, diffuse_light, spiral
 from skysim.sources.dome.surface import Ellipsoid
-from skysim.sources.false_lights import GHOST, MIRRORED
 from skysim.sources.photometry import Band
+from skysim.sources.satellites import GHOST, MIRRORED
 
 CAMERA = {
     "width_px": 400,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from skysim.core import encoded, images
-from skysim.core import fits as fits_images
+from skysim.core import images as fits_images
 from skysim.core.errors import InputError
 
 RNG = np.random.default_rng(4)

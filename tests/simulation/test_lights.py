@@ -26,7 +26,7 @@ from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights import registry
-from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occluder, Plan
+from skysim.simulation.lights.light import Exposure, Light, LightPlan, Lit, Obstacle, Occluder
 from skysim.simulation.lights.registry import register
 from skysim.sources.photometry import led_strength_e_s_sr
 
@@ -60,7 +60,7 @@ class Lighthouse(Light):
         return Lit("lighthouse", points=self.lamp if is_lit else None)
 
 
-def build_lighthouse(config: LighthouseConfig, plan: Plan) -> Lighthouse:
+def build_lighthouse(config: LighthouseConfig, plan: LightPlan) -> Lighthouse:
     one = np.ones(1)
     zero = np.zeros(1)
     strength = np.atleast_1d(led_strength_e_s_sr(config.intensity_cd, "white", plan.band))

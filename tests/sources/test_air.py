@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropy.utils import iers
 
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirConfig, HorizonConfig
+from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources import air as starlight
 from skysim.sources import catalog, stars

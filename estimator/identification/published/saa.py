@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from estimator.attitude.solvers import quest
 from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
-from estimator.catalog.spatial_grid import Cells, within
+from estimator.catalog.sky_index import Cells, within
 from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.apps.stream.packet import Packet, build_packet
-from skysim.apps.stream.sinks import Sink
+from skysim.apps.stream.sinks import Packet, Sink, build_packet
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window
 

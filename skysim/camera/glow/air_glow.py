@@ -15,7 +15,7 @@ from skysim.camera.glow.background import (
 )
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirGlowConfig
+from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.sources.air import Sky, air_mass
 from skysim.sources.ephemeris import Place, observe_from, place
 from skysim.sources.photometry import sky_radiance_e_s_m2_sr

@@ -19,10 +19,10 @@ from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import BaffleConfig
-from skysim.scene.sections.orbit import EarthConfig
+from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
+from skysim.sources.camera_orbit import TO_SPHERE
 from skysim.sources.dome.surface import perpendicular
-from skysim.sources.orbit.earth import TO_SPHERE
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels

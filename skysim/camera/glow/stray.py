@@ -28,8 +28,8 @@ from skysim.core.types import Floats, Sources, SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.dome.mirror import mirrored
-from skysim.sources.false_lights import GHOST
 from skysim.sources.photometry import Band
+from skysim.sources.satellites import GHOST
 
 BLUR_PX = 0.7  # of a ghost's edge
 

@@ -16,14 +16,15 @@ from skysim.experiments.characterize.photon_transfer import (
     LIGHT,
     model,
 )
-from skysim.experiments.characterize.sensor_fit import Sensor
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.results.plots import INK, png
-from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
+from skysim.results.report import Report
+from skysim.results.report_blocks import Column, Facts, Figure, Items, Section, Table, Verdict
 from skysim.scene.sections.camera import CameraConfig
 
 
 def characterize_report(
-    statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None
+    statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
 ) -> Report:
     """The report of a characterized camera. statistics : as in `characterize.json`"""
     figures = [
@@ -105,7 +106,7 @@ SIZE_TEXT = (
 )
 
 
-def draw_transfer(axes: Any, found: Sensor) -> None:
+def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     """Variance against mean, and the linearity."""
     transfer = found.transfer
     (curve, line) = axes

@@ -20,21 +20,22 @@ from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
     DomeFaults,
+    SurveyRun,
     accuracy_statistics,
     fault_lines,
+    residuals_px,
     rows_of,
 )
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
-from skysim.experiments.dome_survey.survey_run import SurveyRun, residuals_px
 from skysim.results import metrics
 from skysim.results.plots import INK, png
-from skysim.results.report import (
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Column,
     Facts,
     Figure,
-    Report,
     Section,
     Table,
     Text,

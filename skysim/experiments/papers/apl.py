@@ -16,15 +16,15 @@ from skysim.camera.render import Poses, in_view, project
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.experiments.configs import with_config
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
     bootstrap_interval,
 )
 from skysim.experiments.papers.published import experiments
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import exact, extremum
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
@@ -166,7 +166,9 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
         for offset_m in OFFSETS_M
     ]
     caption = "Largest angular discrepancy of a fiber against the camera's offset, with the offset unknown and known."
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, np.array(worst))),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw(fig, np.array(worst))),)
+    )
 
 
 def draw(fig: Any, worst_arcsec: Floats) -> None:

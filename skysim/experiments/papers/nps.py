@@ -25,9 +25,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     bootstrap_interval,
     with_cause,
 )
@@ -59,7 +59,7 @@ class OnboardModel(NamedTuple):
     pairs: PairIndex
 
 
-class Solution(NamedTuple):
+class PanelSolution(NamedTuple):
     """Number of matched stars and body_from_lab; 0 and None if no match is significant against chance."""
 
     matched: int
@@ -119,20 +119,20 @@ def directions(lab: Lab, panel: LedMap, rays: Floats, body_from_lab: Rotation) -
     return point_m / np.linalg.norm(point_m, axis=1, keepdims=True)
 
 
-def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> PanelSolution:
     """Solve once: distances from the assumed attitude, master-star identification within 500 arcsec, QUEST."""
     observed = directions(model.lab, model.panel, rays, assumed)
     # master_star takes the error of a direction; an angle's is sqrt(2) times that.
     match = master_star(observed, model.pairs, SEPARATION_RAD / np.sqrt(2))
     if match is None:
-        return Solution(0, None)
+        return PanelSolution(0, None)
     sigma_rad = np.full(len(match.observed), SEPARATION_RAD)
-    return Solution(
+    return PanelSolution(
         len(sigma_rad), quest(observed[match.observed], model.vectors[match.star], sigma_rad)
     )
 
 
-def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> PanelSolution:
     """Solve UPDATES times, each time with the last solution as the assumed attitude."""
     for _ in range(UPDATES):
         solution = solve(model, rays, assumed)
@@ -150,8 +150,8 @@ def initial_error(error_deg: float) -> Rotation:
 class SolutionSeries(NamedTuple):
     """Solutions of all trials by initial error in degrees, and the iterated solutions."""
 
-    solutions: dict[float, list[Solution]]
-    iterated: list[Solution]
+    solutions: dict[float, list[PanelSolution]]
+    iterated: list[PanelSolution]
 
     def matched(self) -> Summary:
         """Mean number of matched stars over the five trials."""
@@ -179,7 +179,7 @@ def solve_series(
     options: ExperimentOptions,
 ) -> SolutionSeries:
     """Solve frames from the level vehicle, each from every initial error, and iterated from ITERATED_DEG."""
-    solutions: dict[float, list[Solution]] = {error: [] for error in errors_deg}
+    solutions: dict[float, list[PanelSolution]] = {error: [] for error in errors_deg}
     iterated_solutions = []
     for n in range(frames):
         rays = rays_body(model.lab, seed + n)
@@ -220,7 +220,9 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),)
+    )
 
 
 def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:

@@ -22,9 +22,9 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import (
     Cause,
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
     bootstrap_interval,
     sample_std,
@@ -229,13 +229,15 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
     return float(np.degrees(np.arccos(itrs_from_icrs(LOCAL_TIMES[0]).apply(boresight) @ up)))
 
 
-def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> tuple[Drawing, ...]:
+def drawings(
+    calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
+) -> tuple[FigureDrawing, ...]:
     return (
-        Drawing(
+        FigureDrawing(
             "Right ascension of the fixed camera against time: Table 2 and ours.",
             lambda fig: draw_rate(fig, calibrated),
         ),
-        Drawing(
+        FigureDrawing(
             "Errors about their mean: of Table 2 about the sidereal rate, and ours with and without the causes.",
             lambda fig: draw_errors(fig, calibrated, uncalibrated),
             (7.4, 4.6),

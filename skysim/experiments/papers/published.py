@@ -18,7 +18,7 @@ from skysim.core.yaml_reader import explain, read_yaml
 FOLDER = DATA / "published"
 
 
-class Row(ConfigModel):
+class PublishedRow(ConfigModel):
     """One published number.
 
     quantity : its description, with the unit in parentheses
@@ -69,7 +69,7 @@ class Experiment(ConfigModel):
     assumed: tuple[str, ...] = ()
     fitted: tuple[str, ...] = ()
     data: dict[str, tuple[tuple[Number, ...], ...]] = Field(default_factory=dict)
-    rows: Annotated[dict[str, Row], Field(min_length=1)]
+    rows: Annotated[dict[str, PublishedRow], Field(min_length=1)]
     paper: str = ""
 
 

@@ -9,7 +9,6 @@ from skysim.core.errors import InputError
 from skysim.experiments.papers import apl, nps, oled, ptase_ground, ptase_monte_carlo
 from skysim.experiments.papers.afit import (
     afit_surface,
-    bump,
     led_tests,
     test1,
     test2,
@@ -25,9 +24,9 @@ from skysim.experiments.papers.compare import (
 from skysim.experiments.papers.published import experiments
 from skysim.experiments.papers.shefex import (
     shefex_camera,
-    shefex_catalog,
     shefex_identification,
     shefex_nights,
+    shefex_setup,
 )
 
 ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
@@ -39,7 +38,7 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "afit-table-3-5": test2.tables_3_to_5,
     "afit-table-6-9": test3.tables_6_to_9,
     "afit-table-10-15": test3_attitude.tables_10_to_15,
-    "afit-bump": bump.bump,
+    "afit-bump": test3_attitude.bump,
     "nps": nps.initial_error_trials,
     "apl": apl.discrepancies_and_counts,
     "oled": oled.noise_and_absolute_error,
@@ -47,7 +46,7 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "ptase-table-2": ptase_ground.table_2,
     "shefex-fig-2": shefex_camera.exposure_control,
     "shefex-fig-3": shefex_camera.scan_times,
-    "shefex-figs-4-5": shefex_catalog.catalog_statistics,
+    "shefex-figs-4-5": shefex_setup.catalog_statistics,
     "shefex-figs-7-10": shefex_identification.figs_7_to_10,
     "shefex-nights": shefex_nights.night_results,
 }

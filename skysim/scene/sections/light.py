@@ -30,10 +30,9 @@ from skysim.core.units import (
     SemiAxis,
     check_table,
 )
-from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.scene.sections.orbit import SatellitesConfig
+from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]

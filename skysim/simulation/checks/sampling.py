@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
 from skysim.simulation.checks.views import VISIBLE, View, view
@@ -30,7 +30,7 @@ class Sampled(NamedTuple):
     others : the lights that it detects and does not know, by their names
     """
 
-    attitudes: Attitudes
+    attitudes: CheckedAttitudes
     exposures: list[Exposure]
     beams: list[Beam]
     known: list[View]
@@ -53,14 +53,14 @@ class Sampled(NamedTuple):
         return np.concatenate([getattr(view, name) for view in self.seen])
 
 
-class Samples(NamedTuple):
+class CheckedSamples(NamedTuple):
     """The two sets of attitudes: those of the frames, and all that the motion could reach."""
 
     frames: Sampled
     reach: Sampled
 
 
-def sampled(at: Attitudes, context: Context) -> Sampled:
+def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     """What the camera sees at some attitudes, and the expected errors there."""
     camera = context.lab.camera
     rows = zip(at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True)

@@ -31,7 +31,7 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
-from skysim.sources.false_lights import MIRRORED
+from skysim.sources.satellites import MIRRORED
 
 STEP_RAD = 1e-5  # of the differences: error 1e-10
 STEPS = 12  # of Newton's method

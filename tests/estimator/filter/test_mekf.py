@@ -21,7 +21,7 @@ from estimator.filter.mekf import (
     GyroModel,
     Update,
 )
-from estimator.filter.propagate import transition
+from estimator.filter.states import transition
 
 ARCSEC_RAD = np.pi / 180 / 3600
 DEG_H_RAD_S = np.pi / 180 / 3600

@@ -20,7 +20,7 @@ from small_dataset import HEIGHT, VARY, WIDTH, contents, small
 
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
-from skysim.experiments import dataset_plan, dataset_run, dataset_shards
+from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.study.execution import engines, workers
 
 pyarrow = pytest.importorskip("pyarrow.parquet")
@@ -416,4 +416,4 @@ def test_a_shard_that_kills_its_workers_is_told_and_left_out() -> None:
     (chunk,) = dataset_run.ShardQueue([2]).next()
     failed = dataset_run.DatasetJob(made, "x").failed(chunk, engines.DIED)
     assert (failed.shard, failed.frames, failed.error) == (2, 0, engines.DIED)
-    assert dataset_plan.FORMATS
+    assert dataset_run.FORMATS

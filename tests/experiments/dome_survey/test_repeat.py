@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
 from skysim.experiments.dome_survey import adjust, survey_prior, survey_procedure
-from skysim.experiments.dome_survey.survey_procedure import Errors
+from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
 def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,12 +21,12 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
     found = iter(
         [
             InputError("survey", "too few"),
-            Errors(1e-8, 4e-8, 1.0, 90, 0),
-            Errors(3e-8, 4e-8, 9.0, 92, 1),
+            SimulatedErrors(1e-8, 4e-8, 1.0, 90, 0),
+            SimulatedErrors(3e-8, 4e-8, 9.0, 92, 1),
         ]
     )
 
-    def run_survey(*_: object) -> Errors:
+    def run_survey(*_: object) -> SimulatedErrors:
         one = next(found)
         if isinstance(one, InputError):
             raise one

@@ -23,7 +23,7 @@ from study_stores import contents, done
 
 import skysim.experiments.study.execution
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import engines, runner, setups, store, trials, workers
 from skysim.experiments.study.execution.engines import Engine
 
@@ -64,7 +64,7 @@ ENVIRONMENT = (
 def study(folder: Path, text: str = STUDY) -> plan.Plan:
     path = folder / "strays.yaml"
     path.write_text(text)
-    return loader.load(path)
+    return study_file.load(path)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import pytest
 from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.analysis import table, worst
 from skysim.experiments.study.execution import engines, runner, store, workers
 from skysim.experiments.study.execution.outcomes import Outcome
@@ -337,7 +337,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told = loader.load(tmp_path / "strays.yaml")
+    told = study_file.load(tmp_path / "strays.yaml")
     draw = random.Random(2)
     done(told, tmp_path / "whole.sqlite")
     often = tmp_path / "often.sqlite"

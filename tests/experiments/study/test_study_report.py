@@ -15,7 +15,8 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import factors as designs
-from skysim.experiments.study.analysis import axes, search
+from skysim.experiments.study.analysis import search
+from skysim.experiments.study.analysis import table as axes
 from skysim.experiments.study.analysis.table import Index, PointRow, cells, has_few_values, table
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome

@@ -52,12 +52,12 @@ def dataset(
     """
     start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments import dataset_plan, dataset_run
+    from skysim.experiments import dataset_run
     from skysim.experiments.dataset_shards import Storage
 
     Storage(out)  # refuses a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
-    made = dataset_plan.load(
+    made = dataset_run.load(
         scene,
         vary,
         frames,

@@ -12,8 +12,8 @@ import typer
 from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
-from skysim.results.report.as_text import print_table, print_wrapped
-from skysim.results.report.blocks import Column, Table
+from skysim.results.report import print_table, print_wrapped
+from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.model_fit import Agreement
@@ -64,18 +64,13 @@ def datasheet(
     """
     from skysim.core import files
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.datasheet import (
-        datasheet_report,
-        datasheet_run,
-        model_export,
-        model_fit,
-    )
+    from skysim.experiments.datasheet import cells, datasheet_report, model_fit
     from skysim.experiments.datasheet.statement import numbers, state
 
     if fmu and model is None:
         raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
     if fmu:
-        model_export.require_fmu_builder()
+        model_fit.require_fmu_builder()
     loaded = load(scene, None, seed, set_)
     overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
     folder = out or Path("out") / f"{loaded.name}_datasheet"
@@ -84,7 +79,7 @@ def datasheet(
         def watch(trials: int) -> Callable[[Any], Any]:
             return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
 
-        sheet = datasheet_run.measure(
+        sheet = cells.measure(
             scene,
             loaded,
             overrides,
@@ -105,8 +100,8 @@ def datasheet(
         constants = model_fit.constants(sheet) | {
             "agreement": [one._asdict() for one in agreements]
         }
-        written = model_export.write_model(model, constants) + (
-            [model_export.write_fmu(model)] if fmu else []
+        written = model_fit.write_model(model, constants) + (
+            [model_fit.write_fmu(model)] if fmu else []
         )
     if json:
         print_json(numbers(statement))

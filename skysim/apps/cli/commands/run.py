@@ -59,7 +59,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.results.report import Facts
+    from skysim.results.report_blocks import Facts
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
     from skysim.simulation.checks.facts import TRACKER_KNOWS
@@ -152,10 +152,9 @@ def compare(
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
     from skysim.experiments import tracker_comparison
-    from skysim.results.recorder import Recorder
+    from skysim.results.run import Recorder
     from skysim.simulation.flight import Flight
-    from skysim.simulation.lab import build_lab
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, frames, seed, set_, tracker)
     programs = used_programs(program, [*tracker, *scene_names(loaded)])

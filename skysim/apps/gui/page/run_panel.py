@@ -12,13 +12,13 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
+from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
-from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
@@ -42,12 +42,12 @@ class RunPanel:
         closed again
     """
 
-    def __init__(self, page: PageContext, contents: Contents, sensor: Sensor) -> None:
+    def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
         self.page = page
         self.contents = contents
         self.sensor = sensor
         self.feedback: str | None = None
-        self.rows: list[FrameRow] = []
+        self.rows: list[FlightRow] = []
         self.log = MotionLog(())
         self.times_s: list[float] = []
         self.residuals: list[tuple[float, int, float]] = []
@@ -363,5 +363,6 @@ class RunPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(FrameRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv"
+            csv_table(FlightRow._fields, self.rows),
+            f"{Path(self.page.state.scene).stem}_flight.csv",
         )

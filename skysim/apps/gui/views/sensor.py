@@ -22,8 +22,8 @@ from skysim.apps.gui.messages import (
     Detection,
     FrameView,
     Lens,
-    Light,
-    Lights,
+    LightColumns,
+    LightRow,
     Pixels,
     Pose,
     SceneInfo,
@@ -31,8 +31,7 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.views import keys, overlay
 from skysim.apps.gui.views.live import Contents, LiveText
-from skysim.apps.gui.views.overlay import NAMES
-from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
+from skysim.apps.gui.views.overlay import FRAMES, NAMES, ServedFrame, Source, TabFrames, display_of
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import annotate
@@ -57,7 +56,7 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
     """The frame with its loupe and plot, implemented in frame.js."""
 
 
-class Sensor:
+class SensorView:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
     id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
@@ -71,7 +70,7 @@ class Sensor:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
-        self.lights: Lights = NO_LIGHTS
+        self.lights: LightColumns = NO_LIGHTS
         self.result: TrackerResult | None = None
         self.size_px = (4, 3)
         self.prefix = "HIP"
@@ -242,7 +241,7 @@ class Sensor:
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
         self.update_text()
 
-    def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
@@ -257,7 +256,7 @@ class Sensor:
             light
         ]
 
-    def light_text(self, detection: Detection | None, light: Light | None) -> str:
+    def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
         lines = []
         if light:

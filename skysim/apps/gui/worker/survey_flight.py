@@ -25,10 +25,9 @@ from skysim.experiments.dome_survey import (
     survey_report,
 )
 from skysim.experiments.dome_survey import survey_frames as stops
-from skysim.experiments.dome_survey.survey_findings import Coverage
+from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights, imu_attitudes
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
-from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation.flight import Flight

@@ -21,7 +21,7 @@ from skysim.apps.gui.messages import (
     FrameView,
     LabGeometry,
     Lens,
-    Lights,
+    LightColumns,
     PlanCheck,
     SceneInfo,
     TrackerResult,
@@ -178,7 +178,7 @@ def id_prefix(lab: Lab) -> str:
     return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
-def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
     """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
     sources = truth.sources
     of_bodies = {body.id: body.v_mag for body in truth.bodies}
@@ -186,7 +186,7 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    return Lights(
+    return LightColumns(
         ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float)
     )
 

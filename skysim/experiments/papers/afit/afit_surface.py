@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import INCH_M
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
     with_cause,
 )
@@ -88,7 +88,7 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
     chords = [chord_in(dome, STATED_HEIGHT_IN, angle) for angle in ANGLES_DEG]
     results["sphere"] = RowResult(exact(np.ptp(chords)))
     caption = "Table 1: width of the image on a flat surface."
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, panel)),))
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, panel)),))
 
 
 def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:

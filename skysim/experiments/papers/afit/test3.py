@@ -31,9 +31,9 @@ from skysim.dynamics import guidance
 from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_angles_arcsec
 from skysim.experiments.papers.compare import (
     Cause,
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
     bootstrap_interval,
 )
@@ -221,12 +221,12 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
     results |= epsilons(ours, with_faults, bumped, drifted) | buckets()
     caption = f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}."
     drawings = (
-        Drawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
-        Drawing(
+        FigureDrawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
+        FigureDrawing(
             f"Fig. 76: angles of all pairs, ours with {CAUSE}.",
             lambda fig: draw_separations(fig, with_faults),
         ),
-        Drawing(
+        FigureDrawing(
             "Figs 77 and 79: positions of the five LEDs; the IMU is correct except at the bumped position 5.",
             lambda fig: draw_scatter(fig, bumped),
             (6.4, 3.9),

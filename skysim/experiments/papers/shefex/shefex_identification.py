@@ -20,9 +20,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import (
     Cause,
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
     bootstrap_of_means,
 )
@@ -32,7 +32,7 @@ from skysim.experiments.papers.shefex.shefex_setup import (
     PIXEL_RAD,
     PRINTED_FIELD_RAD,
     PUBLISHED,
-    Field,
+    StarField,
     identify_and_solve,
     pairs,
     plot_curve,
@@ -66,7 +66,7 @@ class Identification(NamedTuple):
 
 
 def identify(
-    field: Field,
+    field: StarField,
     centroid_px: float,
     cosine_error: float,
     spikes: int,
@@ -174,16 +174,16 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     )
     results |= equation_results(random_stream(options.seed, 2))
     drawings = (
-        Drawing(
+        FigureDrawing(
             "Fig. 7: angles compared by an identification, against cosError.",
             partial(draw_time, curves),
         ),
-        Drawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
-        Drawing(
+        FigureDrawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
+        FigureDrawing(
             "Fig. 9: wrong recognitions against the spikes among the stars.",
             partial(draw_wrong, curves),
         ),
-        Drawing(
+        FigureDrawing(
             "Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)
         ),
     )

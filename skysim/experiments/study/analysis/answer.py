@@ -12,13 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from skysim.experiments.study.analysis import thresholds
-from skysim.experiments.study.analysis.axes import axis, distinct, unit_of
 from skysim.experiments.study.analysis.table import (
     Place,
     PointRow,
+    axis,
+    distinct,
     format_level,
     format_summary,
     has_few_values,
+    unit_of,
 )
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import (
+from skysim.experiments.study.analysis.table import (
     Axis,
+    PointRow,
     axis,
     is_sampled,
     is_share,
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
 from skysim.experiments.study.plan import Curve, Heat, Map, Study
 from skysim.experiments.study.report import layout

@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import (
+from skysim.experiments.study.analysis.table import (
     Axis,
+    PointRow,
     axis,
     distinct,
     fixed_levels,
+    format_level,
     group_points,
+    has_few_values,
     is_sampled,
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.table import PointRow, format_level, has_few_values
 from skysim.experiments.study.analysis.thresholds import thresholds_of
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics

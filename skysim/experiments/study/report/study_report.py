@@ -14,16 +14,25 @@ from skysim.core.types import Floats
 from skysim.experiments.study.analysis import answer, search
 from skysim.experiments.study.analysis import table as sensitivity
 from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.analysis.axes import axis, is_sampled, same, shown_points
 from skysim.experiments.study.analysis.search import SearchResult
-from skysim.experiments.study.analysis.table import Index, PointRow, format_response, format_summary
+from skysim.experiments.study.analysis.table import (
+    Index,
+    PointRow,
+    axis,
+    format_response,
+    format_summary,
+    is_sampled,
+    same,
+    shown_points,
+)
 from skysim.experiments.study.analysis.worst import ColumnsOf
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.results.report import (
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Code,
@@ -31,13 +40,13 @@ from skysim.results.report import (
     Facts,
     Figure,
     Items,
-    Report,
+    Kind,
     Section,
     Table,
     Text,
+    Tone,
     Verdict,
 )
-from skysim.results.report.blocks import Kind, Tone
 
 POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"

@@ -14,7 +14,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.layouts.neighborhoods import unique_levels
+from skysim.sources.dome.layouts.ambiguity import unique_levels
 from skysim.sources.dome.led import (
     DRIVES,
     DriveInput,

@@ -25,6 +25,7 @@ from skysim.scene.sections.layouts import (
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
 from skysim.sources.dome import display
+from skysim.sources.dome.display import projector_sources
 from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
@@ -36,7 +37,6 @@ from skysim.sources.dome.layouts.spreads import (
     random_places,
 )
 from skysim.sources.dome.layouts.string import displace_ends, string
-from skysim.sources.dome.projector import projector_sources
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
