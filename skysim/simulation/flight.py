@@ -36,7 +36,7 @@ from skysim.simulation.lab import (
 )
 from skysim.simulation.motion import Motion, history_s
 from skysim.tracking import factory, navigation
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 FIRST_OBSERVATION = (
     1_000_000  # index of the first frame beside the schedule; it selects the frame's noise

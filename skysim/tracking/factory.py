@@ -10,17 +10,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.checks import ImageError
-from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS
 from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import IDENTIFIERS as NEAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
 from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
@@ -195,3 +198,52 @@ def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: floa
     if isinstance(estimator, DomeTracker):
         return estimator.solve_centroids(centroids, exposure_s=exposure_s)
     return estimator.solve_centroids(centroids)
+
+
+# Automatic exposure: set the next exposure time from the last frame.
+
+
+class ExposureController:
+    """The camera's exposure controller: sets the next exposure time from the last frame.
+
+    exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.control = control_settings(scene)
+        self.settings = assumed_settings(scene)
+        self.exposure_s = scene.exposure.time_s
+
+    def update(self, frame: Frame) -> None:
+        """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
+        if self.control:
+            state = NextExposure(frame.exposure_s)
+            self.exposure_s = step(
+                state, observe_frame(self.settings, self.control, frame), self.control
+            ).time_s
+
+
+def control_settings(scene: Scene) -> Control | None:
+    """The constants of the control law from the scene; None where exposure times are fixed."""
+    config = scene.tracker.exposure_control
+    return Control(**dict(config)) if config else None
+
+
+def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observation:
+    """What the control law needs from a frame: brightness statistics of the detected blobs.
+
+    Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel counts as saturated near the camera's
+    saturation value.
+    """
+    try:
+        blobs = DETECTORS[settings.detector](
+            frame.image_dn,
+            settings.threshold_sigma,
+            settings.min_area_px,
+            settings.max_blobs,
+            FramePriors(None, settings.saturation),
+        )
+    except ImageError:  # a coarse converter may give a frame of one value: no blobs
+        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
+    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+    return observe(frame.image_dn, box_px, settings.saturation, control)

@@ -294,7 +294,7 @@ def test_an_interrupt_leaves_the_old_folder_or_the_new(
 KILLED = """
 import os, sys
 from pathlib import Path
-from skysim.core.io import files as io
+from skysim.core import files as io
 out = Path(sys.argv[1])
 with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "frames.zarr") as folder:
     file.write_text("half")

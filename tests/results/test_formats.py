@@ -24,7 +24,7 @@ from skysim.camera.optics import Optics
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results import annotate, scoring
+from skysim.results import plots, scoring
 from skysim.results.files import recording, run_export
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
@@ -300,7 +300,7 @@ def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> 
     for stem in run.stems:
         there, picture = film.read()
         assert there
-        meant = annotate.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
+        meant = plots.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
             :492, :658
         ]
         assert np.corrcoef(picture[:, :, 0].ravel(), meant.ravel())[0, 1] > 0.8

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
+from skysim.experiments.study import search
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.analysis import search
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.scene import loader
 from skysim.scene.sections import light

@@ -18,7 +18,7 @@ from typing import Any
 from skysim.apps.stream.sinks import Packet, encode_png
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.results.annotate import jpeg, to_8bit
+from skysim.results.plots import jpeg, to_8bit
 
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # for a client that stops reading

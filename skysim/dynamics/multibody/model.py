@@ -22,17 +22,16 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.actuators.fans import Fans
-from skysim.dynamics.multibody.actuators.kind import Hinges, joints
-from skysim.dynamics.multibody.actuators.registry import (
+from skysim.dynamics.multibody.actuator_kind import Hinges, joints
+from skysim.dynamics.multibody.actuators import (
     KINDS,
     TORQUES,
     add_actuators,
     lock_unused,
     locked_joint_hint,
 )
-from skysim.dynamics.multibody.actuators.wheels import WHEEL
+from skysim.dynamics.multibody.cmgs import GIMBAL, ROTOR
+from skysim.dynamics.multibody.fans import Fans
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,
@@ -43,6 +42,7 @@ from skysim.dynamics.multibody.mass import (
     unbalance,
 )
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
 
 STEP_S = 1e-3

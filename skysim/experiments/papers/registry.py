@@ -6,7 +6,16 @@ import time
 from collections.abc import Callable
 
 from skysim.core.errors import InputError
-from skysim.experiments.papers import apl, nps, oled, ptase_ground, ptase_monte_carlo
+from skysim.experiments.papers import (
+    nps,
+    other_domes,
+    ptase_ground,
+    ptase_monte_carlo,
+    shefex_camera,
+    shefex_identification,
+    shefex_nights,
+    shefex_setup,
+)
 from skysim.experiments.papers.afit import (
     afit_surface,
     led_tests,
@@ -22,12 +31,6 @@ from skysim.experiments.papers.compare import (
     compare,
 )
 from skysim.experiments.papers.published import experiments
-from skysim.experiments.papers.shefex import (
-    shefex_camera,
-    shefex_identification,
-    shefex_nights,
-    shefex_setup,
-)
 
 ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
 
@@ -40,8 +43,8 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "afit-table-10-15": test3_attitude.tables_10_to_15,
     "afit-bump": test3_attitude.bump,
     "nps": nps.initial_error_trials,
-    "apl": apl.discrepancies_and_counts,
-    "oled": oled.noise_and_absolute_error,
+    "apl": other_domes.discrepancies_and_counts,
+    "oled": other_domes.noise_and_absolute_error,
     "ptase-table-1": ptase_monte_carlo.table_1,
     "ptase-table-2": ptase_ground.table_2,
     "shefex-fig-2": shefex_camera.exposure_control,

@@ -20,7 +20,7 @@ from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.lab import Lab
-from skysim.simulation.reference_limits import check_reference
+from skysim.simulation.motion import check_reference
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
 
 OWN_KEYS = (

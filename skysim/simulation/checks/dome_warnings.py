@@ -17,8 +17,8 @@ from skysim.simulation.checks.detection import Context, centroid_variance, thres
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.lights.lab_room import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
-from skysim.simulation.lights.room import IMAGES, Mirror
 from skysim.sources.dome import surface
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.surface import Radial, Surface

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from skysim.scene.sections.light import LightConfig, add_kind
-from skysim.simulation.lights import atmosphere, lens, room, sky_bodies, starlight
+from skysim.simulation.lights import atmosphere, lab_room, lens, sky_bodies, starlight
 from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.light import Light, LightPlan
 
@@ -43,9 +43,9 @@ LIGHTS: dict[str, Callable[[LightPlan], Iterable[Light]]] = {
     "satellites": sky_bodies.build_satellites,
     "air": atmosphere.build,
     "further lights": further_lights,
-    "wall": room.build_wall,
+    "wall": lab_room.build_wall,
     "baffle": lens.build_baffle,
-    "vehicle and dome": room.build_obstacles,
+    "vehicle and dome": lab_room.build_obstacles,
     "lens": lens.build,
 }
 

@@ -34,8 +34,7 @@ from skysim.experiments.papers.ptase_monte_carlo import (
     run_version,
     version,
 )
-from skysim.results.annotate import to_8bit
-from skysim.results.plots import png
+from skysim.results.plots import png, to_8bit
 
 SCENE = ("shefex2", "--frames", "1", "--set", "motion.rate_deg_s=[0,0,0]")
 STUDY = """schema: 1

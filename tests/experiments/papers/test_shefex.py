@@ -9,22 +9,17 @@ from scipy.special import erf
 
 from estimator.identification.published.shefex import FOURTH_STAR
 from skysim.core.types import Frame
-from skysim.experiments.papers.compare import ExperimentOptions, bootstrap_of_means
-from skysim.experiments.papers.shefex import (
+from skysim.experiments.papers import (
     shefex_camera,
     shefex_identification,
     shefex_nights,
     shefex_setup,
 )
-from skysim.experiments.papers.shefex.shefex_setup import (
-    StarField,
-    pairs,
-    random_fields,
-    shefex_lab,
-)
+from skysim.experiments.papers.compare import ExperimentOptions, bootstrap_of_means
+from skysim.experiments.papers.shefex_setup import StarField, pairs, random_fields, shefex_lab
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
 

@@ -10,12 +10,11 @@ import pytest
 import yaml
 from study_stores import done
 
-from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import PointRow, format_summary
+from skysim.experiments.study import answer, study_file
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
+from skysim.experiments.study.table import PointRow, format_summary
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks

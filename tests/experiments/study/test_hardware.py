@@ -11,8 +11,7 @@ import yaml
 from study_stores import done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import plan, study_file
-from skysim.experiments.study.analysis import table
+from skysim.experiments.study import plan, study_file, table
 from skysim.experiments.study.execution import runner, setups, store
 
 STUDY: dict[str, Any] = {

@@ -19,8 +19,7 @@ import pytest
 from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import plan, study_file
-from skysim.experiments.study.analysis import table, worst
+from skysim.experiments.study import plan, study_file, table, worst
 from skysim.experiments.study.execution import engines, runner, store, workers
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row

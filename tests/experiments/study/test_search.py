@@ -14,8 +14,7 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import plan, study_file
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import plan, search, study_file
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of

@@ -15,9 +15,8 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import factors as designs
-from skysim.experiments.study.analysis import search
-from skysim.experiments.study.analysis import table as axes
-from skysim.experiments.study.analysis.table import Index, PointRow, cells, has_few_values, table
+from skysim.experiments.study import search
+from skysim.experiments.study import table as axes
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
@@ -27,6 +26,7 @@ from skysim.experiments.study.report import figures, layout, study_report
 from skysim.experiments.study.report.figures import color_scale
 from skysim.experiments.study.report.overview import Overview
 from skysim.experiments.study.report.study_report import POINTS, Analysis
+from skysim.experiments.study.table import Index, PointRow, cells, has_few_values, table
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK
 

@@ -46,7 +46,7 @@ class Contents:
             self.send(self.take())
 
 
-class LiveField(ui.element, component="js/live_field.js", esm={"skysim-live": "js"}):  # type: ignore[call-arg]
+class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
     """An element whose content travels with the frames."""
 
     def __init__(self, contents: Contents, tag: str, type: str = "") -> None:

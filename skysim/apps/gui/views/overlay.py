@@ -19,7 +19,7 @@ from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, Trac
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results.annotate import CURVES
+from skysim.results.plots import CURVES
 
 COLORS = {
     "truth": "#7a8cff",

@@ -23,8 +23,8 @@ from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
-from skysim.results.annotate import annotate
 from skysim.results.files import recording
+from skysim.results.plots import annotate
 from skysim.scene.loader import find
 
 FILE_BY_ITEM = {  # file by menu entry

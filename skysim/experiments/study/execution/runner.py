@@ -37,8 +37,8 @@ from skysim.experiments.study.plan import (
     TrialSpec,
     resolve_point,
 )
-from skysim.results.annotate import annotate, visible
 from skysim.results.files import recording
+from skysim.results.plots import annotate, visible
 from skysim.tracking import factory
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies

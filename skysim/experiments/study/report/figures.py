@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import (
+from skysim.experiments.study.plan import Curve, Heat, Map, Study
+from skysim.experiments.study.report import layout
+from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.table import (
     Axis,
     PointRow,
     axis,
@@ -19,15 +22,12 @@ from skysim.experiments.study.analysis.table import (
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
-from skysim.experiments.study.plan import Curve, Heat, Map, Study
-from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.thresholds import crossings, thresholds_of
 from skysim.results.metrics import MORE_IS_BETTER, split_name
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
-    from skysim.experiments.study.analysis.table import Index
+    from skysim.experiments.study.table import Index
 
 
 # Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes.

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import (
+from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.table import (
     Axis,
     PointRow,
     axis,
@@ -26,8 +27,7 @@ from skysim.experiments.study.analysis.table import (
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.thresholds import thresholds_of
-from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 

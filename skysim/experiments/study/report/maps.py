@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import PointRow, axis, group_points, shown_points
-from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.figures import HATCHED, add_color_bar, color_scale, halo
 from skysim.experiments.study.report.layout import caption_title, fixed_text
+from skysim.experiments.study.table import PointRow, axis, group_points, shown_points
+from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns

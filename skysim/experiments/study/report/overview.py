@@ -12,11 +12,11 @@ import numpy as np
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.execution.trials import rate_axis
 from skysim.experiments.study.factors import Distribution, Factor, Point, Range, make_point
 from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
 from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.table import format_level
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig

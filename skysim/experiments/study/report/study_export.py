@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from skysim.core import files
 from skysim.core.errors import InputError, unknown_name
-from skysim.experiments.study.analysis.table import level_columns, table, to_columns, with_levels
 from skysim.experiments.study.execution.store import COLUMNS, Store
+from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
 from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 

@@ -11,11 +11,16 @@ from typing import Any, NamedTuple
 
 from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import answer, search
-from skysim.experiments.study.analysis import table as sensitivity
-from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.analysis.search import SearchResult
-from skysim.experiments.study.analysis.table import (
+from skysim.experiments.study import answer, search
+from skysim.experiments.study import table as sensitivity
+from skysim.experiments.study import table as tables
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
+from skysim.experiments.study.report import figures, layout, maps
+from skysim.experiments.study.report.maps import DirectionMap
+from skysim.experiments.study.report.overview import Overview, overview
+from skysim.experiments.study.search import SearchResult
+from skysim.experiments.study.table import (
     Index,
     PointRow,
     axis,
@@ -25,12 +30,7 @@ from skysim.experiments.study.analysis.table import (
     same,
     shown_points,
 )
-from skysim.experiments.study.analysis.worst import ColumnsOf
-from skysim.experiments.study.execution.store import Store
-from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
-from skysim.experiments.study.report import figures, layout, maps
-from skysim.experiments.study.report.maps import DirectionMap
-from skysim.experiments.study.report.overview import Overview, overview
+from skysim.experiments.study.worst import ColumnsOf
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,

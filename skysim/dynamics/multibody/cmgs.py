@@ -15,7 +15,7 @@ from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (
+from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
     ControlInput,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import PointRow, points_at
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
+from skysim.experiments.study.table import PointRow, points_at
 from skysim.results import metrics
 from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import Columns

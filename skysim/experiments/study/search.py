@@ -18,7 +18,6 @@ import numpy as np
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.units import in_si
-from skysim.experiments.study.analysis.table import format_level, format_summary
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
@@ -36,6 +35,7 @@ from skysim.experiments.study.factors import (
     split_quantity,
 )
 from skysim.experiments.study.plan import Constraint, Cost, Plan, Search, Study, resolve_point
+from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
 from skysim.results.files.parts import parts_list
 from skysim.results.metrics import Columns, Summary

@@ -32,7 +32,7 @@ from skysim.experiments.papers.compare import (
     format_summary,
     symmetric_interval,
 )
-from skysim.experiments.papers.shefex.shefex_setup import (
+from skysim.experiments.papers.shefex_setup import (
     PUBLISHED,
     apparent,
     plot_curve,

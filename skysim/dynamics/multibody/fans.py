@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (
+from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
     Actuators,

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.cmgs import CMGS
-from skysim.dynamics.multibody.actuators.fans import FANS
-from skysim.dynamics.multibody.actuators.kind import (
+from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
     ControlInput,
@@ -26,7 +24,9 @@ from skysim.dynamics.multibody.actuators.kind import (
     joints,
     sites,
 )
-from skysim.dynamics.multibody.actuators.wheels import WHEELS
+from skysim.dynamics.multibody.cmgs import CMGS
+from skysim.dynamics.multibody.fans import FANS
+from skysim.dynamics.multibody.wheels import WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
 
 KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS)

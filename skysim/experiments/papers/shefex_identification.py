@@ -26,7 +26,7 @@ from skysim.experiments.papers.compare import (
     RowResult,
     bootstrap_of_means,
 )
-from skysim.experiments.papers.shefex.shefex_setup import (
+from skysim.experiments.papers.shefex_setup import (
     CHOSEN_COS_ERROR,
     MAX_CENTROIDS,
     PIXEL_RAD,

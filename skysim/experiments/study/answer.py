@@ -11,8 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skysim.experiments.study.analysis import thresholds
-from skysim.experiments.study.analysis.table import (
+from skysim.experiments.study import thresholds
+from skysim.experiments.study.factors import Value
+from skysim.experiments.study.plan import Study
+from skysim.experiments.study.table import (
     Place,
     PointRow,
     axis,
@@ -22,8 +24,6 @@ from skysim.experiments.study.analysis.table import (
     has_few_values,
     unit_of,
 )
-from skysim.experiments.study.factors import Value
-from skysim.experiments.study.plan import Study
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 

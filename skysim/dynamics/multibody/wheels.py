@@ -18,7 +18,7 @@ import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (
+from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
     ControlInput,

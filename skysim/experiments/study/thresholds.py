@@ -18,9 +18,9 @@ import scipy
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import table
-from skysim.experiments.study.analysis.table import Axis, PointRow
+from skysim.experiments.study import table
 from skysim.experiments.study.plan import Curve, Study, Threshold
+from skysim.experiments.study.table import Axis, PointRow
 from skysim.results import metrics
 
 TAIL = (1 - metrics.CONFIDENCE) / 2
