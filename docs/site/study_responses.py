@@ -6,20 +6,18 @@
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from docstring_text import escape
+from docstring_text import escape, terms
 
 from skysim.core.files import ROOT
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.results import metrics
 
 PAGE = ROOT / "docs" / "reference" / "responses.md"
-TERM = re.compile(r"^(\w+(?:, \w+)*) *: (.*)$")
 # Quantities whose names are not those of a column, or that need more words than a column has.
 QUANTITIES = {
     "cross_arcsec": "error across the boresight, the hypotenuse of both axes",
@@ -65,21 +63,6 @@ TAIL = """
 """
 
 
-def terms(docstring: str | None) -> dict[str, str]:
-    """The meanings of a docstring's lines `name, name : meaning`, by their names; meanings may go on, indented."""
-    found: dict[str, str] = {}
-    last = ""
-    for line in inspect.cleandoc(docstring or "").splitlines():
-        if term := TERM.match(line):
-            last = term[1]
-            found[last] = term[2].strip()
-        elif last and line.startswith("  ") and line.strip():
-            found[last] += f" {line.strip()}"
-        else:
-            last = ""
-    return found
-
-
 def meaning(name: str, found: dict[str, str]) -> str:
     """The meaning of a name among terms. Raises StopIteration if there is none."""
     return next(text for names, text in found.items() if name in names.split(", "))
@@ -87,19 +70,23 @@ def meaning(name: str, found: dict[str, str]) -> str:
 
 def table(head: str, rows: Iterable[tuple[str, str]]) -> str:
     return "\n".join(
-        [f"| {head} | meaning |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows)]
+        [
+            f"| {head} | meaning |",
+            "|---|---|",
+            *(f"| {name} | {text[:1].upper() + text[1:]} |" for name, text in rows),
+        ]
     )
 
 
 def page() -> str:
     """The text of the page."""
-    shares = terms(metrics.response.__doc__)
+    shares = terms(inspect.cleandoc(metrics.response.__doc__ or ""))
     proportions = [
         (", ".join(f"`{name}`" for name in names.split(", ")), escape(text))
         for names, text in shares.items()
         if any(metrics.is_proportion(name) or name == "coverage_N" for name in names.split(", "))
     ]
-    columns = terms(Outcome.__doc__)
+    columns = terms(inspect.cleandoc(Outcome.__doc__ or ""))
     of_meaning: dict[str, list[str]] = {}
     for name in metrics.QUANTITIES:
         of_meaning.setdefault(QUANTITIES.get(name) or meaning(name, columns), []).append(

@@ -29,8 +29,12 @@ from estimator.core.types import Centroids, RateEstimate
 class Sight(NamedTuple):
     """Where the lights are that a camera sees.
 
-    lever_cam_m : (3,) the camera from the bearing, in camera axes
-    radius_m    : distance of the lights from the bearing: of all, or (N,) of each
+    Attributes
+    ----------
+    lever_cam_m
+        (3,) the camera from the bearing, in camera axes
+    radius_m
+        Distance of the lights from the bearing: of all, or (N,) of each
     """
 
     lever_cam_m: Floats
@@ -51,7 +55,10 @@ STARS = Sight(np.zeros(3), 1.0)  # without a lever arm the distance has no effec
 def places_cam(rays_cam: Floats, sight: Sight) -> Floats:
     """(N, 3) places of lights from the bearing, in camera axes, from their rays (N, 3).
 
-    Raises ValueError if the camera is farther from the bearing than a light.
+    Raises
+    ------
+    ValueError
+        If the camera is farther from the bearing than a light.
     """
     return on_sphere(rays_cam, sight.lever_cam_m, sight.radius_m)
 
@@ -275,9 +282,14 @@ def _fit_disks(
 ) -> RateEstimate | None:
     """The rate from one of the two roots (2, N) of each light: the one nearer to the motion by the last rate.
 
-    sigma_px  : (2, N) of the roots
-    motion_px : (N, 2, 3) motion of each image from row to row, by the rate
-    start     : root of the median moments
+    Parameters
+    ----------
+    sigma_px
+        (2, N) of the roots
+    motion_px
+        (N, 2, 3) motion of each image from row to row, by the rate
+    start
+        Root of the median moments
     """
     near = np.full(roots.shape[1], start)
     for _ in range(DISK_ROUNDS):

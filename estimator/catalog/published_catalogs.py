@@ -42,8 +42,18 @@ class Color(NamedTuple):
 class OnBoard:
     """A catalog at one epoch, as a tracker stores it.
 
-    id        : (N,) of the brightest star in each entry;  vectors : (N, 3) unit, barycentric, ICRS axes
-    magnitude : (N,) instrumental;  components : (N,) number of catalog stars in each entry;  epoch_yr : Julian year
+    Attributes
+    ----------
+    id
+        (N,) of the brightest star in each entry
+    vectors
+        (N, 3) unit, barycentric, ICRS axes
+    magnitude
+        (N,) instrumental
+    components
+        (N,) number of catalog stars in each entry
+    epoch_yr
+        Julian year
     """
 
     id: Ints
@@ -61,10 +71,15 @@ def read_cat(
 ) -> OnBoard:
     """READCAT: select stars to a limiting V, propagate to the mission epoch, compute instrumental magnitudes.
 
-    epoch_yr : that of the file if omitted
-    color : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
-        missing color is replaced by that of the Sun
     Keeps the order of the file. Raises ImageError for a file that is not a catalog, and if no star is bright enough.
+
+    Parameters
+    ----------
+    epoch_yr
+        That of the file if omitted
+    color
+        Coefficients of the instrument; if omitted the magnitude is V, and the file needs no
+        color columns. A missing color is replaced by that of the Sun
     """
     numbers, file_epoch_yr = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
     numbers = numbers[:, numbers[6] <= limit_v_mag]

@@ -40,8 +40,14 @@ ACROSS = 0.87
 class QuadIndex(NamedTuple):
     """Quads by the cell of their code. A named tuple, so that compiled code accepts it.
 
-    star : (Q, 4) rows of the sky index: A, B, C, D;  code : (Q, 4)
-    first : (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
+    Attributes
+    ----------
+    star
+        (Q, 4) rows of the sky index: A, B, C, D
+    code
+        (Q, 4)
+    first
+        (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
     """
 
     star: NDArray[np.int32]

@@ -31,8 +31,14 @@ MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
 class Cells(NamedTuple):
     """Stars by the cell of the cube [-1, 1]^3 that holds their direction. A named tuple, for compiled code.
 
-    side  : cells along an edge
-    first : (side^3 + 1,) first entry of each cell in `row`;  row : (N,) rows of the vectors, cell after cell
+    Attributes
+    ----------
+    side
+        Cells along an edge
+    first
+        (side^3 + 1,) first entry of each cell in `row`
+    row
+        (N,) rows of the vectors, cell after cell
     """
 
     side: int
@@ -145,13 +151,23 @@ FACE_HALF_WIDTH = 1.2
 class SkyIndex(NamedTuple):
     """Stars, and pairs of the brightest, in bins. A named tuple, so that compiled code accepts it.
 
-    vectors : (N, 3) unit vectors, brightest star first
-    pair    : (P, 2) rows of stars, in bins of the angle between them
-    first   : (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
-    mag     : (N,) magnitudes, increasing;  share : their density per magnitude, from mag[0] in steps of MAG_STEP
-    cell_first, cell_star : the stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
+    Attributes
+    ----------
+    vectors
+        (N, 3) unit vectors, brightest star first
+    pair
+        (P, 2) rows of stars, in bins of the angle between them
+    first
+        (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
+    mag
+        (N,) magnitudes, increasing
+    share
+        Their density per magnitude, from mag[0] in steps of MAG_STEP
+    cell_first, cell_star
+        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
         cube has side x side cells
-    cells   : the stars in the cells of `spatial_grid`, for wide searches
+    cells
+        The stars in the cells of `spatial_grid`, for wide searches
     """
 
     vectors: Floats
@@ -176,7 +192,11 @@ def build(
 ) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
-    paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
+    Parameters
+    ----------
+    paired
+        Number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3
+        pairs.
     """
     sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors[:paired]
@@ -311,8 +331,12 @@ def nearest(
 ) -> tuple[int, float]:
     """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
 
-    gate : radians, at most 0.05
     The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
+
+    Parameters
+    ----------
+    gate
+        Radians, at most 0.05
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax = abs(x)

@@ -159,7 +159,11 @@ def disk(
 def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> NDArray:
     """Check a centroider's arguments, and convert the image to a type that compiled code accepts.
 
-    Raises ImageError for another type, a gain that is not above 0, or blobs beyond the image: the loops do not look.
+    Raises
+    ------
+    ImageError
+        For another type, a gain that is not above 0, or blobs beyond the image: the loops do
+        not look.
     """
     check_pixel_type(image)
     checks.of_type("blobs", blobs, Blobs)

@@ -150,9 +150,13 @@ def _fit(
 ) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
-    pixels : (3, K) x, y and value of the pixels used
     The start is the frame's streak; it is also the mean of the priors on length, direction and width. Where the model
     does not fit (two crossing streaks) the covariance is inflated by the residuals.
+
+    Parameters
+    ----------
+    pixels
+        (3, K) x, y and value of the pixels used
     """
     count = pixels.shape[1]
     start_x = p[X]

@@ -505,7 +505,10 @@ def _to_blobs(
 ) -> Blobs:
     """Return the brightest accepted blobs (see `brightest_blobs`) as Blobs, without flags.
 
-    Raises ImageError for more than MAX_BLOBS accepted blobs.
+    Raises
+    ------
+    ImageError
+        For more than MAX_BLOBS accepted blobs.
     """
     box, xy, flux, peak, area, count = brightest_blobs(
         boxes, sums, min_area_px, min_total_px, min_flux_per_root_px, max_blobs

@@ -35,12 +35,27 @@ STRAY_DENSITY = 0.1
 class LedDetections(NamedTuple):
     """The detections of one frame, in camera axes.
 
-    ray     : (N, 3) unit;  tangent : (N, 2) x / z and y / z;  sigma : (N,) total standard deviation of each tangent
-    direction : (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the median LED radius
-    direction_per_m : (N, 3) derivative of `direction` with respect to that radius, 1 / m
-    log_flux  : (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not used
-    light_density : (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
-    focal_uncertainty : greatest relative error of the focal length; 0 for a calibrated camera
+    Attributes
+    ----------
+    ray
+        (N, 3) unit
+    tangent
+        (N, 2) x / z and y / z
+    sigma
+        (N,) total standard deviation of each tangent
+    direction
+        (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the
+        median LED radius
+    direction_per_m
+        (N, 3) derivative of `direction` with respect to that radius, 1 / m
+    log_flux
+        (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not
+        used
+    light_density
+        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED
+        or none
+    focal_uncertainty
+        Greatest relative error of the focal length; 0 for a calibrated camera
     """
 
     ray: Floats
@@ -96,7 +111,13 @@ def evaluate(
 
     R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match,
     or if the focal length is out of its range.
-    center : row of the LED whose neighborhood is matched;  focal_ratio : of the pair, if it is uncertain
+
+    Parameters
+    ----------
+    center
+        Row of the LED whose neighborhood is matched
+    focal_ratio
+        Of the pair, if it is uncertain
     """
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
     # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the

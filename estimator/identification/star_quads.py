@@ -36,8 +36,13 @@ def identify(
     """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
 
     The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
-    max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
-    calibrated : whether the focal length should be right (`search.fit_to_all`)
+
+    Parameters
+    ----------
+    max_checks
+        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+    calibrated
+        Whether the focal length should be right (`search.fit_to_all`)
     """
     count = min(max_detections, len(detections.sigma))
     searched = changed(detections, count, 1.0, detections.focal_uncertainty)
@@ -75,7 +80,10 @@ def _test_quad(
 ) -> Hypothesis:
     """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
 
-    checks : (1,) effort so far, increased in place
+    Parameters
+    ----------
+    checks
+        (1,) effort so far, increased in place
     """
     _longest_first(detections.tangent, quad)
     a = quad[0]

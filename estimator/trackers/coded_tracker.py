@@ -41,11 +41,20 @@ PHASE_REACH = (
 class DecoderSettings:
     """Settings of the decoder.
 
-    flux_sigma : relative error of a light's brightness beside its photon noise: pulses, the chip, detection
-    gate_px    : greatest motion of a light between two frames that is not predicted
-    frames     : whose brightness is used, the last ones; None: as many as the code has bits
+    Attributes
+    ----------
+    flux_sigma
+        Relative error of a light's brightness beside its photon noise: pulses, the chip,
+        detection
+    gate_px
+        Greatest motion of a light between two frames that is not predicted
+    frames
+        Whose brightness is used, the last ones; None: as many as the code has bits
 
-    Raises ImageError for a number that cannot be used.
+    Raises
+    ------
+    ImageError
+        For a number that cannot be used.
     """
 
     flux_sigma: float = 0.03
@@ -65,8 +74,12 @@ class CodedTracker(DomeTracker):
     """Tracker under a dome of coded LEDs. Stateful: it takes the frames in order, with their times and numbers.
 
     A frame that is not later than the last one begins anew; so does one without a time, whose lights have no names.
-    code : the words of the LEDs of the map
     Raises ImageError as DomeTracker does, for a code of other LEDs, and for a rolling shutter with free-running bits.
+
+    Attributes
+    ----------
+    code
+        The words of the LEDs of the map
     """
 
     def __init__(
@@ -125,7 +138,10 @@ class CodedTracker(DomeTracker):
     ) -> Report:
         """Solve the frame of number `frame`, exposed about t_s. Raises ImageError for bad input.
 
-        streak_px, rate, exposure_s : as for `DomeTracker.solve`; the rate also predicts the lights' motion
+        Parameters
+        ----------
+        streak_px, rate, exposure_s
+            As for `DomeTracker.solve`; the rate also predicts the lights' motion
         """
         solve = partial(
             self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame

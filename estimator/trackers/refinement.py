@@ -42,11 +42,18 @@ CONVERGED_FALL = 1e-6
 class FieldMatcher:
     """Matches detections to the catalog stars that a candidate attitude predicts on the sensor.
 
-    camera   : on-board calibration
-    stars    : apparent directions and magnitudes
-    sky      : index of the same stars
-    patterns : number of patterns that were searched, for the expected number of chance matches
-    focal_uncertainty : relative; unless it is 0, the lens is fitted with the attitude
+    Attributes
+    ----------
+    camera
+        on-board calibration
+    stars
+        Apparent directions and magnitudes
+    sky
+        Index of the same stars
+    patterns
+        Number of patterns that were searched, for the expected number of chance matches
+    focal_uncertainty
+        Relative; unless it is 0, the lens is fitted with the attitude
     """
 
     def __init__(

@@ -65,9 +65,14 @@ ROWS = 16  # that share memory for their random numbers
 class Detector:
     """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
 
-    sensitivity     : (H, W) relative, mean 1: PRNU
-    dark_e_s        : (H, W) dark current at the chip's temperature, with DSNU and hot pixels
-    column_offset_e : (W,) offsets of the column amplifiers
+    Attributes
+    ----------
+    sensitivity
+        (H, W) relative, mean 1: PRNU
+    dark_e_s
+        (H, W) dark current at the chip's temperature, with DSNU and hot pixels
+    column_offset_e
+        (W,) offsets of the column amplifiers
     """
 
     config: DetectorConfig
@@ -134,10 +139,16 @@ def expose(
 ) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
-    light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
     clipped, for tests of the steps that follow.
-    added   : gets the mask of the particles' pixels
+
+    Parameters
+    ----------
+    light_e
+        (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`;
+        overwritten
+    added
+        Gets the mask of the particles' pixels
     """
     config = detector.config
     if not config.noise:
@@ -341,11 +352,16 @@ def add_snr_and_saturation(
 ) -> SourceTruth:
     """Which sources are expected to saturate, and the signal-to-noise ratio of each.
 
-    light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it
     Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
     expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation over the
     noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
     converter's rounding added to the read noise.
+
+    Parameters
+    ----------
+    light_e
+        (H, W) mean photo-electrons of the whole frame, smear included, before `expose`
+        overwrites it
     """
     config = detector.config
     x, y = sources.peak_xy.T

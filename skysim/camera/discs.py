@@ -50,8 +50,13 @@ def lattice_light(
 ) -> Floats:
     """(count, count) shares of the disc's light at the points of a lattice, [y, x], which zeros must surround.
 
-    axis_px : (count * subsamples,) even coordinates of the samples in both directions
-    shown   : (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where all are seen
+    Parameters
+    ----------
+    axis_px
+        (count * subsamples,) even coordinates of the samples in both directions
+    shown
+        (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where
+        all are seen
     """
     fine = len(axis_px)
     weights = sharing_weights(subsamples)
@@ -113,7 +118,10 @@ def _light_rows(
 ) -> None:
     """Light of each row of samples, shared among the lattice's columns, from the Sun and from the observer's side.
 
-    totals : (fine, 2) sums of the rows with what is hidden
+    Parameters
+    ----------
+    totals
+        (fine, 2) sums of the rows with what is hidden
     """
     count = sunlit.shape[1]
     subsamples = len(weights)
@@ -201,8 +209,12 @@ class Exposed(NamedTuple):
 class DiscOnChip(NamedTuple):
     """Where a disc lies on the chip at mid-exposure.
 
-    center_px       : (2,)
-    px_from_radius  : (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
+    Attributes
+    ----------
+    center_px
+        (2,)
+    px_from_radius
+        (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
     """
 
     center_px: Floats
@@ -234,10 +246,16 @@ def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
 class DisplacedImages(NamedTuple):
     """A point of the disc's full light at its center and displaced by sub-pixel phases.
 
-    patches   : (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
-    corner_px : (2,) chip's pixel (x, y) of a patch's first one
-    speed_px_s: (2,) velocity of the image at mid-exposure
-    streak_px : path length
+    Attributes
+    ----------
+    patches
+        (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
+    corner_px
+        (2,) chip's pixel (x, y) of a patch's first one
+    speed_px_s
+        (2,) velocity of the image at mid-exposure
+    streak_px
+        Path length
     """
 
     patches: Floats

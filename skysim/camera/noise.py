@@ -44,8 +44,18 @@ ROOT_HALF_BITS = 0x3F3504F3  # the single-precision number sqrt(1/2)
 class Scratch(NamedTuple):
     """Memory for one row at a time. A NamedTuple, because numba can compile functions that take one.
 
-    bits : 64-bit draws;  cell, late : a number for each pixel;  found : a byte for each pixel, and up to seven more
-    radius, exponent : a number for every other pixel;  normals, means : one for each
+    Attributes
+    ----------
+    bits
+        64-bit draws
+    cell, late
+        A number for each pixel
+    found
+        A byte for each pixel, and up to seven more
+    radius, exponent
+        A number for every other pixel
+    normals, means
+        One for each
     """
 
     bits: NDArray[np.uint64]

@@ -123,8 +123,12 @@ def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
 class Exif(NamedTuple):
     """What a camera wrote beside the pixels (Exif 2.32, CIPA DC-008).
 
-    orientation : 1 to 8; 1 if the rows are stored as they are to be seen
-    focal_35mm  : FocalLengthIn35mmFilm, mm; None if unknown
+    Attributes
+    ----------
+    orientation
+        1 to 8; 1 if the rows are stored as they are to be seen
+    focal_35mm
+        FocalLengthIn35mmFilm, mm; None if unknown
     """
 
     orientation: int = 1

@@ -116,7 +116,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def make_folder(path: Path) -> Path:
     """The folder, created if it does not exist, without temporary files of our processes that were killed.
 
-    Raises InputError if it cannot be created.
+    Raises
+    ------
+    InputError
+        If it cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -141,8 +144,13 @@ UNCOMPRESSED_TIFF = (
 def write_image(path: Path, image: NDArray) -> None:
     """Write an image in the format of the name's suffix.
 
-    Raises InputError if it cannot be encoded, OSError if it cannot be written. OpenCV encodes in memory, because it
-    would not report why a file cannot be written.
+    Raises
+    ------
+    InputError
+        If it cannot be encoded
+    OSError
+        If it cannot be written. OpenCV encodes in memory, because it would not report why a
+        file cannot be written.
     """
     try:
         encoded, data = cv2.imencode(

@@ -24,7 +24,10 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) -> str:
     """Run a script to its end; return "" on success, else why it failed, in one line.
 
-    cpu_s : processor time, with start-up; memory_bytes : address space, with the libraries
+    Parameters
+    ----------
+    cpu_s
+        Processor time, with start-up; memory_bytes : address space, with the libraries
     """
     command = [
         sys.executable,

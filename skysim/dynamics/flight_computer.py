@@ -61,9 +61,14 @@ def controlling_actuator(
 class FlightComputer:
     """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one motion each.
 
-    source            : of external controllers
-    actuator_sets     : all actuators that are switched on, by their key in `vehicle`
-    control_torque_nm : (3,) control torque of the last period, zeros without a controller
+    Attributes
+    ----------
+    source
+        Of external controllers
+    actuator_sets
+        All actuators that are switched on, by their key in `vehicle`
+    control_torque_nm
+        (3,) control torque of the last period, zeros without a controller
     """
 
     def __init__(
@@ -137,7 +142,10 @@ class FlightComputer:
     ) -> Floats:
         """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,).
 
-        torque_nm : (3,) in body axes, in place of the control law's
+        Parameters
+        ----------
+        torque_nm
+            (3,) in body axes, in place of the control law's
         """
         control = np.zeros(self.nu)
         if self.config is None and torque_nm is None:

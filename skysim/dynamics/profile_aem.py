@@ -181,7 +181,10 @@ def to_icrs(samples: Samples, names: list[str]) -> Samples:
 def join(first: Samples, second: Samples) -> Samples:
     """Two adjoining segments as one. A sample that both have at the seam is taken once.
 
-    Raises InputError for segments of different frames, that overlap or that leave a gap.
+    Raises
+    ------
+    InputError
+        For segments of different frames, that overlap or that leave a gap.
     """
     if not len(first.t_s) or not len(second.t_s):
         return first if len(first.t_s) else second

@@ -29,12 +29,21 @@ MAX_STEP_DEG = 10.0
 class Samples:
     """N attitudes over time.
 
-    source   : file, or what else the samples come from, for messages
-    unit     : what `places` count: line of a file, or row of a table
-    places   : (N,) where each sample stands, from 1
-    t_s      : (N,) seconds from the scene's start if `absolute` (the samples have epochs), else from the file's zero
-    a, b     : frames of the rotations: one of icrs and lab, and one of body and cam, in any order
-    a_from_b : N rotations
+    Attributes
+    ----------
+    source
+        File, or what else the samples come from, for messages
+    unit
+        What `places` count: line of a file, or row of a table
+    places
+        (N,) where each sample stands, from 1
+    t_s
+        (N,) seconds from the scene's start if `absolute` (the samples have epochs), else from
+        the file's zero
+    a, b
+        Frames of the rotations: one of icrs and lab, and one of body and cam, in any order
+    a_from_b
+        N rotations
     """
 
     source: str

@@ -23,8 +23,16 @@ TABLE = "profile"  # source of a table given in Python
 def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[AttitudeSpline, ...]:
     """The profiles of a scene's maneuvers, in their order.
 
-    given : astropy Table, pandas DataFrame or mapping of columns in place of the first profile's file
-    Raises InputError that begins with the key.
+    Parameters
+    ----------
+    given
+        Astropy Table, pandas DataFrame or mapping of columns in place of the first profile's
+        file
+
+    Raises
+    ------
+    InputError
+        That begins with the key.
     """
     profiles: list[AttitudeSpline] = []
     for n, element in enumerate(scene.motion.maneuver):
@@ -41,7 +49,10 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
 def read_profile(source: Any, start: datetime.datetime, rotation: str | None = None) -> Samples:
     """The samples of a file, whose format its content tells, or of a table. Raises InputError.
 
-    start : the scene's start in UTC, from which epochs are counted
+    Parameters
+    ----------
+    start
+        The scene's start in UTC, from which epochs are counted
     """
     if not isinstance(source, Path):
         return profile_table.from_table(source, TABLE, start, rotation)

@@ -187,10 +187,16 @@ def rate_change_state(
 class AttitudeSpline:
     """Attitudes over time.
 
-    source       : where the samples come from, for messages
-    t_s          : (N,) sample times, ascending. They count from the scene's start if `absolute`, else from the start
-                   of the maneuver
-    coefficients : (N - 1, 4, 4) of the steps' cubics in t - t_s[k], from the third power down, of w, x, y, z
+    Attributes
+    ----------
+    source
+        Where the samples come from, for messages
+    t_s
+        (N,) sample times, ascending. They count from the scene's start if `absolute`, else from
+        the start of the maneuver
+    coefficients
+        (N - 1, 4, 4) of the steps' cubics in t - t_s[k], from the third power down, of w, x, y,
+        z
     """
 
     source: str

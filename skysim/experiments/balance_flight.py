@@ -54,11 +54,18 @@ RANGES = {
 class Uncertainty:
     """Standard deviations of what is assumed, all Gaussian.
 
-    inertia_sigma : of each moment of inertia, relative to their mean; products have half of it
-    offset_sigma_m : of the center of mass along each axis, assumed at the bearing's center
-    wheel_sigma   : of each wheel's axial inertia, relative
-    mount_sigma_rad : of the tracker's axes in the body, about each axis, assumed as known
-    tacho_sigma_rad_s : of every reading of a wheel's speed
+    Attributes
+    ----------
+    inertia_sigma
+        Of each moment of inertia, relative to their mean; products have half of it
+    offset_sigma_m
+        Of the center of mass along each axis, assumed at the bearing's center
+    wheel_sigma
+        Of each wheel's axial inertia, relative
+    mount_sigma_rad
+        Of the tracker's axes in the body, about each axis, assumed as known
+    tacho_sigma_rad_s
+        Of every reading of a wheel's speed
     """
 
     inertia_sigma: float
@@ -89,9 +96,14 @@ def parse_uncertainty(
 class Assumptions:
     """What the lab assumes of a vehicle with its trim masses at zero.
 
-    prior : of the parameters (`estimator.calibration.mass_properties`)
-    lab   : gravity, the Earth's rate, wheel axes, level of the random torque
-    wheel_inertia_kg_m2 : (n,) assumed axial inertias
+    Attributes
+    ----------
+    prior
+        Of the parameters (`estimator.calibration.mass_properties`)
+    lab
+        Gravity, the Earth's rate, wheel axes, level of the random torque
+    wheel_inertia_kg_m2
+        (n,) assumed axial inertias
     """
 
     prior: Prior
@@ -161,8 +173,14 @@ def check_observed(
 ) -> None:
     """Raise InputError, in one line, if moments of inertia or the moment are less certain than asked.
 
-    inertia_bar : standard deviation of a moment of inertia over its value;  moment_bar_kg_m : (3,) standard deviations
     of the components of the moment
+
+    Parameters
+    ----------
+    inertia_bar
+        Standard deviation of a moment of inertia over its value
+    moment_bar_kg_m
+        (3,) standard deviations
     """
     values = estimate.values
     sigma = estimate.sigma
@@ -238,7 +256,10 @@ ProgressCallback = Callable[[float, float], None]
 class BalanceFlight:
     """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
 
-    frames, solved, after_contact : numbers of frames
+    Attributes
+    ----------
+    frames, solved, after_contact
+        Numbers of frames
     """
 
     record: BearingRecord

@@ -38,9 +38,18 @@ MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
 class BalancePlan:
     """How a vehicle is balanced.
 
-    excite      : wheels or swing;  tilt_deg : of the excitation
-    torque_bar_nm : residual gravity torque;  max_flights : to try
-    moves       : False: estimate from one flight only
+    Attributes
+    ----------
+    excite
+        Wheels or swing
+    tilt_deg
+        Of the excitation
+    torque_bar_nm
+        Residual gravity torque
+    max_flights
+        To try
+    moves
+        False: estimate from one flight only
     """
 
     excite: str
@@ -54,7 +63,10 @@ class BalancePlan:
 class Bars:
     """What must be reached: residual torque, and standard deviations of inertia (relative) and offset.
 
-    offset_m : None: half of the residual torque over the vehicle's weight
+    Attributes
+    ----------
+    offset_m
+        None: half of the residual torque over the vehicle's weight
     """
 
     torque_nm: float
@@ -95,8 +107,12 @@ def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
 class Iteration:
     """One flight and the estimate from all flights so far.
 
-    estimate : of the vehicle with its trim masses at zero
-    next_m   : (n,) where the trim masses go next; where they are if they stay
+    Attributes
+    ----------
+    estimate
+        Of the vehicle with its trim masses at zero
+    next_m
+        (n,) where the trim masses go next; where they are if they stay
     """
 
     flight: BalanceFlight
@@ -135,7 +151,10 @@ def balance(
 ) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 
-    Raises InputError for a vehicle that cannot be balanced so.
+    Raises
+    ------
+    InputError
+        For a vehicle that cannot be balanced so.
     """
     balance_flight.check_scene(scene)
     vehicle = multibody.build(scene.vehicle)

@@ -52,7 +52,14 @@ SOURCE = np.dtype(
 class Extents(NamedTuple):
     """The rectangle about each source's image, along its streak.
 
-    center_px : (N, 2);  along : (N, 2) unit vector of the streak;  half_px : (N, 2) half-length and half-width
+    Attributes
+    ----------
+    center_px
+        (N, 2)
+    along
+        (N, 2) unit vector of the streak
+    half_px
+        (N, 2) half-length and half-width
     """
 
     center_px: Floats
@@ -67,10 +74,17 @@ class Extents(NamedTuple):
 class LabelledFrame(NamedTuple):
     """A frame with its labels.
 
-    sources    : (N,) of dtype SOURCE, brightest first
-    extents    : the rectangle about each image
-    unmatched_px : (M, 2) detections that are no source of the frame: noise, particles, hot pixels
-    masks      : by name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is left out
+    Attributes
+    ----------
+    sources
+        (N,) of dtype SOURCE, brightest first
+    extents
+        The rectangle about each image
+    unmatched_px
+        (M, 2) detections that are no source of the frame: noise, particles, hot pixels
+    masks
+        By name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is
+        left out
     """
 
     frame: Frame
@@ -84,8 +98,12 @@ class LabelledFrame(NamedTuple):
 class Labeller(NamedTuple):
     """What the labels of all frames of one scene take.
 
-    camera, settings : what its tracker assumes
-    threshold_e      : least charge that something else than light adds to a pixel of a mask
+    Attributes
+    ----------
+    camera, settings
+        What its tracker assumes
+    threshold_e
+        Least charge that something else than light adds to a pixel of a mask
     """
 
     camera: Camera
@@ -103,7 +121,10 @@ def labeller(scene: Scene) -> Labeller:
 def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> LabelledFrame:
     """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
 
-    by : of the setup's scene, if there is one already
+    Parameters
+    ----------
+    by
+        Of the setup's scene, if there is one already
     """
     scene = setup.lab.scene
     by = by or labeller(scene)
@@ -216,7 +237,10 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
 def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
     """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code.
 
-    least : of an image, the least value of a pixel that is set
+    Parameters
+    ----------
+    least
+        Of an image, the least value of a pixel that is set
     """
     rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
     y, x = np.nonzero(mask[rows] >= least)

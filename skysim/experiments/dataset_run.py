@@ -62,7 +62,10 @@ FORMATS = ("webdataset", "zarr", "coco")
 class DatasetPlan:
     """A dataset that can be made on any worker.
 
-    spec : scene, seed, settings and trial of all frames
+    Attributes
+    ----------
+    spec
+        Scene, seed, settings and trial of all frames
     """
 
     spec: TrialSpec
@@ -144,7 +147,12 @@ def load(
 ) -> DatasetPlan:
     """The plan of a dataset. Raises InputError with one line.
 
-    scene : name or path;  vary : file with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
+    Parameters
+    ----------
+    scene
+        Name or path
+    vary
+        File with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
     """
     for name, count in (("frames", frames), ("frames_per_shard", frames_per_shard)):
         if count < 1:

@@ -39,11 +39,22 @@ def with_config(config: Config, section: str, **values: Any) -> Config:
 class TrackerScore:
     """Statistics of one tracker.
 
-    right    : fraction of all frames solved and not wrong (`metrics.is_wrong`), with its 95% interval
-    wrong    : solutions farther off;  refused : no solution;  failed : exception, timeout, crash or invalid output
-    refusals : count of each status other than solved, most frequent first
-    errors   : arcseconds, over correct solutions only; wrong ones are counted instead
-    time_ms  : time from image to solution, over the frames on which the tracker did not fail
+    Attributes
+    ----------
+    right
+        Fraction of all frames solved and not wrong (`metrics.is_wrong`), with its 95% interval
+    wrong
+        Solutions farther off
+    refused
+        No solution
+    failed
+        Exception, timeout, crash or invalid output
+    refusals
+        Count of each status other than solved, most frequent first
+    errors
+        Arcseconds, over correct solutions only; wrong ones are counted instead
+    time_ms
+        Time from image to solution, over the frames on which the tracker did not fail
     """
 
     tracker: str

@@ -124,9 +124,13 @@ def to_8bit(
 ) -> NDArray[np.uint8]:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
-    levels_dn : black and white levels, for example of another frame; by default those of `display_levels`
-
     A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
+
+    Parameters
+    ----------
+    levels_dn
+        Black and white levels, for example of another frame; by default those of
+        `display_levels`
     """
     low, high = levels_dn or display_levels(image)
     top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame

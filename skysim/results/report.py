@@ -248,7 +248,10 @@ def styled(cell: Cell, style: str) -> Any:
 def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
     """Print a text in lines of a width, by default the terminal's.
 
-    first, others : what the first line and the others begin with
+    Parameters
+    ----------
+    first, others
+        What the first line and the others begin with
     """
     width = width or max(terminal_width(), NARROW)
     print(
@@ -304,8 +307,13 @@ LOOKS = (
 class Report:
     """What a run, a study or a measurement says to people.
 
-    blocks  : the answer and what must be known with it, then sections; those that hold nothing are left out
-    command : the command that repeats it
+    Attributes
+    ----------
+    blocks
+        The answer and what must be known with it, then sections; those that hold nothing are
+        left out
+    command
+        The command that repeats it
     """
 
     title: str
@@ -346,9 +354,16 @@ class Report:
     def save(self, path: str | Path, pictures: str = "") -> Path:
         """Write a page in the format of the suffix: .html, .md or .json. Returns the path.
 
-        pictures : what the paths of a Markdown page's figures begin with; by default a folder of the page's name
+        Parameters
+        ----------
+        pictures
+            What the paths of a Markdown page's figures begin with; by default a folder of the
+            page's name
 
-        Raises InputError for another suffix.
+        Raises
+        ------
+        InputError
+            For another suffix.
         """
         from skysim.core import files
 

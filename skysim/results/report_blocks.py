@@ -18,8 +18,12 @@ MISSING = "–"
 class Cell(NamedTuple):
     """A text of a table or of facts.
 
-    key  : number by which a column is sorted; NaN comes last, None sorts by the text
-    link : id of a section ("#results") or a file beside the report
+    Attributes
+    ----------
+    key
+        Number by which a column is sorted; NaN comes last, None sorts by the text
+    link
+        Id of a section ("#results") or a file beside the report
     """
 
     text: str
@@ -31,8 +35,13 @@ class Cell(NamedTuple):
 class Column(NamedTuple):
     """Head of a table's column.
 
-    format : of its numbers, such as ".3f"
-    kind   : numbers are aligned to the right; an aside is a longer text, on a terminal a line below the table
+    Attributes
+    ----------
+    format
+        Of its numbers, such as ".3f"
+    kind
+        Numbers are aligned to the right; an aside is a longer text, on a terminal a line below
+        the table
     """
 
     title: str
@@ -100,7 +109,10 @@ class Facts(Block):
 class Table(Block):
     """Rows of values under columns: cells, texts, numbers, or None for what is missing.
 
-    optional : groups of columns that are left out on a narrow terminal, the first group first
+    Attributes
+    ----------
+    optional
+        Groups of columns that are left out on a narrow terminal, the first group first
     """
 
     columns: Sequence[Column]
@@ -137,7 +149,12 @@ class Code(Block):
 class Section(Block):
     """A heading with its blocks, which may be sections again.
 
-    id : of the heading, for links;  folded : closed until a reader opens it
+    Attributes
+    ----------
+    id
+        Of the heading, for links
+    folded
+        Closed until a reader opens it
     """
 
     title: str

@@ -38,7 +38,12 @@ SHORT_S = 1.0  # the report of a single frame after a shorter motion has no plot
 class Recorder:
     """The files of one camera. Files of an earlier run in the folder are removed first.
 
-    seconds : of all frames, by stage;  shown : the last solved frame, or the first if none was solved
+    Attributes
+    ----------
+    seconds
+        Of all frames, by stage
+    shown
+        The last solved frame, or the first if none was solved
     """
 
     folder: Path
@@ -64,7 +69,10 @@ class Recorder:
     def write(self, frame: Frame, truth: Truth, preview: bool = False) -> Path:
         """Write one frame with its truth; return the path of its FITS file.
 
-        preview : also write frame_NNNN.preview.png, an 8-bit image with the truth marked
+        Parameters
+        ----------
+        preview
+            Also write frame_NNNN.preview.png, an 8-bit image with the truth marked
         """
         write_frame(self.folder, frame, truth, self.camera.scene)
         path = self.folder / f"frame_{frame.index:04d}.fits"
@@ -84,7 +92,10 @@ class Recorder:
     ) -> tuple[dict[str, Any], Report]:
         """Write tables, annotated image and report. Returns the report, and before it what `skysim run --json` prints.
 
-        pictures : image files of the laboratory
+        Parameters
+        ----------
+        pictures
+            Image files of the laboratory
         """
         scene = self.camera.scene
         names = scoring.angle_names(scene)
@@ -135,11 +146,19 @@ class Recorder:
 class Run(Sequence[Score]):
     """The result of one camera in a flight: a sequence of scored shots.
 
-    camera      : the lab's camera that took them
-    scores      : one entry per frame, in order; empty if the frames were written and not kept
-    telemetry   : motion of the vehicle, and measurements and commands of its computer, sampled at the control rate
-    imu_samples : every sample of the IMU; None without one
-    heads       : the runs of the scene's further star cameras, by name
+    Attributes
+    ----------
+    camera
+        The lab's camera that took them
+    scores
+        One entry per frame, in order; empty if the frames were written and not kept
+    telemetry
+        Motion of the vehicle, and measurements and commands of its computer, sampled at the
+        control rate
+    imu_samples
+        Every sample of the IMU; None without one
+    heads
+        The runs of the scene's further star cameras, by name
     """
 
     lab: Lab
@@ -247,7 +266,10 @@ class FlightRecorder:
     ) -> list[tuple[dict[str, Any], Report]]:
         """Write tables, images and reports; return statistics and report of each camera.
 
-        draw : makes pictures of the laboratory for the main camera's report
+        Parameters
+        ----------
+        draw
+            Makes pictures of the laboratory for the main camera's report
         """
         main = run_of(self.flight, [() for _ in self.recorders])
         pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()

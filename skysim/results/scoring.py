@@ -153,7 +153,11 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.u
 class Score:
     """A shot with the error of its solution.
 
-    row : the shot as numbers: angles in degrees, errors and the tracker's standard deviations in arcseconds
+    Attributes
+    ----------
+    row
+        The shot as numbers: angles in degrees, errors and the tracker's standard deviations in
+        arcseconds
     """
 
     shot: Shot

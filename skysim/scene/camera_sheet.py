@@ -125,12 +125,21 @@ class AssumedValue(NamedTuple):
 class Question(NamedTuple):
     """One number of a data sheet.
 
-    keys        : of the section `camera` that the answer gives
-    where       : where a data sheet states it
-    parse       : from the typed text to the value of the file, several for several keys; raises InputError
-    assume      : from the values known so far to the assumption; None if the key is then left out
-    consequence : of not knowing it; empty if it must be given
-    skipped     : why it is not asked, by the values known so far; empty if it is
+    Attributes
+    ----------
+    keys
+        Of the section `camera` that the answer gives
+    where
+        Where a data sheet states it
+    parse
+        From the typed text to the value of the file, several for several keys; raises
+        InputError
+    assume
+        From the values known so far to the assumption; None if the key is then left out
+    consequence
+        Of not knowing it; empty if it must be given
+    skipped
+        Why it is not asked, by the values known so far; empty if it is
     """
 
     keys: tuple[str, ...]

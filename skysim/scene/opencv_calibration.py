@@ -24,9 +24,14 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 class OpencvCalibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
-    focal_px   : focal length (strictly, the image distance) over the pixel pitch
-    center_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
-    distortion : k1, k2, p1, p2, k3 in OpenCV's order
+    Attributes
+    ----------
+    focal_px
+        Focal length (strictly, the image distance) over the pixel pitch
+    center_px
+        Principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
+    distortion
+        k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int

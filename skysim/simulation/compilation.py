@@ -75,7 +75,10 @@ def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]
 def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
     """Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
 
-    overrides : `KEY=VALUE` as on the command line
+    Parameters
+    ----------
+    overrides
+        `KEY=VALUE` as on the command line
     """
     lab = build_lab(loader.load(scene, parse_overrides(list(overrides))))
     warm_up(lab.camera, lab.start, build_tracker(lab.camera))

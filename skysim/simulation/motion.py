@@ -285,9 +285,17 @@ def rotation(wxyz: Floats) -> Rotation:
 class Motion:
     """The motion of a lab's vehicle. Stateful: use one instance for one motion.
 
-    duration_s : at most; may be infinite with `kept_s`
-    kept_s     : how long past states and IMU samples are kept; None: all of them
-    Raises InputError for a maneuver that the vehicle cannot follow, and for too fast vibration.
+    Attributes
+    ----------
+    duration_s
+        At most; may be infinite with `kept_s`
+    kept_s
+        How long past states and IMU samples are kept; None: all of them
+
+    Raises
+    ------
+    InputError
+        For a maneuver that the vehicle cannot follow, and for too fast vibration.
     """
 
     def __init__(
@@ -345,7 +353,10 @@ class Motion:
         The order is: attitude and rate as the controller gets them, controls, disturbance torques, integration, IMU.
         The controls are held over the period.
 
-        torque_nm : (3,) in body axes, in place of the controller's
+        Parameters
+        ----------
+        torque_nm
+            (3,) in body axes, in place of the controller's
         """
         simulation = self.simulation
         flight_computer = self.flight_computer

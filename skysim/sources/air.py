@@ -147,10 +147,16 @@ def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
 class Air:
     """The air of a scene.
 
-    site       : with a longitude
-    refraction : for its weather and the camera's band
-    star_id, b_v : (N,) ascending numbers of the catalog's stars, and their colors
-    wavelength_m : of scintillation: the mean of a G2 star's photo-electrons
+    Attributes
+    ----------
+    site
+        With a longitude
+    refraction
+        For its weather and the camera's band
+    star_id, b_v
+        (N,) ascending numbers of the catalog's stars, and their colors
+    wavelength_m
+        Of scintillation: the mean of a G2 star's photo-electrons
     """
 
     config: AirConfig

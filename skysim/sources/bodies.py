@@ -117,8 +117,16 @@ NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
 
-    radius_rad : of its disc;  flux_e_s_m2 : photo-electrons at the aperture;  earthshine : see `Surface`
-    chromatic  : (4,) a row of `Sources.chromatic`
+    Attributes
+    ----------
+    radius_rad
+        Of its disc
+    flux_e_s_m2
+        photo-electrons at the aperture
+    earthshine
+        See `Surface`
+    chromatic
+        (4,) a row of `Sources.chromatic`
     """
 
     name: str

@@ -32,10 +32,16 @@ PHASE_STEP_DEG = (
 def brightness(law: int, mu: float, mu0: float) -> float:
     """Relative brightness of a surface.
 
-    LIMB_DARKENED   : the Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical Quantities)
-    LOMMEL_SEELIGER : a dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981, JGR 86,
-                      3039). The full disc is uniform, as the full Moon's is; the maria are left out.
-    LAMBERT         : a bright cloud deck, in which light is scattered many times: mu0
+    Returns
+    -------
+    LIMB_DARKENED
+        The Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical
+        Quantities)
+    LOMMEL_SEELIGER
+        A dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981,
+        JGR 86, 3039). The full disc is uniform, as the full Moon's is; the maria are left out.
+    LAMBERT
+        A bright cloud deck, in which light is scattered many times: mu0
     """
     if law == LIMB_DARKENED:
         return 0.30 + 0.93 * mu - 0.23 * mu**2
@@ -47,8 +53,12 @@ def brightness(law: int, mu: float, mu0: float) -> float:
 class DiscSurface(NamedTuple):
     """How a disc shines.
 
-    law        : of `brightness`
-    earthshine : light of the disc as lit from the observer's side, over that of the sunlit one
+    Attributes
+    ----------
+    law
+        Of `brightness`
+    earthshine
+        Light of the disc as lit from the observer's side, over that of the sunlit one
     """
 
     law: int
@@ -59,8 +69,12 @@ class DiscSurface(NamedTuple):
 def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     """Shares of the disc's light at the points of a square lattice that covers it; they add up to 1.
 
-    axis : (n,) the lattice's even coordinates in both directions, in units of the disc's radius
     Returns (n, n), [y, x].
+
+    Parameters
+    ----------
+    axis
+        (n,) the lattice's even coordinates in both directions, in units of the disc's radius
     """
     sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
     _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)

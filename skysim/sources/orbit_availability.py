@@ -30,8 +30,13 @@ Law = Literal["inertial", "zenith"]
 class Pointing(NamedTuple):
     """The attitude law of the boresight.
 
-    inertial : toward `direction` (3,), ICRS axes
-    zenith   : off_rad from the zenith, toward the azimuth around_rad from the flight direction, left of it positive
+    Attributes
+    ----------
+    inertial
+        Toward `direction` (3,), ICRS axes
+    zenith
+        off_rad from the zenith, toward the azimuth around_rad from the flight direction, left
+        of it positive
     """
 
     law: Law
@@ -53,8 +58,14 @@ class Pointing(NamedTuple):
 class SkySamples(NamedTuple):
     """What the tracker has about its boresight at K times.
 
-    sun_deg, moon_deg : angles from their centers;  earth_deg : from the Earth's limb, negative on its disc
-    stars             : number of stars in the field that the Earth does not hide
+    Attributes
+    ----------
+    sun_deg, moon_deg
+        Angles from their centers
+    earth_deg
+        From the Earth's limb, negative on its disc
+    stars
+        Number of stars in the field that the Earth does not hide
     """
 
     t_s: Floats
@@ -84,7 +95,12 @@ def sample(
 ) -> SkySamples:
     """Angles and stars at K times since the start.
 
-    stars : (N, 3) directions of the stars that the tracker detects;  field_rad : half-angle of a round field
+    Parameters
+    ----------
+    stars
+        (N, 3) directions of the stars that the tracker detects
+    field_rad
+        half-angle of a round field
     """
     tree = cKDTree(stars)
     parts = list[SkySamples]()

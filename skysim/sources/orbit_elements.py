@@ -235,8 +235,13 @@ KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 class OrbitEphemeris(NamedTuple):
     """Samples of an orbit in GCRS axes.
 
-    t_s  : (N,) since the scene's start, strictly increasing
-    path : a polynomial of the fifth degree between two samples, of their positions, velocities and accelerations
+    Attributes
+    ----------
+    t_s
+        (N,) since the scene's start, strictly increasing
+    path
+        A polynomial of the fifth degree between two samples, of their positions, velocities and
+        accelerations
     """
 
     source: str

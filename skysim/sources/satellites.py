@@ -34,10 +34,16 @@ SHORTEST_S = 1e-3  # time over which a path is differentiated
 class ExposureView(NamedTuple):
     """What the camera can see in one exposure.
 
-    boresight  : (3,) at mid-exposure, ICRS axes
-    field_rad  : from the boresight to the chip's corner
-    turn_rad   : angle by which the camera turns in the exposure
-    duration_s : from the first row's opening to the last row's end
+    Attributes
+    ----------
+    boresight
+        (3,) at mid-exposure, ICRS axes
+    field_rad
+        From the boresight to the chip's corner
+    turn_rad
+        Angle by which the camera turns in the exposure
+    duration_s
+        From the first row's opening to the last row's end
     """
 
     boresight: Floats
@@ -80,9 +86,14 @@ def known_satellites(
 ) -> Iterator[MovingLight]:
     """The sunlit satellites whose paths can cross the field in an exposure, and that the Earth does not hide.
 
-    time        : mid-exposure, UTC
-    observer_at : the camera's state, seconds after mid-exposure
     SGP4 gives all satellites at mid-exposure; the few near the field are then followed through it (`path`).
+
+    Parameters
+    ----------
+    time
+        mid-exposure, UTC
+    observer_at
+        The camera's state, seconds after mid-exposure
     """
     here = observer_at(0.0)
     sun = sun_m(tt_jd(time))

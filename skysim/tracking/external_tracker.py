@@ -136,8 +136,11 @@ NO_ATTITUDE = "no attitude"  # status where the function returned None
 class FunctionTracker:
     """A tracker that is a function. Every failure there becomes the status of a frame.
 
-    function : takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or as a unit
-        quaternion (4,) scalar last, or None for no attitude
+    Attributes
+    ----------
+    function
+        Takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or
+        as a unit quaternion (4,) scalar last, or None for no attitude
     """
 
     def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:

@@ -128,8 +128,15 @@ def build_tracker(
     """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
     else the true ones.
 
-    programs : commands of external trackers by name, for `tracker.name`
-    Raises InputError for a dome or a catalog that the tracker cannot use.
+    Parameters
+    ----------
+    programs
+        Commands of external trackers by name, for `tracker.name`
+
+    Raises
+    ------
+    InputError
+        For a dome or a catalog that the tracker cannot use.
     """
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
@@ -176,8 +183,12 @@ def solve_frame(
 ) -> Report:
     """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
-    streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
-    rate      : of the camera, if a gyro measures it; external trackers get streak_px only
+    Parameters
+    ----------
+    streak_px
+        (dx, dy) that lights move in the exposure, if a gyro measures it
+    rate
+        Of the camera, if a gyro measures it; external trackers get streak_px only
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
@@ -206,7 +217,10 @@ def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: floa
 class ExposureController:
     """The camera's exposure controller: sets the next exposure time from the last frame.
 
-    exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    Attributes
+    ----------
+    exposure_s
+        Of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
     """
 
     def __init__(self, scene: Scene) -> None:

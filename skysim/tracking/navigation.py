@@ -34,7 +34,10 @@ def rate_of_frame(
 ) -> RateEstimate | None:
     """Rate of the camera in its own axes, with the covariance of the data sheet; None without samples, or saturated.
 
-    window, rows : exposure of a sensor of so many rows, to the end of its last row
+    Parameters
+    ----------
+    window, rows
+        Exposure of a sensor of so many rows, to the end of its last row
     """
     begin_s = window.open_s
     end_s = window.close_s(rows)
@@ -71,11 +74,18 @@ def latest(samples: list[Increments], kept_s: float) -> list[Increments]:
 class Navigation:
     """The vehicle's attitude estimates: integrated gyros, and the filter that the star tracker corrects.
 
-    scene : with `vehicle.imu`, and optionally `filter`
-    mounts : of the cameras, as assumed; the main one's first
-    lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
-    position_body_m, gravity_m_s2 : of the accelerometers
-    kept_s : how long IMU samples are kept, for `imu_samples`
+    Attributes
+    ----------
+    scene
+        With `vehicle.imu`, and optionally `filter`
+    mounts
+        Of the cameras, as assumed; the main one's first
+    lab_from_body_wxyz
+        (4,) the true attitude at the start, when the navigator is zeroed
+    position_body_m, gravity_m_s2
+        Of the accelerometers
+    kept_s
+        How long IMU samples are kept, for `imu_samples`
     """
 
     def __init__(

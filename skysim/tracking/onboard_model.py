@@ -196,7 +196,10 @@ def calibration(camera: CameraConfig) -> Camera:
 def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
     """The tracker's star catalog, a name in data/catalogs/ or a file, by the estimator's own reader.
 
-    key : the scene's key or the option that gives it, for the message of InputError
+    Parameters
+    ----------
+    key
+        The scene's key or the option that gives it, for the message of InputError
     """
     try:
         return catalog.read(require_catalog(key, name))

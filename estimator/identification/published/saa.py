@@ -36,7 +36,10 @@ UNMATCHED_COST = 16.0
 class Gates(NamedTuple):
     """Standard deviations of an angle between stars, a direction, and a magnitude. A gate is three of them.
 
-    stretch : stretch * angle is added to the gate of an angle
+    Attributes
+    ----------
+    stretch
+        Stretch * angle is added to the gate of an angle
     """
 
     separation_rad: float
@@ -48,9 +51,14 @@ class Gates(NamedTuple):
 class SearchInput(NamedTuple):
     """The observed stars, brightest first, the catalog, and the gates.
 
-    vectors_cam, vectors     : (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
-    magnitude_cam, magnitude : (N,), (M,) their magnitudes, NaN if unknown
-    cells                    : spatial grid of the catalog's directions
+    Attributes
+    ----------
+    vectors_cam, vectors
+        (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
+    magnitude_cam, magnitude
+        (N,), (M,) their magnitudes, NaN if unknown
+    cells
+        Spatial grid of the catalog's directions
     """
 
     vectors_cam: Floats
@@ -64,11 +72,22 @@ class SearchInput(NamedTuple):
 class Primary(NamedTuple):
     """The primary pair A, B, and the geometry of the X other stars about it.
 
-    rows, triad : (2,) rows of the observed stars;  (3, 3) see `triad`;  midpoint : (3,) unit vector halfway
-    others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of these
-    sigma_rad, radius_rad : (X,) standard deviation of the predicted position and its gate
-    area_sr     : (X,) area inside all gates
-    reach_rad   : greatest angle of an observed star from the midpoint, with a gate added
+    Attributes
+    ----------
+    rows, triad
+        (2,) rows of the observed stars;  (3, 3) see `triad`
+    midpoint
+        (3,) unit vector halfway
+    others
+        (X,) rows
+    corner_rad, gate_rad
+        (2, X) their angles from A and from B, and the gates of these
+    sigma_rad, radius_rad
+        (X,) standard deviation of the predicted position and its gate
+    area_sr
+        (X,) area inside all gates
+    reach_rad
+        Greatest angle of an observed star from the midpoint, with a gate added
     """
 
     rows: Ints
@@ -287,7 +306,10 @@ def add_contradictions(
 ) -> None:
     """Accumulate the assumptions that identify an observed star differently from the best one.
 
-    contradictions: (3,) their number, the sum of their matches and their least cost, updated in place
+    Parameters
+    ----------
+    contradictions
+        (3,) their number, the sum of their matches and their least cost, updated in place
     """
     for n in range(len(cost)):
         for m in range(len(best)):
@@ -309,15 +331,22 @@ def saa(
 ) -> StarMatch | None:
     """SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2): two bright stars, all pairs like them, all other stars.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    index         : pairs in buckets, or a k-vector index
-    tolerance_rad : of a direction, 3 epsilon_position
-    options       : those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
-        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
     Steps 2 to 8 of 2.4.2, except that the search does not stop at the first assumption that passes: with the
     assumptions of ten more pairs, the best must be significant (1e-5), and 1e5 times as likely as the next one that
     identifies a star differently. Otherwise returns None. A lattice of LEDs that is not in the catalog is sometimes
     identified as one that is.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    index
+        Pairs in buckets, or a k-vector index
+    tolerance_rad
+        Of a direction, 3 epsilon_position
+    options
+        Those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
+        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
     """
     settings = Options(**options)
     settings.require_known_focal("saa")

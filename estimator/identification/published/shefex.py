@@ -34,7 +34,11 @@ MIN_SIDE_TOLERANCES = 6.0
 class ShefexOptions(NamedTuple):
     """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
-    accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
+    Attributes
+    ----------
+    accept
+        log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a
+        fourth star
     """
 
     cos_error: float
@@ -66,12 +70,19 @@ def shefex(
 ) -> StarMatch | None:
     """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
-    tolerance_rad : of a direction;  options : those of `Options`; magnitudes are not used
     All triangles are tried in the order of brightness: the base triangle's stars are found with the k-vector, a fourth
     star and then every other star by its three angles to them. Three tests are added to the paper's: the handedness of
     the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
     match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first; the paper has 15 at most
+    tolerance_rad
+        Of a direction
+    options
+        Those of `Options`; magnitudes are not used
     """
     settings = Options(**options)
     settings.require_known_focal("shefex")

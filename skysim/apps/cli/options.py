@@ -94,8 +94,11 @@ def load(
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.
 
-    trackers : names of all trackers that will solve its frames, the scene's own first; an override must have an effect
-        for one of them
+    Parameters
+    ----------
+    trackers
+        Names of all trackers that will solve its frames, the scene's own first; an override
+        must have an effect for one of them
     """
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import unused
@@ -229,7 +232,10 @@ OPTIONS = {  # by the key of a function's parameter
 def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
     """The error with the option at fault in place of its key, and the place of a key that was checked after loading.
 
-    loaded : name and overrides of the scene, by default those of the last one
+    Parameters
+    ----------
+    loaded
+        Name and overrides of the scene, by default those of the last one
     """
     error = with_place(error, loaded or (LOADED[-1] if LOADED else None))
     if error.where == OVERRIDES:

@@ -305,7 +305,12 @@ def print_worst(
 ) -> None:
     """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
 
-    levels : of each trial's point;  instead : the command to give if no trial counts for the response
+    Parameters
+    ----------
+    levels
+        Of each trial's point
+    instead
+        The command to give if no trial counts for the response
     """
     if not found:
         print(f"no trial counts for {response}; rank them by an error: {instead}")

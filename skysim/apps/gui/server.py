@@ -203,10 +203,16 @@ def is_plain_file(scope: Any) -> bool:
 class Guard:
     """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
 
-    hosts : allowed Host headers ("*": any). This stops DNS rebinding: another site's name that resolves to this
-        server comes with its own Host header.
-    token : required; `/?token=...` stores it in a cookie
-    port : of the server. Browsers send a host's cookies to all its ports, so the cookie's name has the port
+    Attributes
+    ----------
+    hosts
+        Allowed Host headers ("*": any). This stops DNS rebinding: another site's name that
+        resolves to this server comes with its own Host header.
+    token
+        Required; `/?token=...` stores it in a cookie
+    port
+        Of the server. Browsers send a host's cookies to all its ports, so the cookie's name has
+        the port
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
@@ -378,10 +384,15 @@ def serve(
 ) -> None:
     """Serve until Ctrl-C.
 
-    token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
-        empty
-    cameras : live cameras that the page may watch, see `skysim.core.images`
-    workers : greatest number of worker processes; further pages wait for one
+    Parameters
+    ----------
+    token
+        Required of browsers, also of this machine, where other users and other sites' pages
+        are; a random one if empty
+    cameras
+        Live cameras that the page may watch, see `skysim.core.images`
+    workers
+        Greatest number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)

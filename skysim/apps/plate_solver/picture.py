@@ -69,13 +69,22 @@ def solve(
 ) -> PlateSolution:
     """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
-    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 2 to
-        100 degrees
-    camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
-    time_utc : when the image was taken; the FITS header's date if left out
-    catalog  : name or file of a deeper star catalog, for fields of a few degrees
+    Parameters
+    ----------
+    fov_deg
+        Horizontal field of view to 5 %; if neither it nor `camera` is given, the field that
+        EXIF tells, and 2 to 100 degrees
+    camera
+        A scene, a camera file or an OpenCV calibration in place of fov_deg
+    time_utc
+        When the image was taken; the FITS header's date if left out
+    catalog
+        Name or file of a deeper star catalog, for fields of a few degrees
 
-    Raises InputError with one line for an image that cannot be read.
+    Raises
+    ------
+    InputError
+        With one line for an image that cannot be read.
     """
     if camera or catalog:
         solver = make_solver(
@@ -93,7 +102,10 @@ def solve(
 def pictures_in(paths: Iterable[Path]) -> list[Path]:
     """The files, with every folder replaced by its image files, sorted; without annotated images of an earlier call.
 
-    Raises InputError for a folder without an image.
+    Raises
+    ------
+    InputError
+        For a folder without an image.
     """
     found: list[Path] = []
     for path in paths:
@@ -185,7 +197,10 @@ def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
 def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
-    Raises InputError if the image cannot come from this camera.
+    Raises
+    ------
+    InputError
+        If the image cannot come from this camera.
     """
     camera = solver.camera
     if camera and image.ndim != 2:

@@ -40,9 +40,14 @@ class Client:
 class FrameHub:
     """The newest packet, shared between the simulation thread and the clients' threads.
 
-    sender_status : returns the sender's counters
-    clients : connected clients, and the last KEPT_DISCONNECTED that have disconnected
-    earlier : number of clients that disconnected before those, and the sums of their counters
+    Attributes
+    ----------
+    sender_status
+        Returns the sender's counters
+    clients
+        Connected clients, and the last KEPT_DISCONNECTED that have disconnected
+    earlier
+        Number of clients that disconnected before those, and the sums of their counters
     """
 
     def __init__(self, sender_status: Callable[[], dict[str, Any]]) -> None:

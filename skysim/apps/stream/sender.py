@@ -65,8 +65,13 @@ DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 class SenderStats:
     """Counters of the sender.
 
-    rendered, dropped : numbers of frames
-    late_ms : delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW frames
+    Attributes
+    ----------
+    rendered, dropped
+        Numbers of frames
+    late_ms
+        Delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW
+        frames
     """
 
     rendered: int = 0
@@ -106,7 +111,11 @@ def send(
     """Fly and send each frame of the main camera when it is due, until the last one or until all sinks have failed.
 
     Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
-    publish : also called with each packet
+
+    Parameters
+    ----------
+    publish
+        Also called with each packet
     """
     scene = flight.lab.scene
     may_drop = scene.filter is None

@@ -34,12 +34,18 @@ MAX_PIXELS = 1 << 28
 class Packet(NamedTuple):
     """A frame to send.
 
-    header : what a tracker may use. index, t_s (mid-exposure since the scene's start), exposure_s, width, height,
-             dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and made_unix_s (wall-clock times at
-             which the exposure ended and the frame was ready), dropped (frames dropped before this one)
-    pixels : (H, W)
-    truth  : cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px, y_px of the lights
-             on the detector
+    Attributes
+    ----------
+    header
+        What a tracker may use. index, t_s (mid-exposure since the scene's start), exposure_s,
+        width, height, dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and
+        made_unix_s (wall-clock times at which the exposure ended and the frame was ready),
+        dropped (frames dropped before this one)
+    pixels
+        (H, W)
+    truth
+        cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px,
+        y_px of the lights on the detector
     """
 
     header: dict[str, Any]
@@ -121,7 +127,12 @@ READER_GONE = "the reader has closed the pipe"
 class Sink:
     """A thread that passes packets to `write`, the oldest first.
 
-    sent, dropped : packets so far;  fault : the error that stopped it, or ""
+    Attributes
+    ----------
+    sent, dropped
+        Packets so far
+    fault
+        The error that stopped it, or ""
     """
 
     def __init__(self, name: str, write: Callable[[Packet], None]) -> None:

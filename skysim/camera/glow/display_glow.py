@@ -33,9 +33,13 @@ def black_glow(
 ) -> Floats | None:
     """(H, W) electrons s^-1 px^-1 of a display's black pixels, 1 / contrast of white; None without such a display.
 
-    camera_m : (3,) the entrance pupil in the lab
     A chip pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
     exposure and the row times of a rolling shutter are left out.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil in the lab
     """
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:

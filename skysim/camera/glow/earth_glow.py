@@ -127,7 +127,10 @@ def stray_of_bodies_e_s_m2(
 ) -> dict[str, float]:
     """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
 
-    boresight : (3,)
+    Parameters
+    ----------
+    boresight
+        (3,)
     """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)

@@ -119,9 +119,13 @@ def wall_glow(
 ) -> Floats:
     """(h, w) electrons s^-1 px^-1 at the nodes of `background.glow_map`: the radiance rho E / pi times the etendue.
 
-    camera_m : (3,) the entrance pupil in the lab; outside of the wall it sees nothing
     Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes, and beyond wall and floor
     it is dark. The light of the wall is interpolated between fewer points (`IRRADIANCE`), as it varies slowly.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil in the lab; outside of the wall it sees nothing
     """
     toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)

@@ -135,14 +135,20 @@ def vscmg_commands(
 class CmgSet:
     """Control moment gyroscopes: rotating a spinning rotor's axle gives the torque d(angle)/dt x h.
 
-    gimbal_axes, spin_axes : (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
-    rotor_inertia_kg_m2    : (n,) of each rotor about its axle
-    rotor_torque_limit_nm  : None leaves the rotors to spin; a torque makes them variable-speed CMGs
-    steering               : a key of STEERING, which variable-speed CMGs do not use
-
     A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
     accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
     vectors or not at right angles, and for an unknown steering law.
+
+    Attributes
+    ----------
+    gimbal_axes, spin_axes
+        (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
+    rotor_inertia_kg_m2
+        (n,) of each rotor about its axle
+    rotor_torque_limit_nm
+        None leaves the rotors to spin; a torque makes them variable-speed CMGs
+    steering
+        A key of STEERING, which variable-speed CMGs do not use
     """
 
     gimbal_axes: Floats

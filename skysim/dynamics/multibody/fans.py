@@ -57,9 +57,17 @@ class Fans:
 class FanSet:
     """Fans: thrust with a lever arm about the bearing's center rotates the vehicle, T = sum position x axis thrust.
 
-    force_axes : (3, n) unit vectors along which a positive thrust pushes the body
-    positions_m: (3, n) from the center of rotation
-    Raises InputError (one line) for axes that are not unit vectors and positions of another shape.
+    Attributes
+    ----------
+    force_axes
+        (3, n) unit vectors along which a positive thrust pushes the body
+    positions_m
+        (3, n) from the center of rotation
+
+    Raises
+    ------
+    InputError
+        (one line) for axes that are not unit vectors and positions of another shape.
     """
 
     force_axes: Floats

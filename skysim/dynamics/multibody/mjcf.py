@@ -45,7 +45,12 @@ class FileReference(NamedTuple):
 class References:
     """References found so far. A setting in one file affects the paths of another, so all files are collected together.
 
-    bases : folders that a relative name may start from;  folders : values of meshdir and the like
+    Attributes
+    ----------
+    bases
+        Folders that a relative name may start from
+    folders
+        Values of meshdir and the like
     """
 
     folder: Path
@@ -216,7 +221,10 @@ def load(path: Path) -> Any:
 def trial_fault(path: Path, modified_ns: int) -> str:
     """Why MuJoCo does not survive the file, in one line; "" if it does. A shipped file needs no trial.
 
-    modified_ns : so that a changed file is tried again
+    Parameters
+    ----------
+    modified_ns
+        So that a changed file is tried again
     """
     data = path.read_bytes()
     if any(data == shipped.read_bytes() for shipped in (SCENES / "vehicles").glob("*.xml")):

@@ -62,11 +62,19 @@ STOP_BODY_M = 0.5
 class VehicleModel:
     """A vehicle on its bearing, ready to simulate. Simulation does not change the model.
 
-    spec    : mujoco.MjSpec that the model was made from
-    model   : mujoco.MjModel, whose first four qpos and three qvel are the bearing's
-    mass    : mass properties of the whole vehicle, with balanced wheels and the trim masses in their places
-    torques : (3,) actuator numbers of the ideal torques about body x, y, z
-    wheels, gimbals, rotors, fans, trims : the actuators, empty where they are not switched on
+    Attributes
+    ----------
+    spec
+        mujoco.MjSpec that the model was made from
+    model
+        mujoco.MjModel, whose first four qpos and three qvel are the bearing's
+    mass
+        Mass properties of the whole vehicle, with balanced wheels and the trim masses in their
+        places
+    torques
+        (3,) actuator numbers of the ideal torques about body x, y, z
+    wheels, gimbals, rotors, fans, trims
+        The actuators, empty where they are not switched on
     """
 
     spec: Any

@@ -39,10 +39,19 @@ WHEEL = "wheel_"
 class WheelSet:
     """Reaction wheels: a motor's torque on its wheel acts oppositely on the body, T = -sum axis u.
 
-    axes : (3, n) unit vectors; a positive speed is right-handed about them
-    inertia_kg_m2 : (n,) of each wheel about its axle
-    speed_limit_rad_s : relative to the body
-    Raises InputError (one line) for axes that are not unit vectors and inertias that are not positive.
+    Attributes
+    ----------
+    axes
+        (3, n) unit vectors; a positive speed is right-handed about them
+    inertia_kg_m2
+        (n,) of each wheel about its axle
+    speed_limit_rad_s
+        Relative to the body
+
+    Raises
+    ------
+    InputError
+        (one line) for axes that are not unit vectors and inertias that are not positive.
     """
 
     axes: Floats

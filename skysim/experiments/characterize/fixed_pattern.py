@@ -54,7 +54,10 @@ class RateNoise(NamedTuple):
 class DarkCurrent(NamedTuple):
     """Mean and DSNU over the pixels, fraction of hot pixels, and their mean excess if they are enough. Rates in DN/s.
 
-    edges, counts, expected : histogram of the rates, and what the law expects
+    Attributes
+    ----------
+    edges, counts, expected
+        Histogram of the rates, and what the law expects
     """
 
     mean: Estimate
@@ -213,7 +216,10 @@ Planes = tuple[
 def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes:
     """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature.
 
-    half : first_dn or second_dn
+    Parameters
+    ----------
+    half
+        first_dn or second_dn
     """
     times = np.array([one.exposure_s for one in darks])
     weight = np.array(
@@ -259,7 +265,10 @@ def prnu(
 ) -> Estimate:
     """Relative standard deviation of the sensitivity, from the rate of every pixel in the light.
 
-    dark_ratio : dark current at the flats' temperature over that of the darks
+    Parameters
+    ----------
+    dark_ratio
+        Dark current at the flats' temperature over that of the darks
     """
     rates = [
         light_rate(flats, transfer, half, planes, dark_ratio)

@@ -150,7 +150,11 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     """The levels of a folder's frames, by exposure. Raises InputError with one line.
 
     Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
-    shape : (height, width) of the camera's frames
+
+    Parameters
+    ----------
+    shape
+        (height, width) of the camera's frames
     """
     builders: dict[Setting, LevelBuilder] = {}
     stack = Stack(folder)

@@ -55,9 +55,18 @@ LEAST_VARIANCE_PX2 = 1e-3
 class StarImages(NamedTuple):
     """Fitted images of N stars.
 
-    xy_px : (N, 2);  flux_dn : (N,);  variance_px2, variance_sigma_px2 : (N,) mean of s_x^2 and s_y^2, and its error
-    stretch_px2 : (N, 2) s_x^2 - s_y^2, and twice the covariance of x and y: of a trail
-    chi2 : (N,) reduced
+    Attributes
+    ----------
+    xy_px
+        (N, 2)
+    flux_dn
+        (N,)
+    variance_px2, variance_sigma_px2
+        (N,) mean of s_x^2 and s_y^2, and its error
+    stretch_px2
+        (N, 2) s_x^2 - s_y^2, and twice the covariance of x and y: of a trail
+    chi2
+        (N,) reduced
     """
 
     xy_px: Floats

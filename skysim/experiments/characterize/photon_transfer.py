@@ -108,10 +108,18 @@ class Moments(NamedTuple):
 class Level:
     """Frames of one exposure time and temperature.
 
-    count  : frames, an even number;  greatest_dn, least_dn : of all pixels
-    first_dn, second_dn : (H, W) means of the first and of the second frames of the pairs
-    variance_dn2 : (H, W) temporal variance of every pixel, from count / 2 pairs
-    difference_dn2 : mean square of the difference of the frames of a pair, averaged over the frame
+    Attributes
+    ----------
+    count
+        Frames, an even number
+    greatest_dn, least_dn
+        Of all pixels
+    first_dn, second_dn
+        (H, W) means of the first and of the second frames of the pairs
+    variance_dn2
+        (H, W) temporal variance of every pixel, from count / 2 pairs
+    difference_dn2
+        Mean square of the difference of the frames of a pair, averaged over the frame
     """
 
     exposure_s: float
@@ -224,11 +232,19 @@ class TransferPoint(NamedTuple):
 class Transfer(NamedTuple):
     """The fit.
 
-    values     : K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each temperature
-    covariance : of these
-    flicker    : relative standard deviation of the light from frame to frame
-    misfit     : chi-square over its degrees of freedom
-    points     : those fitted
+    Attributes
+    ----------
+    values
+        K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each
+        temperature
+    covariance
+        Of these
+    flicker
+        Relative standard deviation of the light from frame to frame
+    misfit
+        chi-square over its degrees of freedom
+    points
+        Those fitted
     """
 
     values: Floats

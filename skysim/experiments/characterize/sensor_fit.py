@@ -34,11 +34,18 @@ HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a part
 class MeasuredSensor(NamedTuple):
     """What the frames tell.
 
-    estimates : by key of `camera.detector`, in its units
-    remarks   : what they do not tell, one line each
-    dark      : distribution of the dark current, None if it is below the noise
-    flats     : all levels, those too that are beyond the fit
-    saturation_dn : digital number of a saturated pixel, or of the brightest flat
+    Attributes
+    ----------
+    estimates
+        By key of `camera.detector`, in its units
+    remarks
+        What they do not tell, one line each
+    dark
+        Distribution of the dark current, None if it is below the noise
+    flats
+        All levels, those too that are beyond the fit
+    saturation_dn
+        Digital number of a saturated pixel, or of the brightest flat
     """
 
     estimates: dict[str, Estimate]
@@ -203,8 +210,12 @@ def dark_parameters(
 ) -> DarkCurrent | None:
     """Dark current, DSNU and hot pixels from the rates of the pixels at the temperature of these darks.
 
-    own   : index of the temperature for which they are stated
-    ratio : dark current at it over that of these darks
+    Parameters
+    ----------
+    own
+        Index of the temperature for which they are stated
+    ratio
+        Dark current at it over that of these darks
     """
     weights = first[2]
     gain = transfer.values[GAIN]

@@ -56,8 +56,15 @@ MISSED_PX = (
 class Size:
     """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of other cells.
 
-    draws : frames in each field with attitudes and noise of their own, in which units and thermal states take turns
-    sky   : frames in new fields, of other units;  pairs : frames with and without a cause to compare
+    Attributes
+    ----------
+    draws
+        Frames in each field with attitudes and noise of their own, in which units and thermal
+        states take turns
+    sky
+        Frames in new fields, of other units
+    pairs
+        Frames with and without a cause to compare
     """
 
     fields: int
@@ -392,8 +399,16 @@ AXES = ("x_arcsec", "y_arcsec", "roll_arcsec")
 class MeasuredFrames:
     """The measured frames of a datasheet.
 
-    columns : of the trials, (cells, fields) each;  scene_name : as it was given;  overrides : of the command line
-    spec    : what a trial needs to be run again
+    Attributes
+    ----------
+    columns
+        Of the trials, (cells, fields) each
+    scene_name
+        As it was given
+    overrides
+        Of the command line
+    spec
+        What a trial needs to be run again
     """
 
     scene: Scene
@@ -480,9 +495,13 @@ def measure(
 ) -> MeasuredFrames:
     """Run the missing trials of a scene's datasheet in a folder, and return all of them.
 
-    quick, fields : smaller experiments, and another number of fields
     watch(trials) : returns the function that is called after every batch
     Raises InputError for a scene without attitudes of single frames, and for a cell whose trials fail.
+
+    Parameters
+    ----------
+    quick, fields
+        Smaller experiments, and another number of fields
     """
     check_scene(scene)
     size = QUICK if quick else FULL

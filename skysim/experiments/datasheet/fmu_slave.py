@@ -13,7 +13,10 @@ from tracker_error import ErrorModel  # type: ignore[import-not-found]
 class TrackerError(Fmi3Slave):
     """Input: the rate of the boresight. Outputs: the errors about the camera's axes, drawn anew at every step.
 
-    seed : of the random numbers; read at the first step
+    Attributes
+    ----------
+    seed
+        Of the random numbers; read at the first step
     """
 
     author = "skysim"

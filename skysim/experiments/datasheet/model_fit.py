@@ -111,7 +111,11 @@ def along_square(
 ) -> float:
     """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
 
-    errors : (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is negative
+    Parameters
+    ----------
+    errors
+        (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is
+        negative
     """
     if not rate_deg_s:
         return 0.0
@@ -194,9 +198,16 @@ APART_STEP_S = 1e9  # between draws, which then are of other fields
 class Agreement(NamedTuple):
     """How well the model agrees with other fields at one rate.
 
-    fitted      : the fields of the fit, even or odd;  frames : one of each other field
-    p_values    : (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
-    correlation : mean over the axes and over all pairs of frames of a sequence, and that of the model
+    Attributes
+    ----------
+    fitted
+        The fields of the fit, even or odd
+    frames
+        One of each other field
+    p_values
+        (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
+    correlation
+        Mean over the axes and over all pairs of frames of a sequence, and that of the model
     """
 
     fitted: str

@@ -198,10 +198,16 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 class Limit(NamedTuple):
     """Between which levels the probability of a right attitude falls below `share`, each shown at 95 % confidence.
 
-    share : the highest of LIMITS that the frames of a level can show
-    above : the highest level up to which all are shown to be above it, NaN if none is
-    below : the lowest from which all are shown to be below it, infinite if none is
-    fields : fewest fields at a level
+    Attributes
+    ----------
+    share
+        The highest of LIMITS that the frames of a level can show
+    above
+        The highest level up to which all are shown to be above it, NaN if none is
+    below
+        The lowest from which all are shown to be below it, infinite if none is
+    fields
+        Fewest fields at a level
     """
 
     share: float

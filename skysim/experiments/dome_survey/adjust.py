@@ -66,10 +66,15 @@ def run_survey(
 ) -> SurveyRun:
     """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
 
-    fit_distortion : fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate with the
-        focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the attitude does not change
     watch(rounds done, rounds) is called after each round of identification and adjustment
     Raises InputError if the frames do not determine the unknowns, or the result contradicts the prior.
+
+    Parameters
+    ----------
+    fit_distortion
+        Fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate
+        with the focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the
+        attitude does not change
     """
 
     def adjusted(
@@ -320,11 +325,15 @@ def led_visibility(
 def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:
     """Indices of the largest group of frames connected by shared LEDs.
 
-    visible : (F, N) mask of the LEDs in each frame
-    min_shared : minimum number of LEDs that a frame shares with the rest of the group
-
     Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group
     grows from the frame with the most LEDs, adding connected frames until none is left.
+
+    Parameters
+    ----------
+    visible
+        (F, N) mask of the LEDs in each frame
+    min_shared
+        Minimum number of LEDs that a frame shares with the rest of the group
     """
     n_frames = len(visible)
     remaining = np.ones(n_frames, dtype=bool)

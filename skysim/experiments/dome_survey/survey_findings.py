@@ -43,9 +43,17 @@ STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames ma
 class SurveyRun:
     """A survey with the frames and correspondences of its last round.
 
-    taken  : all frames, with the IMU's attitudes;  rows : those of `taken` that are in the survey
-    listed : the LEDs before the survey
-    prior  : the model before the last round; its LEDs are the listed ones, those moved at the places found
+    Attributes
+    ----------
+    taken
+        All frames, with the IMU's attitudes
+    rows
+        Those of `taken` that are in the survey
+    listed
+        The LEDs before the survey
+    prior
+        The model before the last round; its LEDs are the listed ones, those moved at the places
+        found
     """
 
     survey: DomeSurvey
@@ -183,8 +191,14 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
 class Coverage:
     """The frames held so far, and which LEDs they measure.
 
-    model : by which further attitudes are chosen;  held, seen : body_from_lab of F frames, and (F, N) LEDs in them
-    accuracy : that of the survey, or predicted before it; None if the frames are too few
+    Attributes
+    ----------
+    model
+        By which further attitudes are chosen
+    held, seen
+        body_from_lab of F frames, and (F, N) LEDs in them
+    accuracy
+        That of the survey, or predicted before it; None if the frames are too few
     """
 
     model: SurveyModel
@@ -259,13 +273,23 @@ def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> Survey
 class DomeFaults:
     """Faults of the dome by LED number.
 
-    dark      : LEDs that no frame shows though it must
-    displaced : LED and its distance from the list's place, m;  list_sigma_m : error of the other places about each axis
-    exchanged : LED at whose place another one shines, that other one, and others that would do as well
-    found_m   : places, m, at which displaced LEDs and lights of exchanged ones were found
-    unlisted  : places, m, of lights at rest that are no LED of the list
-    exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if none are
-        compared: too few are in enough frames, or the time of their code is unknown
+    Attributes
+    ----------
+    dark
+        LEDs that no frame shows though it must
+    displaced
+        LED and its distance from the list's place, m
+    list_sigma_m
+        Error of the other places about each axis
+    exchanged
+        LED at whose place another one shines, that other one, and others that would do as well
+    found_m
+        Places, m, at which displaced LEDs and lights of exchanged ones were found
+    unlisted
+        Places, m, of lights at rest that are no LED of the list
+    exchange_share
+        Share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
+        none are compared: too few are in enough frames, or the time of their code is unknown
     """
 
     dark: list[int]

@@ -40,7 +40,11 @@ STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103, "candidates": 104, "
 def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) -> Rotation:
     """Random lab_from_body at `count` stops: tilt uniform in solid angle up to tilt_deg, yaw uniform.
 
-    stream_name : random stream, a key of STREAM_KEYS. Raises InputError if the tilt exceeds the vehicle's tilt stop.
+    Parameters
+    ----------
+    stream_name
+        Random stream, a key of STREAM_KEYS. Raises InputError if the tilt exceeds the vehicle's
+        tilt stop.
     """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
@@ -69,9 +73,17 @@ def planned_stops(
 ) -> Rotation:
     """lab_from_body at up to `count` stops that reduce the errors most, in their order (`survey_plan.choose`).
 
-    margin_px  : of the chip, where an image would be incomplete
-    held, seen : body_from_lab of frames taken before, and the LEDs identified in them
-    Raises InputError if no attitude shows enough LEDs.
+    Parameters
+    ----------
+    margin_px
+        Of the chip, where an image would be incomplete
+    held, seen
+        body_from_lab of frames taken before, and the LEDs identified in them
+
+    Raises
+    ------
+    InputError
+        If no attitude shows enough LEDs.
     """
     candidates = stop_attitudes(scene, "candidates", CANDIDATES, tilt_deg).inv()
     shown = model.visible(candidates, margin_px)
@@ -112,7 +124,10 @@ SAME_LIGHT_PX = 2.0  # greatest distance of a centroid from the true image
 class SurveyFrame:
     """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment.
 
-    index : number of the frame, from 0, which tells what coded LEDs show
+    Attributes
+    ----------
+    index
+        Number of the frame, from 0, which tells what coded LEDs show
     """
 
     lights: Centroids
@@ -140,7 +155,10 @@ def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Trut
 def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
     """Standard deviation of a centroid's coordinates, robust, from the true images in NOISE_FRAMES simulated frames.
 
-    Raises InputError if they show too few lights.
+    Raises
+    ------
+    InputError
+        If they show too few lights.
     """
     errors = []
     for _, truth, lights in take_frames(
@@ -198,12 +216,15 @@ def prediction_sigmas_px(
 ) -> tuple[float, Floats]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
 
-    map_px : (N,) standard deviation of each LED's place; that of `uncertainty` if None
-
     The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error moves the
     camera too: it turns the direction of an LED at the distance R from the center of rotation, d from the camera, by
     R / d of itself. The LED position error, and the roll and focal length errors (largest, and evaluated, at the image
     corner), act on each light differently.
+
+    Parameters
+    ----------
+    map_px
+        (N,) standard deviation of each LED's place; that of `uncertainty` if None
     """
     camera = prior.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
@@ -225,7 +246,10 @@ def match_by_imu(
 ) -> Correspondences:
     """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment.
 
-    map_px : see `prediction_sigmas_px`
+    Parameters
+    ----------
+    map_px
+        See `prediction_sigmas_px`
     """
     common_px, individual_px = prediction_sigmas_px(prior, uncertainty, map_px)
     predicted = prior.pixels(frame.body_from_lab)
@@ -293,7 +317,10 @@ def match_by_survey(
 ) -> Correspondences:
     """Match detections to LEDs with the attitudes and map of an adjustment.
 
-    sigma_px : (N,) standard deviation of each LED's predicted coordinates
+    Parameters
+    ----------
+    sigma_px
+        (N,) standard deviation of each LED's predicted coordinates
     """
     predicted = prior.pixels(frame.body_from_lab)
     visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max())))

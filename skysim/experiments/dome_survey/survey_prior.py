@@ -42,8 +42,16 @@ UNCERTAINTY_RANGES = {
 class SurveyUncertainty:
     """Uncertainty before the survey: standard deviations per axis, and a focal length error.
 
-    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
-    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
+    Attributes
+    ----------
+    imu_sigma_rad
+        Attitude from the IMU at each frame
+    led_sigma_m
+        Position of each LED
+    lever_sigma_m
+        Position of the camera in the body
+    focal_error
+        Relative error of the assumed focal length
     """
 
     imu_sigma_rad: float
@@ -60,9 +68,15 @@ class SurveyUncertainty:
 class CalibrationPrior:
     """Assumed model of dome and camera, before a survey or from it.
 
-    floor_px : least standard deviation of a prediction's residuals, by which lights are matched
-    disk_m   : diameter of an LED's luminous disk
-    levels   : (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None if all are steady
+    Attributes
+    ----------
+    floor_px
+        Least standard deviation of a prediction's residuals, by which lights are matched
+    disk_m
+        Diameter of an LED's luminous disk
+    levels
+        (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None
+        if all are steady
     """
 
     camera: Camera

@@ -58,7 +58,12 @@ RANDOM = "random"
 class HeldAttitudes:
     """Attitudes to hold, one frame at each.
 
-    shown : (F, N) LEDs that each shows;  margin_px : from the edge, where an image would be incomplete
+    Attributes
+    ----------
+    shown
+        (F, N) LEDs that each shows
+    margin_px
+        From the edge, where an image would be incomplete
     """
 
     lab_from_body: Rotation
@@ -139,7 +144,10 @@ def survey_images(
 ) -> SurveyRun:
     """Survey from images, of which `frames` have an attitude; the others are identified with the LEDs surveyed so far.
 
-    Raises InputError if too few images have an attitude, or they do not determine the unknowns.
+    Raises
+    ------
+    InputError
+        If too few images have an attitude, or they do not determine the unknowns.
     """
     if len(frames) < 2:
         raise InputError(

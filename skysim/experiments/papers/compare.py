@@ -29,8 +29,14 @@ VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
 class ExperimentOptions:
     """Options of an experiment.
 
-    quick: fewer trials, wider intervals;  seed: of all its random streams
-    watch: progress callback, called with (completed, total)
+    Attributes
+    ----------
+    quick
+        Fewer trials, wider intervals
+    seed
+        Of all its random streams
+    watch
+        Progress callback, called with (completed, total)
     """
 
     quick: bool = False
@@ -153,7 +159,10 @@ def compare(
 ) -> Reproduction:
     """Compare every published row with our result.
 
-    Raises ValueError if the experiment has no result for a row, or a result for a row that is not published.
+    Raises
+    ------
+    ValueError
+        If the experiment has no result for a row, or a result for a row that is not published.
     """
     if unmatched := published.rows.keys() ^ experiment.results.keys():
         raise ValueError(
@@ -225,8 +234,13 @@ def prediction_interval(
     """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n), t for n - 1 degrees of freedom.
 
     For a published number that is itself a single draw.
-    count : number of independent draws, if fewer than the values
-    own_variance : of the predicted draw in units of s^2, in place of 1
+
+    Parameters
+    ----------
+    count
+        Number of independent draws, if fewer than the values
+    own_variance
+        Of the predicted draw in units of s^2, in place of 1
     """
     draws = np.asarray(values, float)
     count = count or len(draws)
@@ -277,7 +291,12 @@ def widen_interval(summary: Summary) -> Summary:
 def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:
     """A function of K column means, with its bootstrap percentile interval over the N rows; NaNs are left out.
 
-    columns : (N, K);  statistic : of (..., K) means, shape (...)
+    Parameters
+    ----------
+    columns
+        (N, K)
+    statistic
+        Of (..., K) means, shape (...)
     """
     finite = np.isfinite(columns)
     filled = np.where(finite, columns, 0.0)

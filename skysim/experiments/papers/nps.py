@@ -50,7 +50,16 @@ FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
 class OnboardModel(NamedTuple):
     """The tracker's model: the true panel and lever arm, and the nine stars as seen from the level vehicle.
 
-    lab: the true lab;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
+    Attributes
+    ----------
+    lab
+        The true lab
+    panel
+        The plane
+    vectors
+        (9, 3) unit, from the bearing
+    pairs
+        Their index
     """
 
     lab: Lab

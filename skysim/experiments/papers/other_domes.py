@@ -266,7 +266,10 @@ def mean_absolute_error_deg(
 ) -> Summary:
     """Mean error angle in degrees. The attitudes of one survey share its errors, so the interval is over surveys.
 
-    seeds : one list per survey: its seed, then the seeds of its attitudes
+    Parameters
+    ----------
+    seeds
+        One list per survey: its seed, then the seeds of its attitudes
     """
     means_arcsec = []
     for survey_seed, *attitude_seeds in seeds:

@@ -90,8 +90,14 @@ def paper_angles_deg(cam_from_icrs: Rotation) -> Floats:
 class FrameSolutions(NamedTuple):
     """Solutions of N frames.
 
-    local : (N,) local times;  estimated_deg, true_deg : (N, 3) estimated and true angles as in Table 2
-    error_rad : (N,) error angle. Estimates and errors are NaN for unsolved frames.
+    Attributes
+    ----------
+    local
+        (N,) local times
+    estimated_deg, true_deg
+        (N, 3) estimated and true angles as in Table 2
+    error_rad
+        (N,) error angle. Estimates and errors are NaN for unsolved frames.
     """
 
     local: list[datetime.datetime]

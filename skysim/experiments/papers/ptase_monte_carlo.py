@@ -151,10 +151,16 @@ def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
 class RunErrors(NamedTuple):
     """(N,) errors of the solved runs in arcsec, as the paper defines them (eqs. 7-9), and the rotation angle.
 
-    attitude : |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
-    angle    : rotation angle of the error
-    roll     : |phi_true - phi_est| of eq. 5's angle, which counts from north
-    axis     : |Z_true - Z_est|
+    Attributes
+    ----------
+    attitude
+        |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
+    angle
+        Rotation angle of the error
+    roll
+        |phi_true - phi_est| of eq. 5's angle, which counts from north
+    axis
+        |Z_true - Z_est|
     """
 
     attitude: Floats

@@ -146,7 +146,14 @@ DISTURBANCES: dict[str, dict[str, Any]] = {"planet": PLANET, "planets": PLANETS,
 class ExposureLoop:
     """A camera at rest with closed-loop exposure control.
 
-    overrides : of the scene;  lab_from_body : its attitude;  start_ms : first exposure time
+    Attributes
+    ----------
+    overrides
+        Of the scene
+    lab_from_body
+        Its attitude
+    start_ms
+        First exposure time
     """
 
     def __init__(

@@ -105,12 +105,20 @@ def identify(
 class Curves(NamedTuple):
     """Results for N attitudes. The paper accepts a match with a fourth star; our rule requires significance.
 
-    work, right       : (centroid errors, cosErrors, N) by the paper's rule
-    right_significant : (cosErrors, N) by our rule, at 0.2 px
-    wrong             : (spikes, cosErrors of SPIKE_COS_ERRORS, N) by the paper's rule, at 0.2 px
-    wrong_significant : (spikes, N) by our rule, at 0.2 px
-    error_deg         : (centroid errors of ERRORS_PX, N, 3)
-    has_four_stars    : (N,) whether four stars are on the detector
+    Attributes
+    ----------
+    work, right
+        (centroid errors, cosErrors, N) by the paper's rule
+    right_significant
+        (cosErrors, N) by our rule, at 0.2 px
+    wrong
+        (spikes, cosErrors of SPIKE_COS_ERRORS, N) by the paper's rule, at 0.2 px
+    wrong_significant
+        (spikes, N) by our rule, at 0.2 px
+    error_deg
+        (centroid errors of ERRORS_PX, N, 3)
+    has_four_stars
+        (N,) whether four stars are on the detector
     """
 
     work: Floats

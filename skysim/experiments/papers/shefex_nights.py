@@ -103,8 +103,12 @@ def star_image(
 ) -> Floats:  # fmt: skip
     """(H, W) noise-free electrons of the catalog's brightest star alone, with the camera rotating across the boresight.
 
-    place_rad : offset of the star from the boresight, right and down, at mid-exposure
-    axis_rad : direction of the rotation axis, from camera x towards y
+    Parameters
+    ----------
+    place_rad
+        Offset of the star from the boresight, right and down, at mid-exposure
+    axis_rad
+        Direction of the rotation axis, from camera x towards y
     """
     brightest = lab.camera.sources.take(np.array([np.argmax(lab.camera.sources.strength)]))
     star_direction = brightest.place[0, :3]
@@ -231,8 +235,12 @@ CATALOG = "uniform"  # "processed using the uniform Hipparcos catalog"
 class NightResults(NamedTuple):
     """Results of N frames, each (N,): solved correctly, solved wrongly, number of centroids, by the paper's chain.
 
-    right_low_threshold : solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA
-    ours : solved correctly by our default chain
+    Attributes
+    ----------
+    right_low_threshold
+        Solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA
+    ours
+        Solved correctly by our default chain
     """
 
     right: Floats

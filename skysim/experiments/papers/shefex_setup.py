@@ -94,7 +94,14 @@ class ChainResult(NamedTuple):
 class ProcessingChain:
     """The paper's processing chain: sequential scan, 15 centroids, triangles and pyramids at cosError 5.5e-5, ESOQ2.
 
-    name : of its catalog;  threshold_sigma : of the scan, in units of the frame's noise;  focal_px : calibrated
+    Attributes
+    ----------
+    name
+        Of its catalog
+    threshold_sigma
+        Of the scan, in units of the frame's noise
+    focal_px
+        calibrated
     """
 
     def __init__(self, name: str, threshold_sigma: float, focal_px: float) -> None:
@@ -259,7 +266,10 @@ def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOption
 def relative_dispersion(means: Floats) -> Floats:
     """Index of dispersion (variance over mean) of the uniform catalog's counts, divided by the asymmetric one's.
 
-    means : (..., 4) mean counts of both catalogs, then mean squared counts
+    Parameters
+    ----------
+    means
+        (..., 4) mean counts of both catalogs, then mean squared counts
     """
     mean = means[..., :2]
     square = means[..., 2:]

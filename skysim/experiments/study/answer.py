@@ -149,9 +149,14 @@ def headline(
 ) -> list[str]:
     """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
 
-    lines : of all points, with the responses of the study and RESPONSES
-    may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
-    worst : the command that lists the worst trials
+    Parameters
+    ----------
+    lines
+        Of all points, with the responses of the study and RESPONSES
+    may_be_ambiguous
+        Whether the tracker can refuse a frame as ambiguous
+    worst
+        The command that lists the worst trials
     """
     done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
     if not done:

@@ -93,7 +93,10 @@ class Values(KeyedFactor):
 class Range(KeyedFactor):
     """A key between two bounds: `steps` values in a design with levels, uniformly distributed in a sampled design.
 
-    scale : equal steps (linear) or equal ratios (log); integer : rounded to whole numbers
+    Attributes
+    ----------
+    scale
+        Equal steps (linear) or equal ratios (log); integer : rounded to whole numbers
     """
 
     from_: Annotated[Value, Field(alias="from")]
@@ -238,10 +241,16 @@ class Point(NamedTuple):
 class Design(ConfigModel):
     """How points are chosen.
 
-    kind  : factorial, every combination of levels; one_at_a_time, the first levels, then each other level alone;
-            lhs, a Latin hypercube; sobol, a Sobol sequence; saltelli, the sample for Sobol indices: matrices A and B,
-            and A with each column of B in turn, points * (factors + 2) in all (Saltelli et al. 2010)
-    points: number of points, for lhs, sobol and saltelli only; a power of two for sobol and saltelli
+    Attributes
+    ----------
+    kind
+        Factorial, every combination of levels; one_at_a_time, the first levels, then each other
+        level alone; lhs, a Latin hypercube; sobol, a Sobol sequence; saltelli, the sample for
+        Sobol indices: matrices A and B, and A with each column of B in turn, points * (factors
+        + 2) in all (Saltelli et al. 2010)
+    points
+        Number of points, for lhs, sobol and saltelli only; a power of two for sobol and
+        saltelli
     """
 
     kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"

@@ -133,10 +133,16 @@ MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 class Candidate(NamedTuple):
     """One evaluated point.
 
-    figures  : statistic of each response that is an objective or a constraint
-    feasible : all constraints hold for the values (intervals are ignored), and no value is missing
-    refused  : its scene is invalid
-    why      : the violated constraints, or the error message of the scene; empty if feasible
+    Attributes
+    ----------
+    figures
+        Statistic of each response that is an objective or a constraint
+    feasible
+        All constraints hold for the values (intervals are ignored), and no value is missing
+    refused
+        Its scene is invalid
+    why
+        The violated constraints, or the error message of the scene; empty if feasible
     """
 
     number: int
@@ -152,8 +158,13 @@ class Candidate(NamedTuple):
 class SearchResult(NamedTuple):
     """Result of a search.
 
-    front    : the Pareto-optimal feasible candidates, best in the first objective first; with one objective, the best
-    finished : whether all candidates, or all existing points, were evaluated
+    Attributes
+    ----------
+    front
+        The Pareto-optimal feasible candidates, best in the first objective first; with one
+        objective, the best
+    finished
+        Whether all candidates, or all existing points, were evaluated
     """
 
     candidates: list[Candidate]
@@ -425,8 +436,12 @@ def run_candidate(
 ) -> bool:  # fmt: skip
     """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
 
-    total   : progress of the whole search, passed to `watch`
-    refused : number of failed trials of invalid scenes, which the budget does not count
+    Parameters
+    ----------
+    total
+        Progress of the whole search, passed to `watch`
+    refused
+        Number of failed trials of invalid scenes, which the budget does not count
     """
     # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
     before = replace(total)

@@ -68,9 +68,16 @@ def load(
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
-    programs : commands of external trackers and controllers by name; None if the study will not be run, and its
-               trackers and controllers need not be installed
-    Raises InputError with one line: the key, the fault, what is allowed, the file and line.
+    Parameters
+    ----------
+    programs
+        Commands of external trackers and controllers by name; None if the study will not be
+        run, and its trackers and controllers need not be installed
+
+    Raises
+    ------
+    InputError
+        With one line: the key, the fault, what is allowed, the file and line.
     """
     path = find(str(name))
     tree, text = read_yaml(path)
@@ -91,8 +98,17 @@ def plan_of(
 ) -> Plan:
     """The validated plan of a study's tree, read from a text.
 
-    path : of the text, for messages;  base : a file beside which scenes are, `path` if left out
-    Raises InputError with one line.
+    Parameters
+    ----------
+    path
+        Of the text, for messages
+    base
+        A file beside which scenes are, `path` if left out
+
+    Raises
+    ------
+    InputError
+        With one line.
     """
     try:
         study = Study.model_validate(tree)
@@ -111,7 +127,10 @@ def plan_of(
 def check(plan: Plan, to_run: bool) -> None:
     """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
 
-    to_run : whether the trackers and controllers must be installed
+    Parameters
+    ----------
+    to_run
+        Whether the trackers and controllers must be installed
     """
     from skysim.experiments.study import search
     from skysim.experiments.study.execution.store import COLUMNS

@@ -36,10 +36,20 @@ ColumnsOf = Callable[..., Columns]  # the columns of the trials of some points
 class WorstTrial(NamedTuple):
     """One of the worst trials: its number, point and attitude, and what happened in it.
 
-    status : "misidentified" where it is solved with wrong lights
-    tilt_deg, azimuth_deg : of the body's z axis under a dome;  ra_deg, dec_deg : of the boresight under the stars
-    yaw_deg, pitch_deg, roll_deg : the body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
-    lights : in the field;  cross_arcsec, roll_arcsec : its errors, NaN without a solution
+    Attributes
+    ----------
+    status
+        "misidentified" where it is solved with wrong lights
+    tilt_deg, azimuth_deg
+        Of the body's z axis under a dome
+    ra_deg, dec_deg
+        Of the boresight under the stars
+    yaw_deg, pitch_deg, roll_deg
+        The body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
+    lights
+        In the field
+    cross_arcsec, roll_arcsec
+        Its errors, NaN without a solution
     """
 
     trial: int

@@ -58,8 +58,16 @@ LARGEST = 1e9
 class Price(NamedTuple):
     """A line of the table.
 
-    price : of a unit;  fixed : once;  serves : how many LEDs or channels one part serves
-    sigma_m : error of an LED's place along each axis that a survey reaches; nan for other parts
+    Attributes
+    ----------
+    price
+        Of a unit
+    fixed
+        once
+    serves
+        How many LEDs or channels one part serves
+    sigma_m
+        Error of an LED's place along each axis that a survey reaches; nan for other parts
     """
 
     unit: str

@@ -113,7 +113,10 @@ class Recording:
     def motion(self) -> tuple[Floats, Rotation] | None:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
 
-        Raises InputError if a column is missing.
+        Raises
+        ------
+        InputError
+            If a column is missing.
         """
         telemetry = self.table("telemetry")
         if telemetry is None:
@@ -156,7 +159,10 @@ def open_recording(folder: Path) -> Recording:
 def read_truth(path: Path) -> FrameTruth:
     """Read the truth of a frame.
 
-    Raises InputError (one line) for a file that is not a truth file or that an older skysim wrote.
+    Raises
+    ------
+    InputError
+        (one line) for a file that is not a truth file or that an older skysim wrote.
     """
     sources = files.read_table(path)
     counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}

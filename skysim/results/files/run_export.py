@@ -50,15 +50,22 @@ def message(
 ) -> str:
     """The text of an AEM file with one segment of type QUATERNION.
 
-    name     : object name
-    notes    : comments
-    frames   : (A, B), keys of MEANING
-    utc      : K epochs, ascending
-    a_from_b : K rotations
-
     The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
     quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
     X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
+
+    Parameters
+    ----------
+    name
+        Object name
+    notes
+        comments
+    frames
+        (A, B), keys of MEANING
+    utc
+        K epochs, ascending
+    a_from_b
+        K rotations
     """
     if not utc:
         raise InputError(name, "no attitude to write")
@@ -335,7 +342,10 @@ def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
 def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """Write frames.zarr (Zarr 3): frames in chunks of one, with times, exposures, attitudes and rates.
 
-    Raises InputError if zarr is not installed or the frames differ in size or type.
+    Raises
+    ------
+    InputError
+        If zarr is not installed or the frames differ in size or type.
     """
     try:
         import zarr
@@ -472,7 +482,10 @@ EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
 def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
     """Write a run in each of the formats and return the paths.
 
-    Raises InputError for an unknown format before anything is written.
+    Raises
+    ------
+    InputError
+        For an unknown format before anything is written.
     """
     names = list(dict.fromkeys(formats))
     for name in names:

@@ -166,7 +166,12 @@ MARK_M = 4e-3  # size of an LED's mark on the mesh
 class Dome(NamedTuple):
     """What the builder makes: the surface to the cap's rim, and LEDs by number (N,) at (N, 3) places.
 
-    name : of the scene;  led_radius_m : of an LED's disk
+    Attributes
+    ----------
+    name
+        Of the scene
+    led_radius_m
+        Of an LED's disk
     """
 
     name: str

@@ -57,10 +57,19 @@ class Check(NamedTuple):
 def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
     """Check the plan of a lab whose motion need not be simulated.
 
-    tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
-    rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames
+    Parameters
+    ----------
+    tilt_deg
+        Greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of
+        a study)
+    rate_body_rad_s
+        (3,) rate of all frames in body axes, in place of the motion's, for trials of single
+        frames
 
-    Raises InputError for unreadable files, and for a maneuver that a run would refuse.
+    Raises
+    ------
+    InputError
+        For unreadable files, and for a maneuver that a run would refuse.
     """
     scene = lab.scene
     first = [

@@ -31,8 +31,14 @@ MAX_PULSES = 500  # in an exposure; with more the mean time of the light does no
 class Context(NamedTuple):
     """What all checks share: the lab, the tracker's settings and beliefs, the camera, and the dome's surface.
 
-    known_id, known_row : (N,) ascending numbers of the lights that the tracker knows, and their rows in its beliefs
-    timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
+    Attributes
+    ----------
+    known_id, known_row
+        (N,) ascending numbers of the lights that the tracker knows, and their rows in its
+        beliefs
+    timing_s
+        (N,) standard deviation of the mean time of each light that the tracker knows within an
+        exposure
     """
 
     lab: Lab

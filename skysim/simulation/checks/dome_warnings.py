@@ -167,8 +167,14 @@ def compared(
 ) -> tuple[Ambiguity, float]:
     """The most similar other field of each field within the greatest tilt, and what coincides, m.
 
-    least : fraction below which none is sought;  most_work : fields compared, those at the least tilts, times LEDs in
     a field
+
+    Parameters
+    ----------
+    least
+        Fraction below which none is sought
+    most_work
+        Fields compared, those at the least tilts, times LEDs in
     """
     lab = context.lab
     camera = context.camera.optics.camera

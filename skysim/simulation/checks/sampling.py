@@ -24,10 +24,18 @@ from skysim.simulation.lights.light import Beam, Exposure, beam_of
 class Sampled(NamedTuple):
     """Some attitudes, what the camera sees there, and the expected errors.
 
-    known  : the lights on the chip that the tracker knows, also hidden ones
-    seen   : of them those that nothing hides;  used : those that it also detects
-    hidden : how many of them are hidden, by the name of what hides them
-    others : the lights that it detects and does not know, by their names
+    Attributes
+    ----------
+    known
+        The lights on the chip that the tracker knows, also hidden ones
+    seen
+        Of them those that nothing hides
+    used
+        Those that it also detects
+    hidden
+        How many of them are hidden, by the name of what hides them
+    others
+        The lights that it detects and does not know, by their names
     """
 
     attitudes: CheckedAttitudes

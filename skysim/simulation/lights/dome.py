@@ -25,8 +25,12 @@ MAX_RUNS = 4  # whose timing is kept
 class LedTiming(NamedTuple):
     """The LEDs' timing in one run.
 
-    clocks : the controllers' oscillators; None where all light is steady
-    codes  : the LEDs' words and the clock of their bits; None without light.led.code
+    Attributes
+    ----------
+    clocks
+        The controllers' oscillators; None where all light is steady
+    codes
+        The LEDs' words and the clock of their bits; None without light.led.code
     """
 
     clocks: Clocks | None
@@ -37,7 +41,10 @@ class LedTiming(NamedTuple):
 class LedDome(KnownLight):
     """A dome's LEDs: warmed up, moved by the temperature, and lit by their controllers' pulses and codes.
 
-    thermal : what has moved since the survey; None for nothing
+    Attributes
+    ----------
+    thermal
+        What has moved since the survey; None for nothing
     """
 
     config: DomeConfig

@@ -23,8 +23,12 @@ KINDS: dict[str, Callable[[Any, LightPlan], Light]] = {}
 def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]) -> None:
     """Add a kind of light to those of the scene's list `lights`.
 
-    config : the schema of its section, with a literal `kind`
-    build  : makes the light of such a section
+    Parameters
+    ----------
+    config
+        The schema of its section, with a literal `kind`
+    build
+        Makes the light of such a section
     """
     KINDS[add_kind(config)] = build
 

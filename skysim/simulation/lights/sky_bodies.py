@@ -82,7 +82,10 @@ def build_earth(plan: LightPlan) -> Iterator[Light]:
 class Satellites(Light):
     """Satellites that can cross the field, those of the file first.
 
-    elements : of the file; None without one
+    Attributes
+    ----------
+    elements
+        Of the file; None without one
     """
 
     only_adds: ClassVar[bool] = True

@@ -30,7 +30,10 @@ class FixedStars(KnownLight):
 class StarsInOrbit(KnownLight):
     """Stars displaced by the velocity of an orbit, which turns by a degree in 15 s when it is low.
 
-    velocity_m_s : (3,) barycentric velocity for which `sources` are
+    Attributes
+    ----------
+    velocity_m_s
+        (3,) barycentric velocity for which `sources` are
     """
 
     velocity_m_s: Floats

@@ -50,7 +50,10 @@ MAX_DATA_BITS = 20  # 2^20 words are listed at most
 def codebook(config: Code, count: int) -> Words:
     """(count, frames) levels of a scene's code, 0 the lowest; read-only.
 
-    Raises InputError if the kind has not so many words.
+    Raises
+    ------
+    InputError
+        If the kind has not so many words.
     """
     if isinstance(config, BchCodeConfig):
         words = packed(partial(bch, distance=config.distance), count, config.levels)

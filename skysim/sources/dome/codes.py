@@ -35,10 +35,16 @@ FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' error
 class Clocks:
     """The oscillators of C controllers, (C,) each.
 
-    on_s    : tau_0, controller's time at t = 0
-    offset  : y, relative frequency offset at t = 0
-    drift_s : d, change of the relative frequency per second
-    filter_s : (N,) time constants of the LEDs' low-pass filters; None without them
+    Attributes
+    ----------
+    on_s
+        tau_0, controller's time at t = 0
+    offset
+        Y, relative frequency offset at t = 0
+    drift_s
+        D, change of the relative frequency per second
+    filter_s
+        (N,) time constants of the LEDs' low-pass filters; None without them
     """
 
     on_s: Floats
@@ -141,9 +147,14 @@ def hardware_seed(layout: Layout) -> int:
 class LedCodes:
     """The code of a dome's LEDs in one run.
 
-    words  : (N, B) levels, in the order of the dome's LEDs
-    clock  : one oscillator; None if the camera's trigger advances the code
-    seed   : of the run, which draws the bits that fail
+    Attributes
+    ----------
+    words
+        (N, B) levels, in the order of the dome's LEDs
+    clock
+        One oscillator; None if the camera's trigger advances the code
+    seed
+        Of the run, which draws the bits that fail
     """
 
     words: Words

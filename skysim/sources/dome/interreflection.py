@@ -33,7 +33,10 @@ LOBE_SAMPLES = 2049  # of a lobe, at even cosines: within 1e-5 of cos^10
 class Emitters(NamedTuple):
     """N small emitters: places, unit normals, strengths in e- s^-1 sr^-1 along the normals, and their common lobe.
 
-    lobe : (K,) relative intensity at even cosines of the emission angle, from 0 to 1
+    Attributes
+    ----------
+    lobe
+        (K,) relative intensity at even cosines of the emission angle, from 0 to 1
     """
 
     place_m: Floats

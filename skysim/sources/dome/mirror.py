@@ -52,7 +52,12 @@ class Rays(NamedTuple):
 class Image(NamedTuple):
     """K images: rows of their LEDs, directions from the camera, virtual distances, and cosines of the incidence.
 
-    wall_m : (K, 3) where they are mirrored;  along : (K, 3) from there toward the LED
+    Attributes
+    ----------
+    wall_m
+        (K, 3) where they are mirrored
+    along
+        (K, 3) from there toward the LED
     """
 
     led: NDArray[np.int64]
@@ -68,8 +73,14 @@ def mirrored(
 ) -> Sources:
     """The images of the LEDs that the camera sees in the wall; their numbers are in `false_lights.MIRRORED`.
 
-    camera_m : (3,) the entrance pupil;  grid : (h, w, 3) unit vectors that cover the field
     Images closer together than the grid's directions, near a caustic, can be missed. None for a camera outside.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil
+    grid
+        (h, w, 3) unit vectors that cover the field
     """
     if not wall.inside(camera_m):
         return leds.take(np.zeros(0, np.int64))

@@ -27,7 +27,10 @@ SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
 def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, Floats]:
     """Horizontal direction from the lab's x toward its y and zenith angle, rad, and distance, m, (N,) each.
 
-    Raises InputError for an LED at the station.
+    Raises
+    ------
+    InputError
+        For an LED at the station.
     """
     sight_m = place_m - np.array(config.position_m)
     level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
@@ -90,8 +93,12 @@ def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Float
 def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
     """(N, 3) places in the lab that the survey yields for LEDs at place_m.
 
-    own   : (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
-    setup : (8,) of `draw_setup`
+    Parameters
+    ----------
+    own
+        (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
+    setup
+        (8,) of `draw_setup`
     """
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])

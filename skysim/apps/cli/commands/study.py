@@ -290,8 +290,12 @@ def run_and_report(
 ) -> None:
     """Run the missing trials of a study or a search with a progress bar, then report.
 
-    resumed       : the store may hold trials already
-    repeat_failed : repeat the failed trials too
+    Parameters
+    ----------
+    resumed
+        The store may hold trials already
+    repeat_failed
+        Repeat the failed trials too
     """
     from skysim.experiments.study import search
     from skysim.experiments.study.execution import runner, store
@@ -382,11 +386,19 @@ def load_stored_plan(
 ) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
-    program : external trackers of the command line; None if no trial will be run
-    set_    : more overrides
-    grows   : whether the study may have more replicates than its store
+    Parameters
+    ----------
+    program
+        External trackers of the command line; None if no trial will be run
+    set_
+        More overrides
+    grows
+        Whether the study may have more replicates than its store
 
-    Raises InputError if the store holds another study, or this one before it was changed.
+    Raises
+    ------
+    InputError
+        If the store holds another study, or this one before it was changed.
     """
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import study_file

@@ -77,7 +77,10 @@ def json_schema(kind: str) -> dict[str, Any]:
 def relaxed(node: Any, name: str = "") -> Any:
     """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
 
-    name : of the definition that `node` is, for which EXTRA_KEYS may add keys
+    Parameters
+    ----------
+    name
+        Of the definition that `node` is, for which EXTRA_KEYS may add keys
     """
     if isinstance(node, list):
         return [relaxed(item) for item in node]

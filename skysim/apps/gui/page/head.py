@@ -18,7 +18,12 @@ from skysim.core.files import SCENES
 class Head:
     """The elements of the head, and what they do.
 
-    folder : where scenes are saved;  message_text : the message
+    Attributes
+    ----------
+    folder
+        Where scenes are saved
+    message_text
+        The message
     """
 
     def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
@@ -196,7 +201,10 @@ window.skysimSplitter = (() => {
 class Arrangement:
     """The splitters between the frame, the 3-D view and the panels, and the theme.
 
-    charts : that are drawn again in another theme
+    Attributes
+    ----------
+    charts
+        That are drawn again in another theme
     """
 
     def __init__(self, charts: list[ui.echart]) -> None:
@@ -208,7 +216,10 @@ class Arrangement:
     def splitter(kind: str, orientation: str, label: str) -> None:
         """A line that is dragged or moved by arrow keys; a double click or Enter gives the pane its first size.
 
-        kind : side (the column of panels) or space (the 3-D view)
+        Parameters
+        ----------
+        kind
+            Side (the column of panels) or space (the 3-D view)
         """
         line = (
             ui.element("div")

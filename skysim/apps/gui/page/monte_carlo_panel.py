@@ -41,10 +41,22 @@ TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 class MonteCarloPanel:
     """Panel that runs one study at a time.
 
-    out : folder of the studies;  user, tab : the browser and its tab, which are in the names of their folders
-    process : the study;  run_number : of the tab's last Monte Carlo study
-    failed : trials that the page lists, see `StudyResults`
-    stopped : whether the study was stopped and can be continued;  starting : whether its process is being started
+    Attributes
+    ----------
+    out
+        Folder of the studies
+    user, tab
+        The browser and its tab, which are in the names of their folders
+    process
+        The study
+    run_number
+        Of the tab's last Monte Carlo study
+    failed
+        Trials that the page lists, see `StudyResults`
+    stopped
+        Whether the study was stopped and can be continued
+    starting
+        Whether its process is being started
     """
 
     def __init__(self, page: PageContext, out: Path, user: str, tab: str) -> None:
@@ -212,7 +224,10 @@ class MonteCarloPanel:
     def study_file(self) -> Path:
         """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.
 
-        Raises InputError for a wrong number of runs.
+        Raises
+        ------
+        InputError
+            For a wrong number of runs.
         """
         if self.study_select.value:
             return STUDIES / f"{self.study_select.value}.yaml"

@@ -28,7 +28,14 @@ def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
 class PhotoPanel:
     """Panel with upload area, live camera and result text.
 
-    cameras : that it may watch;  live : whether it watches one;  logged : the status that was logged last
+    Attributes
+    ----------
+    cameras
+        That it may watch
+    live
+        Whether it watches one
+    logged
+        The status that was logged last
     """
 
     def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:

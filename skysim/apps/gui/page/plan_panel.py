@@ -46,9 +46,19 @@ UNPLANNED = (
 class PlanPanel:
     """Panel with three parts, each computed at a button's press and cleared when the scene changes.
 
-    scene_3d : in which it colors LEDs;  run_panel : which flies the survey
-    taken : frames of the survey, once they are adjusted;  colored : its LEDs and how well it knows each
-    legends : what the colors of the LEDs in the 3-D view mean, by what has colored them; the last one is shown
+    Attributes
+    ----------
+    scene_3d
+        In which it colors LEDs
+    run_panel
+        Which flies the survey
+    taken
+        Frames of the survey, once they are adjusted
+    colored
+        Its LEDs and how well it knows each
+    legends
+        What the colors of the LEDs in the 3-D view mean, by what has colored them; the last one
+        is shown
     """
 
     def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:

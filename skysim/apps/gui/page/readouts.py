@@ -22,8 +22,12 @@ ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field =
 class AttitudeCard:
     """True and estimated angles with the error, and the algorithms of the tracker's four stages.
 
-    contents : of the tab's live fields
-    shows_photo : whether the card shows an image that is not of the current scene
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    shows_photo
+        Whether the card shows an image that is not of the current scene
     """
 
     def __init__(self, page: PageContext, contents: Contents) -> None:
@@ -183,7 +187,11 @@ def rows(
 ) -> Iterator[dict[str, Any]]:
     """Rows of the table: every true light with its detection, the brightest first, then detections of no light.
 
-    state : good if the light was identified, warn if a detection is false or taken for another light, else quiet
+    Returns
+    -------
+    state
+        Good if the light was identified, warn if a detection is false or taken for another
+        light, else quiet
     """
     found = list(detections)
     found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)

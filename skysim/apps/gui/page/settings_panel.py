@@ -45,10 +45,20 @@ MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of th
 class KeyForm:
     """Form with one expandable part per group of keys; values that differ from the file are marked.
 
-    label  : of a field, from its key;  opens : the group that is open at first
-    scene, fields : the scene whose fields are shown, and these by key
-    last_typed : by key the last typed value, accepted or refused
-    rows, labels, inputs : by key its elements;  expansions : by group
+    Attributes
+    ----------
+    label
+        Of a field, from its key
+    opens
+        The group that is open at first
+    scene, fields
+        The scene whose fields are shown, and these by key
+    last_typed
+        By key the last typed value, accepted or refused
+    rows, labels, inputs
+        By key its elements
+    expansions
+        By group
     """
 
     def __init__(
@@ -178,8 +188,14 @@ class KeyForm:
 class ScenePanel:
     """The form, one part per section of the scene, a field that finds keys, and a button that saves a new scene file.
 
-    folder : of the saved scenes;  saved : called when one is there
-    shown : scene and overrides in the form
+    Attributes
+    ----------
+    folder
+        Of the saved scenes
+    saved
+        Called when one is there
+    shown
+        Scene and overrides in the form
     """
 
     def __init__(self, page: PageContext, folder: Path, saved: Callable[[], None]) -> None:
@@ -266,8 +282,12 @@ class TrackerPanel:
 
     A form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights.
 
-    study : the panel of that simulation
-    shown : scene and overrides in the form
+    Attributes
+    ----------
+    study
+        The panel of that simulation
+    shown
+        Scene and overrides in the form
     """
 
     def __init__(self, page: PageContext, study: MonteCarloPanel) -> None:

@@ -67,7 +67,10 @@ class StripCurve:
 class Strip:
     """One chart with its unit in the title.
 
-    dots : of lights, drawn by strips.js: time, value, and the light's number
+    Attributes
+    ----------
+    dots
+        Of lights, drawn by strips.js: time, value, and the light's number
     """
 
     title: str
@@ -148,7 +151,12 @@ def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
 class StripChart:
     """The chart; a click on a strip emits the page's event `moment` with the time there.
 
-    contents : of the tab's live fields;  strips : that are drawn
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    strips
+        That are drawn
     """
 
     def __init__(self, contents: Contents) -> None:

@@ -44,13 +44,26 @@ PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "
 class Tab:
     """One tab: its worker, its scene, and its page elements. It is the `PageContext` of its parts.
 
-    session : its worker, set when it has got one
-    new_session : gives another worker, None if there are too many
-    folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
-    user : its browser, see `server.user_of`
-    state, scene_info, view, is_open : see `Shown`
-    contents : of the fields that change with every frame
-    editing, filling : held while the scene is changed, or a form of its keys is filled
+    Attributes
+    ----------
+    session
+        Its worker, set when it has got one
+    new_session
+        Gives another worker, None if there are too many
+    folder
+        Where scenes are saved
+    out
+        Where studies are
+    cameras
+        Live ones that it may watch
+    user
+        Its browser, see `server.user_of`
+    state, scene_info, view, is_open
+        See `Shown`
+    contents
+        Of the fields that change with every frame
+    editing, filling
+        Held while the scene is changed, or a form of its keys is filled
     """
 
     session: Session
@@ -393,7 +406,10 @@ class Tab:
     def show_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
 
-        state : see `show_frame`
+        Parameters
+        ----------
+        state
+            See `show_frame`
         """
         self.set_state(**state)
         self.attitude.show_photo(photo)

@@ -88,11 +88,22 @@ ONE_KIND = ("light",)
 class FormField(NamedTuple):
     """One key of a scene.
 
-    key   : dotted;  text: its value as YAML, from the file, or else the default
-    unit  : of a bare number;  allowed_values: those of an enumeration
-    is_set: whether a file or an override sets it
-    meaning   : what `null` stands for, if that is one of the allowed values
-    no_effect : why the key does nothing in this scene; empty if it does something
+    Attributes
+    ----------
+    key
+        dotted
+    text
+        Its value as YAML, from the file, or else the default
+    unit
+        Of a bare number
+    allowed_values
+        Those of an enumeration
+    is_set
+        Whether a file or an override sets it
+    meaning
+        What `null` stands for, if that is one of the allowed values
+    no_effect
+        Why the key does nothing in this scene; empty if it does something
     """
 
     key: str
@@ -141,7 +152,10 @@ def section_fields(
 ) -> Iterator[FormField]:
     """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
 
-    kinds : that the section could have instead of its own
+    Parameters
+    ----------
+    kinds
+        That the section could have instead of its own
     """
     for name, info in type(model).model_fields.items():
         file_key = info.alias or SI_SUFFIX.sub("", name)
@@ -351,7 +365,9 @@ FEEDBACKS = {
 def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
     """Override by which a scene's horizontal field of view becomes another: f = width / (2 tan(field / 2)).
 
-    Raises InputError.
+    Raises
+    ------
+    InputError
     """
     if not 0.5 <= field_deg <= 120:
         raise InputError("field", "", "0.5 to 120 deg")

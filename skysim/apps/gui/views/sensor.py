@@ -59,9 +59,18 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
 class SensorView:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
-    hover_px : place of the light under the mouse, or None
-    sent_number : of the last frame sent to the browser;  frames : the newest ones
+    Attributes
+    ----------
+    id, contents
+        Of the tab, and its live fields
+    source
+        Of pixels, set when the tab has got a worker
+    hover_px
+        Place of the light under the mouse, or None
+    sent_number
+        Of the last frame sent to the browser
+    frames
+        The newest ones
     """
 
     source: Source

@@ -152,7 +152,10 @@ RANGES = {  # degrees
 def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
-    Raises InputError for an angle out of range, or a tilt beyond the vehicle's stop.
+    Raises
+    ------
+    InputError
+        For an angle out of range, or a tilt beyond the vehicle's stop.
     """
     for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
         low, high = RANGES[name]
@@ -211,9 +214,15 @@ class Grip(NamedTuple):
 class Push:
     """The motion of a lab's vehicle from rest at an attitude, as long as the user lets it go on.
 
-    simulation    : with gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and controller
-    lab_from_body : the present attitude
-    torque_nm     : (3,) of the grip in the last period, body axes
+    Attributes
+    ----------
+    simulation
+        With gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and
+        controller
+    lab_from_body
+        The present attitude
+    torque_nm
+        (3,) of the grip in the last period, body axes
     """
 
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:

@@ -48,10 +48,18 @@ from skysim.results import plots, scoring
 class Photo:
     """An image that is not of the current scene, and its solution.
 
-    pixels, saturation_dn, pose : see `FrameView`;  lens : of the pose; both are None if the image was not solved
-    names, true_deg : of its three angles, and their true values if known
-    lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
-    hint : of a refused file the likely cause, of a solved one what was assumed
+    Attributes
+    ----------
+    pixels, saturation_dn, pose
+        See `FrameView`
+    lens
+        Of the pose; both are None if the image was not solved
+    names, true_deg
+        Of its three angles, and their true values if known
+    lights, prefix
+        True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
+    hint
+        Of a refused file the likely cause, of a solved one what was assumed
     """
 
     size_px: tuple[int, int]

@@ -36,7 +36,10 @@ LOUPE_PX = 11  # most rows and columns in the loupe
 class PixelLevels(NamedTuple):
     """An image as unsigned integers n: pixel = offset + step n.
 
-    integers : (H, W), of 8 or 16 bits
+    Attributes
+    ----------
+    integers
+        (H, W), of 8 or 16 bits
     """
 
     integers: NDArray
@@ -78,7 +81,12 @@ def pixels_for(
     """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
     columns than the image.
 
-    saturation_dn : from which a pixel is saturated;  number : of the image in its worker
+    Parameters
+    ----------
+    saturation_dn
+        From which a pixel is saturated
+    number
+        Of the image in its worker
     """
     integers = levels.integers
     (height, width) = levels.integers.shape
@@ -212,7 +220,12 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     """Counts of a sample of the pixels, in BINS of an axis that is an inverse hyperbolic sine about the sky, in units
     of its scatter: linear there, logarithmic for stars.
 
-    sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
+    Returns
+    -------
+    sky, scatter
+        Of the axis
+    range
+        Least and greatest value of all pixels, over which it reaches
     """
     sample = integers[:: 2 * plots.SAMPLE_STRIDE, :: plots.SAMPLE_STRIDE].astype(float)
     low = float(integers.min())

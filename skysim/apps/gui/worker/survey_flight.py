@@ -45,9 +45,16 @@ UNCERTAINTY = survey_prior.survey_uncertainty()  # that `skysim survey` assumes
 class Survey:
     """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
 
-    lab, before : with the errors of the onboard model before the survey, and this model
-    noise_px : standard deviation of a centroid's coordinates, by which attitudes are chosen
-    taken : the frames that were flown;  run : the newest adjustment that succeeded
+    Attributes
+    ----------
+    lab, before
+        With the errors of the onboard model before the survey, and this model
+    noise_px
+        Standard deviation of a centroid's coordinates, by which attitudes are chosen
+    taken
+        The frames that were flown
+    run
+        The newest adjustment that succeeded
     """
 
     scene: Scene
@@ -67,9 +74,15 @@ class Survey:
     def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
 
-        views : the frames of the flight so far, in order
+        Parameters
+        ----------
+        views
+            The frames of the flight so far, in order
 
-        Raises InputError if the flight has no further frames; the survey is then as before.
+        Raises
+        ------
+        InputError
+            If the flight has no further frames; the survey is then as before.
         """
         allow(count)
         new, missed = self.new_frames(flight, views)
@@ -115,7 +128,10 @@ class Survey:
     ) -> tuple[list[TakenFrame], int]:
         """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
 
-        Raises InputError if there are none, or the survey has them already.
+        Raises
+        ------
+        InputError
+            If there are none, or the survey has them already.
         """
         rows, holds = frames_at_rest(flight, views)
         if not rows:

@@ -38,11 +38,22 @@ KEPT_IMAGES = 3  # the page may still show one before the newest
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    display : of the browser, for which frames are made, as far as it is known
-    shown : the newest images for the page by number, and from where each is saturated;  number : of the last one
-    pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
-    surveyed : the survey of the scene's dome, if one was planned
-    other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
+    Attributes
+    ----------
+    display
+        Of the browser, for which frames are made, as far as it is known
+    shown
+        The newest images for the page by number, and from where each is saturated
+    number
+        Of the last one
+    pushed
+        The motion of the pushed vehicle, as long as the workbench has its attitude
+    surveyed
+        The survey of the scene's dome, if one was planned
+    other, image
+        An image that is not of the scene, and its (H, W) pixels
+    camera
+        An open live camera
     """
 
     current: Workbench | None = None

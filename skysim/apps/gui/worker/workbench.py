@@ -50,9 +50,16 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    lens : where its camera's pixels point;  geometry : of the laboratory
-    rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
-    magnitude : V magnitude by a light's number
+    Attributes
+    ----------
+    lens
+        Where its camera's pixels point
+    geometry
+        Of the laboratory
+    rendered_count
+        Number of frames rendered; it changes the seed, so that each frame has independent noise
+    magnitude
+        V magnitude by a light's number
     """
 
     scene: Scene
@@ -74,7 +81,9 @@ class Workbench:
         """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
         kept; if tracker or camera, its attitude.
 
-        Raises InputError.
+        Raises
+        ------
+        InputError
         """
         scene = load(name, overrides)
         if before and before.scene == scene:

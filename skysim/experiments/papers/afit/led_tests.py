@@ -125,7 +125,10 @@ def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Lab:
 def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Lab:
     """The last board under the dome: white LEDs lit one after another, each for its pulse within its slot.
 
-    saturation_fraction : a pixel saturates at this fraction of the converter's range
+    Parameters
+    ----------
+    saturation_fraction
+        A pixel saturates at this fraction of the converter's range
     """
     levels = [pulse * 1e-6 / SLOT_S for pulse in pulses_us]
     scene = board_scene(levels, DOME_IN, LensSettings(8.0, DOME_IN), intensity_cd=WHITE_CD)

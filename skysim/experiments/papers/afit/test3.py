@@ -139,8 +139,14 @@ def photograph(
 class Measurements:
     """F images of all five LEDs as the thesis measures them (eqs 43-45).
 
-    position : (F,) of the vehicle, from 0;  magnitude : (F, 5)
-    body_m, lab_m : (F, 5, 3) LED positions in body axes, and rotated to the lab frame by the IMU's attitude
+    Attributes
+    ----------
+    position
+        (F,) of the vehicle, from 0
+    magnitude
+        (F, 5)
+    body_m, lab_m
+        (F, 5, 3) LED positions in body axes, and rotated to the lab frame by the IMU's attitude
     """
 
     position: Ints
@@ -316,7 +322,11 @@ def stratified_bootstrap(
     """A statistic of (F, ...) values of the images, with a bootstrap interval stratified by position.
 
     Images are resampled within each position only, because the differences between positions are systematic.
-    statistic : of (..., F, K) values to (...), over the last two axes
+
+    Parameters
+    ----------
+    statistic
+        Of (..., F, K) values to (...), over the last two axes
     """
     position = measurements.position
     rows = np.arange(len(values))

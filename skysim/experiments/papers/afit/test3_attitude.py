@@ -81,8 +81,14 @@ CAUSE = f"a bump of {FITTED_BUMP} deg/s, gyros saturated at 10"
 class BumpRun(NamedTuple):
     """A simulated motion of `simsat_bump`.
 
-    t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
-    saturated_s : how long a gyro was saturated;  tracker_error_deg : the star tracker's worst error after the bump
+    Attributes
+    ----------
+    t_s, imu_deg, filter_deg
+        (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
+    saturated_s
+        How long a gyro was saturated
+    tracker_error_deg
+        The star tracker's worst error after the bump
     """
 
     t_s: Floats
@@ -210,8 +216,12 @@ CAUSE_BUMP = f"{CAUSE_IMU}, position 5 bumped"
 class AlgorithmErrors(NamedTuple):
     """D sets of five images, one per position; the catalog is from the home position's image.
 
-    error_deg: (D, 5, 3) roll, pitch, yaw by the algorithm minus the true ones
-    named    : number of images with all LEDs identified correctly, and number of images
+    Attributes
+    ----------
+    error_deg
+        (D, 5, 3) roll, pitch, yaw by the algorithm minus the true ones
+    named
+        Number of images with all LEDs identified correctly, and number of images
     """
 
     error_deg: Floats
@@ -221,10 +231,16 @@ class AlgorithmErrors(NamedTuple):
 class AllCauses(NamedTuple):
     """Results with all causes simulated together.
 
-    error_deg: (K, 5, 3) attitude by the algorithm minus that of the IMU
-    images : number of independent draws for positions 1 to 4 (the fewer of images and IMUs)
-    bumps : number of independent draws for position 5 (the fewest of images, IMUs and bumps)
-    earth_deg : (5, 3) what an uncorrected Earth rate in the IMU would add
+    Attributes
+    ----------
+    error_deg
+        (K, 5, 3) attitude by the algorithm minus that of the IMU
+    images
+        Number of independent draws for positions 1 to 4 (the fewer of images and IMUs)
+    bumps
+        Number of independent draws for position 5 (the fewest of images, IMUs and bumps)
+    earth_deg
+        (5, 3) what an uncorrected Earth rate in the IMU would add
     """
 
     error_deg: Floats
@@ -271,7 +287,10 @@ def with_draws(
 ) -> RowResult:
     """Prediction intervals of clean values, and of those with the causes, which have fewer independent `draws`.
 
-    with_earth : the value if the IMU also contained the Earth rate, for the note
+    Parameters
+    ----------
+    with_earth
+        The value if the IMU also contained the Earth rate, for the note
     """
     note = "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
     return RowResult(
@@ -335,7 +354,10 @@ def algorithm_errors(
 ) -> AlgorithmErrors:
     """The thesis's processing: eqs 43-44, SAA with Table 9's epsilons, QUEST with the `lights` brightest LEDs.
 
-    images : number of images per position
+    Parameters
+    ----------
+    images
+        Number of images per position
     """
     sightings = [
         photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)
@@ -382,7 +404,11 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     """(U, 5, 3) error of U random IMUs at the end of each stay: roll, pitch, yaw in degrees.
 
     The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
-    earth : measure the Earth rate and do not correct for it
+
+    Parameters
+    ----------
+    earth
+        Measure the Earth rate and do not correct for it
     """
     lab = build_lab(loader.load("afit_test3_ideal", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
     config = lab.scene.vehicle.imu

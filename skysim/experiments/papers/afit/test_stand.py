@@ -94,7 +94,10 @@ def measure_frame(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -
 def light_positions_m(lab: Lab, xy_px: Floats, camera: Camera | None = None) -> Floats:
     """(N, 3) positions of lights in body axes, by eqs 43-44 and the camera's lever arm.
 
-    camera : camera model to use; the tracker's own if left out
+    Parameters
+    ----------
+    camera
+        Camera model to use; the tracker's own if left out
     """
     assert isinstance(lab.scene.light, DomeConfig)
     leds = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)

@@ -39,7 +39,14 @@ FLUX_NOISE = (
 class VisibleSources(NamedTuple):
     """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
-    rows : (N,) in `lab.camera.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
+    Attributes
+    ----------
+    rows
+        (N,) in `lab.camera.sources`
+    xy_px
+        (N, 2)
+    electrons
+        (N,) photo-electrons of an exposure
     """
 
     rows: NDArray[np.int64]

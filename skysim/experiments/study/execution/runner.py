@@ -50,7 +50,14 @@ MAX_CHUNK = 5000  # maximum number of trials in a chunk
 class Progress:
     """Progress of a run.
 
-    trials : total;  done : in the store, of which failed and wrong;  now : done by this run since `began`
+    Attributes
+    ----------
+    trials
+        total
+    done
+        In the store, of which failed and wrong
+    now
+        Done by this run since `began`
     """
 
     trials: int
@@ -81,7 +88,12 @@ class ChunkQueue:
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
-    missing : (M,) trial numbers, ascending;  spec : of the trials, if their hardware is drawn
+    Attributes
+    ----------
+    missing
+        (M,) trial numbers, ascending
+    spec
+        Of the trials, if their hardware is drawn
     """
 
     def __init__(
@@ -145,10 +157,18 @@ def prepare_store(
 
     The store may be of the same study with fewer replicates: its trials are kept, and numbered anew.
 
-    resume    : whether to continue a store that already has trials
-    overrides : study keys from the command line, saved in the store
+    Parameters
+    ----------
+    resume
+        Whether to continue a store that already has trials
+    overrides
+        Study keys from the command line, saved in the store
 
-    Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
+    Raises
+    ------
+    InputError
+        If the store holds another study or rows of another code version, or if `resume` does
+        not fit.
     """
     stored = store.meta("digest")
     done = store.counts()["done"]

@@ -54,7 +54,11 @@ def setup_key(spec: TrialSpec, settings: Settings) -> str:
 def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialSetup:
     """The setup of a design point, from the cache if it is there. Raises InputError.
 
-    key : its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the key
+    Parameters
+    ----------
+    key
+        Its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the
+        key
     """
     key = key or setup_key(spec, settings)
     cached = CACHE.setups

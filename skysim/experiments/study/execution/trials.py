@@ -75,8 +75,13 @@ REFUSED = "refused"  # in place of the hash of a scene that cannot be built
 class Row(NamedTuple):
     """One trial as stored.
 
-    scene : its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker died
-    error : an InputError's line, or the traceback of another exception
+    Attributes
+    ----------
+    scene
+        Its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker
+        died
+    error
+        An InputError's line, or the traceback of another exception
     """
 
     trial: int
@@ -153,7 +158,11 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """Run the trials of a segment together.
 
     If one of them raises an exception, each runs by itself, and the row of that one stores it.
-    key : `setup_key` of the segment, if it is known
+
+    Parameters
+    ----------
+    key
+        `setup_key` of the segment, if it is known
     """
     numbers = list(enumerate(segment.replicates, segment.first))
     seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
@@ -371,7 +380,10 @@ def render_trial_frame(
 ) -> tuple[Frame, Truth, tuple[float, float] | None]:
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center.
 
-    added : gets the masks of smear and particles
+    Parameters
+    ----------
+    added
+        Gets the masks of smear and particles
     """
     moving = moving_camera(setup, seed)
     return *moving.render(tracked_frames(setup), added), moving.streak_px

@@ -471,7 +471,10 @@ def pareto_png(
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 
-    also : fronts of other searches with the same objectives, (K, 2) by label
+    Parameters
+    ----------
+    also
+        Fronts of other searches with the same objectives, (K, 2) by label
     """
     from matplotlib.patheffects import withStroke
 

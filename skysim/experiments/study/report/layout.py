@@ -50,7 +50,12 @@ FAR_RATIO = (
 class Series(NamedTuple):
     """A line of a curve: its label and (N,) x, values and interval bounds, ascending in x.
 
-    values : number of trials with a value;  few : whether they are few of the point's trials (`has_few_values`)
+    Attributes
+    ----------
+    values
+        Number of trials with a value
+    few
+        Whether they are few of the point's trials (`has_few_values`)
     """
 
     label: str
@@ -65,7 +70,12 @@ class Series(NamedTuple):
 class Grid(NamedTuple):
     """A heat map: its axes and (Y, X) values, NaN where there is no value.
 
-    values : (Y, X) number of trials with a value;  few : whether they are few of the point's trials (`has_few_values`)
+    Attributes
+    ----------
+    values
+        (Y, X) number of trials with a value
+    few
+        Whether they are few of the point's trials (`has_few_values`)
     """
 
     x: Axis

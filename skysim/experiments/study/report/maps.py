@@ -38,7 +38,12 @@ LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
 class MapCell(NamedTuple):
     """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
 
-    value : the response, NaN without values;  values : number of trials with a value
+    Attributes
+    ----------
+    value
+        The response, NaN without values
+    values
+        Number of trials with a value
     """
 
     low_deg: float
@@ -212,7 +217,10 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
 
         x = 2 sqrt(2) cos(dec) sin(l / 2) / d,    y = sqrt(2) sin(dec) / d,    d = sqrt(1 + cos(dec) cos(l / 2)).
 
-    around_deg : azimuth, or RA from 180 to 540
+    Parameters
+    ----------
+    around_deg
+        Azimuth, or RA from 180 to 540
     """
     around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
     if not sky:

@@ -32,10 +32,17 @@ MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
 class Overview(NamedTuple):
     """What a report begins with.
 
-    rows     : names and texts of the scene table, for the first level of every factor
-    findings : of the checks, each with the levels at which it was found; at the rates of the study's trials
-    may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
-    fixed    : seeds of hardware that all trials share, see `loader.fixed_seeds`
+    Attributes
+    ----------
+    rows
+        Names and texts of the scene table, for the first level of every factor
+    findings
+        Of the checks, each with the levels at which it was found; at the rates of the study's
+        trials
+    may_be_ambiguous
+        Whether the tracker can refuse a frame as ambiguous
+    fixed
+        Seeds of hardware that all trials share, see `loader.fixed_seeds`
     """
 
     rows: list[tuple[str, str]]
@@ -91,7 +98,10 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
     """The name of a checked point, with its number of LEDs where a study's points differ in it.
 
-    leds : of each checked point under a dome
+    Parameters
+    ----------
+    leds
+        Of each checked point under a dome
     """
     return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
 

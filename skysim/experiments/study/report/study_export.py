@@ -65,7 +65,10 @@ def texts(column: NDArray[Any]) -> list[Any]:
 def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write one row per trial, missing values null; title, code version and study file are in the file's metadata.
 
-    Raises InputError if pyarrow is not installed.
+    Raises
+    ------
+    InputError
+        If pyarrow is not installed.
     """
     try:
         import pyarrow.parquet

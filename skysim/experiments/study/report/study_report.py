@@ -62,10 +62,20 @@ SOBOL = (
 class Analysis(NamedTuple):
     """What is known of a study's trials.
 
-    lines    : of all points, with the responses of `responses` and those of the answers
-    about    : scene table and findings of its checks
-    headline : answers in words;  ranges : of each response, in words
-    indices  : Sobol indices, of design saltelli;  result : candidates and front, of a search
+    Attributes
+    ----------
+    lines
+        Of all points, with the responses of `responses` and those of the answers
+    about
+        Scene table and findings of its checks
+    headline
+        Answers in words
+    ranges
+        Of each response, in words
+    indices
+        Sobol indices, of design saltelli
+    result
+        Candidates and front, of a search
     """
 
     lines: Sequence[PointRow]
@@ -84,7 +94,10 @@ class Analysis(NamedTuple):
 def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
     """The report of a study. study, out : as `commands` takes them
 
-    Raises InputError if `where` of a figure names an unknown factor or level.
+    Raises
+    ------
+    InputError
+        If `where` of a figure names an unknown factor or level.
     """
     command = commands(plan, store, study, out)
     return compose(plan.study, store, analyze(plan, store, command), command)
@@ -95,7 +108,10 @@ def commands(
 ) -> Callable[[str], str]:
     """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
 
-    study, out : what the command names; by default the study's name or path, and the store's folder
+    Parameters
+    ----------
+    study, out
+        What the command names; by default the study's name or path, and the store's folder
     """
     if not study:
         study = plan.name if plan.path.parent == STUDIES else str(plan.path)

@@ -34,10 +34,18 @@ Ints = NDArray[np.int64]
 class PlacedLeds:
     """LED positions before drive and brightness are assigned.
 
-    id        : (N,) LED numbers
-    place_m   : (N, 3) in the lab;  normal : (N, 3) unit
-    level     : (N,) fraction of full brightness, 0 < level <= 1
-    magnitude : (N,) of the star that the LED represents; NaN if it represents none
+    Attributes
+    ----------
+    id
+        (N,) LED numbers
+    place_m
+        (N, 3) in the lab
+    normal
+        (N, 3) unit
+    level
+        (N,) fraction of full brightness, 0 < level <= 1
+    magnitude
+        (N,) of the star that the LED represents; NaN if it represents none
     """
 
     id: Ints

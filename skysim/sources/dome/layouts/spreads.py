@@ -134,7 +134,10 @@ def optimized_places(
 ) -> tuple[Floats, Mapping[str, Any]]:
     """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
 
-    sites, spirals : (K, 3) points, m, as bytes, because arrays have no hash
+    Parameters
+    ----------
+    sites, spirals
+        (K, 3) points, m, as bytes, because arrays have no hash
     """
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]

@@ -39,9 +39,14 @@ GLUE_M = 0.3  # of tape over which its sideways error is the same, assumed
 class Meridian(NamedTuple):
     """The surface's mean meridian from the apex to the cap's rim, (K,) each.
 
-    tilt_rad : from the zenith, seen from the bearing
-    arc_m    : length along the surface from the apex, mean of the meridians
-    ring_m   : circumference of the circle of this tilt over 2 pi
+    Attributes
+    ----------
+    tilt_rad
+        From the zenith, seen from the bearing
+    arc_m
+        Length along the surface from the apex, mean of the meridians
+    ring_m
+        Circumference of the circle of this tilt over 2 pi
     """
 
     tilt_rad: Floats
