@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
 OPTIMIZE, AMBIGUITY = (
-    interpreted(f"skysim.sources.dome.placement.{name}") for name in ("optimize", "ambiguity")
+    interpreted(f"skysim.sources.dome.layouts.{name}") for name in ("optimize", "ambiguity")
 )
 
 

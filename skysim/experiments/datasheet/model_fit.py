@@ -297,7 +297,7 @@ HERE = Path(__file__).parent
 def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
     """Write the module and its constants to a folder; return their paths."""
     paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
-    write_text(paths[0], (HERE / "errors.py").read_text(encoding="utf-8"))
+    write_text(paths[0], (HERE / "error_model.py").read_text(encoding="utf-8"))
     write_text(paths[1], to_json(constants))
     return paths
 

@@ -125,7 +125,7 @@ def to_dxf(drawing: Drawing) -> str:
 
 def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
     """The group codes and values of a shape; a dashed line is on a layer of its own."""
-    kind = type(shape).__name__.upper()
+    kind = "CIRCLE" if isinstance(shape, Circle) else "TEXT"
     layer = (8, shape.layer)
     if isinstance(shape, Polyline):
         layer = (8, "HELP" if shape.dashed else shape.layer)

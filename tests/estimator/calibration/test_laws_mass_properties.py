@@ -157,7 +157,10 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
 def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
     rng: np.random.Generator, at: int
 ) -> None:
-    """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e."""
+    """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e.
+
+    To 4 %: Gauss and Newton leave out the curvature times the residuals, at errors of any size.
+    """
     assumed, vehicle = prior(SMALL, rng)
     error = 2e-5 * rng.standard_normal(3)
     systematic = np.zeros((len(RECORD.t_s), 3, 3))
@@ -178,7 +181,7 @@ def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
     change = (after.values - before.values) / before.sigma
     added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
     np.testing.assert_allclose(
-        added, np.outer(change, change), rtol=0.05, atol=0.02 * change @ change
+        added, np.outer(change, change), rtol=0.05, atol=0.04 * change @ change
     )
 
 

@@ -24,14 +24,13 @@ from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.solver_options import Options
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
-PYRAMID, SHEFEX, FIALHO, SAA, SEARCH, DIRECT = (
+PYRAMID, SHEFEX, FIALHO, SAA, DIRECT = (
     interpreted(f"estimator.identification.{name}")
     for name in (
         "published.pyramid",
         "published.shefex",
         "published.fialho",
         "published.saa",
-        "published.saa_search",
         "direct_match",
     )
 )
@@ -513,7 +512,7 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
         nearby = np.empty(302, np.int64)
         partner = np.empty(3, np.int64)
         cost = np.empty(3)
-        SEARCH._partners(stars, primary, 0, 1, nearby, partner, cost)
+        SAA._partners(stars, primary, 0, 1, nearby, partner, cost)
         for k, n in enumerate((1, 3, 4)):
             distance = np.linalg.norm(
                 index.vectors - seen[n], axis=1
@@ -537,7 +536,7 @@ def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
     for costs, kept in (([1.0, 2.0], 0), ([2.0, 1.0], 2)):
         partner = np.array([7, 3, 7, -1])
         cost = np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
-        assert SEARCH._remove_duplicates(partner, cost) == 2
+        assert SAA._remove_duplicates(partner, cost) == 2
         assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
         assert cost[2 - kept] == UNMATCHED_COST
         assert cost[kept] == 1
