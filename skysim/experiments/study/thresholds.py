@@ -284,3 +284,41 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     if math.isinf(found.high):
         return f"{100 * metrics.CONFIDENCE:g} %: above {low}{needs}"
     return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"
+
+
+def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
+    """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
+    axis = table.axis(study, lines, threshold.along)
+    unit = table.unit_of(axis)
+    found = [
+        (f" ({label})" if label else "", one)
+        for label, one in crossings(threshold, study, lines).items()
+        if one is not None
+    ]
+    if not found:
+        return ""
+    limit = f"{100 * threshold.limit:g} %"
+    at = [
+        f"{one.between[0]:.4g} to {one.between[1]:.4g}{unit}{label}"
+        if one.between
+        else f"{one.value:.4g}{unit}{label}"
+        for label, one in found
+        if math.isfinite(one.value)
+    ]
+    always = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) != one.rising
+    ]
+    never = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) == one.rising
+    ]
+    parts = []
+    if at:
+        crosses = "reaches" if any(one.rising for _, one in found) else "falls below"
+        parts.append(
+            f"{threshold.response} {crosses} {limit} at {threshold.along} = {', '.join(at)}"
+        )
+    for labels, text in ((always, f"at least {limit}"), (never, f"below {limit}")):
+        if labels:
+            subject = "" if parts else f"{threshold.response} is "
+            parts.append(f"{subject}{text} at all levels{','.join(labels)}")
+    return "; ".join(parts) + "." if parts else ""
