@@ -102,7 +102,7 @@ test-lowest:
 # on by mutation alone, and says so.
 FUZZ_S ?= 60
 fuzz: fuzzer
-	$(BIN)/python -m fuzz $(FUZZ_S)
+	$(BIN)/python -m tests.fuzz $(FUZZ_S)
 
 fuzzer: $(READY)
 	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'

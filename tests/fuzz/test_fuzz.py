@@ -21,8 +21,6 @@ from hypothesis import strategies as some
 from PIL import Image
 
 from benchmarks.hostilefiles import promise
-from fuzz.__main__ import NAMES, TOKENS, mutate, seeds
-from fuzz.targets import TARGETS, rejects
 from skysim.camera.psf.otf import read_cells
 from skysim.core.errors import InputError
 from skysim.core.io import decoding, encoded, images, yaml_reader
@@ -30,6 +28,8 @@ from skysim.scene import loader
 from skysim.sources import photometry
 from skysim.sources.dome.layouts import listed
 from skysim.sources.dome.shell import point_cloud
+from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
+from tests.fuzz.targets import TARGETS, rejects
 
 AS_IT_IS = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
