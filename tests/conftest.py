@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-pytest.register_assert_rewrite("labpage", "laws")
+pytest.register_assert_rewrite("tests.helpers")
 ROOT = Path(__file__).resolve().parents[1]
 
 

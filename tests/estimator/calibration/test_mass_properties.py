@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
@@ -17,6 +16,7 @@ from estimator.calibration.mass_properties.record import BearingRecord, Lab, Mas
 from estimator.calibration.mass_properties.recursive import filter_mass
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
+from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 
 NINE = slice(0, 9)
 

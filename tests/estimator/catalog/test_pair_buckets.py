@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 
 from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalog
 from estimator.core.arrays import Floats
+from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.catalog.pair_buckets")
 bucket_of = PLAIN.bucket_of

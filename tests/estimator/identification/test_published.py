@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from estimator.identification.published.saa_search import (
 )
 from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions
 from estimator.identification.registry import IDENTIFIERS
+from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
 PYRAMID, SHEFEX, FIALHO, SAA, SEARCH, DIRECT = (

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from two_samples import histogram_p
 
 from skysim.camera.detector import detector
 from skysim.camera.detector.detector import Detector
@@ -20,6 +19,7 @@ from skysim.experiments.characterize.sensor.levels import Level, Moments, level
 from skysim.experiments.characterize.sensor.photon_transfer import Point
 from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
+from tests.helpers.two_samples import histogram_p
 
 CHIP = {
     "quantum_efficiency": 0.6,

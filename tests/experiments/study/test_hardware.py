@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from study_stores import done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
 from skysim.experiments.study.analysis import table
 from skysim.experiments.study.execution import replay, runner, setups, store
+from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {
     "schema": 1,

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
@@ -27,6 +26,7 @@ from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.report import export
 from skysim.results.files import row_parts
+from tests.helpers.study_stores import STRAYS, done
 
 pytest.importorskip("pyarrow")
 POINTS = 3

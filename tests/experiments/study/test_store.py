@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from study_stores import STRAYS, contents, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
@@ -26,6 +25,7 @@ from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import Row
+from tests.helpers.study_stores import STRAYS, contents, done
 
 
 @pytest.fixture(scope="module")
