@@ -20,7 +20,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from PIL import Image
 
-from benchmarks.hostilefiles import promise
 from skysim.camera.psf.otf import read_cells
 from skysim.core.errors import InputError
 from skysim.core.io import decoding, encoded, images, yaml_reader
@@ -30,6 +29,7 @@ from skysim.sources.dome.layouts import listed
 from skysim.sources.dome.shell import point_cloud
 from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from tests.fuzz.targets import TARGETS, rejects
+from tests.helpers.hostile_files import promise
 
 AS_IT_IS = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
