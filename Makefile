@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: reference baseline bench demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: reference baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -46,11 +46,15 @@ oracle: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(BIN)/python -m pytest -rs -m "not long" tests/oracles
 
-# Our speed beside other people's tools, which are installed first.
+# Our speed beside other people's tools, which are installed first. Without AREAS=... the quick part of every area.
 bench: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(PIP) --no-deps cedar-solve==0.5.1 pillow  # it pins an old numpy; benchmarks/peers.py
 	$(BIN)/python -m benchmarks $(AREAS)
+
+# Every bar that a benchmark or a long test holds, in out/accept.json: hours; stopped, it goes on. QUICK=1: a minute.
+accept: $(READY)
+	NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks accept $(if $(QUICK),--quick)
 
 gui: $(READY)
 	$(BIN)/skysim gui
@@ -113,7 +117,7 @@ MUTANTS ?= 300
 SEED ?= 1
 mutants: $(READY)
 	$(PIP) -e '.[mutants]'
-	$(BIN)/python -m benchmarks.mutants $(MUTANTS) $(SEED) $(AGAIN)
+	$(BIN)/python -m tests.mutants $(MUTANTS) $(SEED) $(AGAIN)
 
 lint: $(READY)
 	$(BIN)/ruff check .
