@@ -70,10 +70,10 @@ def test_a_page_s_benchmarks_exist(page: Path) -> None:
 def test_rows_of_the_quick_run_are_kept_and_judged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of two areas one misses its bar; times are no bars of the quick run."""
+    """Of two areas one misses its bar; shares and times are no bars of the quick run."""
     row = {"peer": "", "peer_value": None, "ratio": None}
     measured = {
-        "good": [row | {"name": "found", "value": 99.5, "unit": "%", "bar": 99, "met": True}],
+        "good": [row | {"name": "lost", "value": 0, "unit": "fields", "bar": 0, "met": True}],
         "bad": [
             row | {"name": "wrong", "value": 1, "unit": "frames", "bar": 0, "met": False},
             row | {"name": "time", "value": 9.0, "unit": "ms", "bar": 1, "met": False},
@@ -88,6 +88,6 @@ def test_rows_of_the_quick_run_are_kept_and_judged(
     )
     rows = accept.rows_by_command(tmp_path / "accept.json")
     assert rows.keys() == {"python -m benchmarks good --count=2", "python -m benchmarks bad"}
-    ((found,), (wrong,)) = rows.values()
-    assert (found["figure"], found["bar"], found["met"]) == (99.5, 99, True)
-    assert (wrong["name"], wrong["code"]) == ("bad: wrong", found["code"])
+    ((kept,), (wrong,)) = rows.values()
+    assert (kept["figure"], kept["bar"], kept["met"]) == (0, 0, True)
+    assert (wrong["name"], wrong["code"]) == ("bad: wrong", kept["code"])
