@@ -14,13 +14,29 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: reference baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+# Extras of single targets, each installed once. `make extras`: all that CI needs, by one call of pip.
+EXTRA := .venv/.extra-
+$(EXTRA)%: $(READY)
+	$(PIP) -e '.[$(subst +,$(comma),$*)]'
+	touch $@
+
+comma := ,
+CI_EXTRAS := docs s3+query browser
+extras: $(READY)
+	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
+	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
+
+.PHONY: compile extras reference baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
 	$(BIN)/skysim run afit_simsat --out out/afit_simsat
 	$(BIN)/skysim run afit_simsat_ideal --frames 20 --out out/afit_simsat_ideal
 	$(BIN)/skysim run shefex2 --out out/shefex2
+
+# All compiled code that the tests need, in two processes; `make test` compiles what most tests need by itself.
+compile: $(READY)
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.helpers.compilation
 
 # Kept bytecode: the tests start some hundred processes, each of which would compile the sources again.
 PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
@@ -29,8 +45,7 @@ test: $(READY)
 	$(PYTEST) -m "not slow and not long and not browser"
 
 # The tests that CI runs beside those of `make test`.
-test-slow: $(READY)
-	$(PIP) -e '.[s3,query]'
+test-slow: $(READY) $(EXTRA)s3+query
 	$(PYTEST) -m "slow and not long and not browser"
 
 test-long: $(READY)
@@ -73,8 +88,7 @@ papers: $(READY)
 	$(BIN)/skysim reproduce all --report --markdown docs/findings/papers.md
 
 # The site, in out/site. Nothing in it is fetched from elsewhere.
-docs: $(READY)
-	$(PIP) -e '.[docs]'
+docs: $(READY) $(EXTRA)docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The pages of commands, keys and responses, from the code.
@@ -87,9 +101,8 @@ figures: $(READY)
 	$(BIN)/python docs/site/figures.py
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
-test-browser: $(READY)
-	$(PIP) -e '.[browser]'
-	$(BIN)/pytest -m browser tests/apps/gui tests/docs -rs
+test-browser: $(READY) $(EXTRA)browser
+	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
