@@ -22,13 +22,13 @@ from benchmarks import peers
 from benchmarks.timing import figure, verdict
 from estimator.attitude.solvers import quest
 from estimator.catalog import catalog
-from estimator.core.arrays import Ints
+from estimator.core.checks import Ints
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.results.metrics import WRONG_RAD
 from skysim.sources import hipparcos
 

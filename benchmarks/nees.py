@@ -17,7 +17,7 @@ import scipy.stats
 from benchmarks.lost_in_space import DENSE, SHEFEX, Field, Workload, field
 from benchmarks.rolling import row
 from estimator.catalog import catalog
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker

@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 

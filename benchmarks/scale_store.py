@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import verdict
-from skysim.core.io.files import make_folder
+from skysim.core.files import make_folder
 from skysim.experiments.study import loader
 from skysim.experiments.study.execution import runner, store
 from skysim.results.files import row_parts

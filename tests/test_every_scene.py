@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
 from skysim.camera.glow.display_glow import black_glow
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.dynamics import multibody
 from skysim.experiments.configs import with_config
 from skysim.experiments.study.execution.setups import Setup
@@ -21,7 +21,7 @@ from skysim.results import metrics
 from skysim.results.simulate import render
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
+from skysim.scene.sections.light import (CollimatedDisplayConfig, StarsConfig)
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
 from skysim.simulation.lab import build_lab, build_tracker

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 
 def module_of(path: Path) -> str:

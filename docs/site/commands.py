@@ -9,7 +9,7 @@ import typer
 
 from skysim.apps.cli.examples import EXAMPLES
 from skysim.apps.cli.main import app
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "commands.md"
 HEAD = """# Commands

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import cv2
 
-from skysim.core.io import files
-from skysim.dynamics.multibody.view.picture import picture
-from skysim.results import annotate, telemetry_report
+from skysim.core import files
+from skysim.dynamics.multibody.scene_picture import picture
+from skysim.results import (telemetry_report)
+from skysim.results import annotate
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skysim.core.paths import STUDIES
+from skysim.core.files import STUDIES
 from skysim.core.types import Floats
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.execution import store

@@ -14,7 +14,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from docstring_text import escape
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.results import metrics
 

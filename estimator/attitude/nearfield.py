@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, on_surface, project
 from estimator.attitude.solvers import quest
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.least_squares import cholesky_solve, normal_equations
 from estimator.core.least_squares import step as least_squares_step

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import covariance_of, error_gain, streak_factor
+from estimator.attitude.rate import (covariance_of, error_gain, streak_factor)
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.attitude.rate import aligned, chords, inliers, inverses
-from estimator.core.arrays import Floats
+from estimator.attitude.rate import (aligned, chords, inliers, inverses)
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids, RateEstimate
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.attitude.nearfield import tangent_gradients, tangent_jacobian
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 
 

@@ -20,7 +20,7 @@ from math import isfinite, sqrt
 import numpy as np
 
 from estimator.core import least_squares
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.vectors import rotate_in_place
 

@@ -25,7 +25,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 
 # Newton decrement g'N^-1 g at convergence: the squared step in standard deviations. Small enough for a relative
 # accuracy of 1e-9 in lengths.

@@ -40,7 +40,7 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Covariances, Sightings
 from estimator.calibration.gauge import Gauge, Subset
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.

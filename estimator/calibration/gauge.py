@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 
 
 @dataclass(frozen=True, slots=True)

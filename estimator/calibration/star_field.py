@@ -13,26 +13,73 @@ by the square of the field angle, and k2 and k3 resemble k1 over a narrow field.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+import numpy as np
+from estimator.core import checks
+from estimator.core.checks import Floats
+from estimator.core.constants import SIGMA_PER_MAD
+from estimator.core.checks import ImageError
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
-
-import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
-
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
-from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
-from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
+
+
+
+
+
+# Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
+
+
+@dataclass(frozen=True, slots=True)
+class MagnitudeZero:
+    """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
+
+    sigma_mag   : standard deviation of the offset
+    scatter_mag : of one star about the offset, mainly by its color
+    stars       : number of different stars
+    """
+
+    offset_mag: float
+    sigma_mag: float
+    scatter_mag: float
+    stars: int
+
+
+def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats) -> MagnitudeZero:
+    """Zero point as the median over different stars of each star's median difference.
+
+    Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
+    the stars, not the sightings. The scatter is 1.4826 times the median absolute deviation, and the standard deviation
+    of the median is sqrt(pi / 2) times the scatter over the square root of the number of stars. Leave out stars near
+    the detection limit: only those with positive errors are detected, which biases the median.
+    """
+    checks.unit_rows("vectors_ref", vectors_ref, None)
+    if not len(vectors_ref):
+        raise ImageError("magnitude_zero: no stars; allowed: one or more")
+    for name, values in (("instrumental_mag", instrumental_mag), ("v_mag", v_mag)):
+        if not np.isfinite(checks.floats(name, values, (len(vectors_ref),))).all():
+            raise ImageError(f"{name} has a NaN or infinity; allowed: finite")
+    _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
+    star = np.ravel(star)
+    difference = v_mag - instrumental_mag
+    each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
+    offset = float(np.median(each))
+    scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
+    return MagnitudeZero(
+        offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each)
+    )
+
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
@@ -490,3 +537,5 @@ def _identified(
                 )
             )
     return identified
+
+

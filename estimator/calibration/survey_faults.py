@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
 from estimator.core.constants import SIGMA_PER_MAD
 

@@ -20,7 +20,7 @@ from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, p
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import CONNECTING_RAD, check_redundancy, connected_subset
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
 
 Mask = NDArray[np.bool_]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from estimator.catalog.sky_index import SkyIndex
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core import vectors
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 PER_CIRCLE = 10  # stars of quads in a circle as high as the field

@@ -13,7 +13,7 @@ import numpy as np
 
 from estimator.catalog.catalog import utc
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from estimator.catalog import spatial_grid
 from estimator.catalog.spatial_grid import cell_of
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 
 PAIRS_PER_BIN = 8

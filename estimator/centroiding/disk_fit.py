@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from estimator.centroiding.moments import belongs_to_neighbor, neighbors
 from estimator.core import least_squares
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 

@@ -12,7 +12,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 # A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),

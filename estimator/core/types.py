@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 
 

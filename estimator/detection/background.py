@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.jit import jit
 from estimator.core.types import Background

@@ -17,7 +17,7 @@ from math import floor, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.jit import jit
 from estimator.detection.background import accumulator_type, filtered, filtered_row, interpolate
 

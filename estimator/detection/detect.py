@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
-from estimator.core.checks import native, number, of_type
-from estimator.core.errors import ImageError
+from estimator.core.checks import (Floats, Ints)
+from estimator.core.checks import (native, number, of_type)
+from estimator.core.checks import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import FILTERED_NOISE, estimate_background, median
@@ -25,7 +25,7 @@ from estimator.detection.components import (
     label_runs,
     runs_above,
 )
-from estimator.detection.shefex import maximum_scan, sequential_scan
+from estimator.detection.shefex_detection import (maximum_scan, sequential_scan)
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.jit import jit
 from estimator.core.types import NO_PRIORS, Blobs, FramePriors
 from estimator.detection.background import estimate_background, filtered, interpolate

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.filter.propagate import rotate_quaternion, transition
-from estimator.filter.states import Layout, State, of_head
+from estimator.filter.states import (Layout, State, of_head)
 
 
 class Solution(NamedTuple):

@@ -27,14 +27,14 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, chdtri
 
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.types import FilterState
-from estimator.filter.checks import checked_covariances, checked_samples, not_negative
+from estimator.filter.consistency import (checked_covariances, checked_samples, not_negative)
 from estimator.filter.correct import Solution, adopt, correct, innovation, wxyz_of
-from estimator.filter.jumps import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
-from estimator.filter.models import CONSIDERED, GyroModel, JumpModel, TrackerModel
+from estimator.filter.consistency import (CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad)
+from estimator.filter.states import (CONSIDERED, GyroModel, JumpModel, TrackerModel)
 from estimator.filter.propagate import inverse_response
-from estimator.filter.states import State, build_layout, decorrelate, propagate_state, start_state
+from estimator.filter.states import (State, build_layout, decorrelate, propagate_state, start_state)
 
 __all__ = ["AttitudeFilter", "GyroModel", "JumpModel", "TrackerModel", "Update"]
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.jit import jit
 
 # The last column of a sample.

@@ -17,13 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.identification.leds import codes, naming
-from estimator.identification.leds.codes import LedCode
-from estimator.identification.leds.tracks import LightTracks
+from estimator.identification import led_codes
+from estimator.identification import led_naming
+from estimator.identification.led_codes import LedCode
+from estimator.identification.led_codes import LightTracks
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma_rad, process_frame
 from estimator.trackers.star_tracker import NO_STARS
@@ -95,7 +96,7 @@ class CodedTracker(DomeTracker):
         radius_m = np.linalg.norm(leds.position_m, axis=1)
         pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
         position_m = np.asarray(leds.position_m, dtype=float)
-        self.sphere = naming.Sphere(position_m, radius_m, position_m / radius_m[:, None], pupil_m)
+        self.sphere = led_naming.Sphere(position_m, radius_m, position_m / radius_m[:, None], pupil_m)
         goes_dark = bool(code.levels.min() == 0)
         self.tracks = LightTracks(
             camera,
@@ -112,7 +113,7 @@ class CodedTracker(DomeTracker):
             len(code.phases), bool
         )  # those of the code's clock that the lights have not excluded
         self.last_s: float | None = None
-        codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
+        led_codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
 
     def solve(
         self,
@@ -190,20 +191,20 @@ class CodedTracker(DomeTracker):
         sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
         misfit = self._misfit(tracks.light[usable], sigma)
         lights = len(usable)
-        plausible = misfit.min(axis=(0, 2)) <= codes.expected_misfit(measured[usable])
+        plausible = misfit.min(axis=(0, 2)) <= led_codes.expected_misfit(measured[usable])
         usable = usable[plausible]
         misfit = misfit[:, plausible]
         if len(usable) < 2:
             self.phases[:] = True
             return COLLECTING
-        misfit = misfit / codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
+        misfit = misfit / led_codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
         row = tracks.row[usable]
-        named = naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
-        match = naming.identify(named, self.sphere)
+        named = led_naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
+        match = led_naming.identify(named, self.sphere)
         if isinstance(match, str):
             return match
-        if not naming.is_supported(match, misfit, lights):
-            return naming.CONTRADICTED
+        if not led_naming.is_supported(match, misfit, lights):
+            return led_naming.CONTRADICTED
         return replace(match, observed=row[match.observed])
 
     def _misfit(self, light: Floats, sigma: Floats) -> Floats:
@@ -218,8 +219,8 @@ class CodedTracker(DomeTracker):
         )
         flat = np.full((len(light), len(templates)), np.inf)
         for one, row, error in zip(flat, light, sigma, strict=True):
-            likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
-            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[
+            likely = led_codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
+            one[likely] = led_codes.misfits(row[None], error[None], templates[likely], spread[likely])[
                 0
             ]
         each = flat.reshape(-1, len(tried), leds)

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.motion import center_streak_px
+from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera, check_frame
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify
-from estimator.detection.classify import NO_STAR, Flag
+from estimator.detection.classify import (NO_STAR, Flag)
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
 
 SATURATED = "the frame is saturated"

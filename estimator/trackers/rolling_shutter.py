@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude import rolling
-from estimator.attitude.disk_rate import from_moments
-from estimator.attitude.motion import STARS, Sight, at_middle_row
+from estimator.attitude.rate import from_moments
+from estimator.attitude.rate import (STARS, Sight, at_middle_row)
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.attitude.rate import MAX_RATE_RAD_S, from_streaks
-from estimator.core.arrays import Floats
+from estimator.attitude.rate import (MAX_RATE_RAD_S, from_streaks)
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, RateEstimate
 

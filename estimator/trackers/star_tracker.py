@@ -20,27 +20,24 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import covariance_of
+from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
-from estimator.catalog import catalog, pair_index, quad_index, sky_index
+from estimator.catalog import (catalog, quad_index, sky_index)
+from estimator.catalog import pair_index
 from estimator.catalog.refraction import SiteAir
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
-from estimator.identification.stars import quads, search
-from estimator.identification.stars.detections import (
-    Detections,
-    FlatCentroids,
-    Sensor,
-    detections_of,
-)
-from estimator.identification.stars.evidence import Solution
+from estimator.identification import star_quads
+from estimator.identification import star_search
+from estimator.identification.star_detections import (Detections, FlatCentroids, Sensor, detections_of)
+from estimator.identification.star_evidence import Solution
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
@@ -50,9 +47,10 @@ from estimator.trackers.pipeline import (
     check_algorithms,
     process_frame,
 )
-from estimator.trackers.residuals import companions, misfit
-from estimator.trackers.residuals.misfit import Refit
-from estimator.trackers.residuals.refinement import NO_MATCH, FieldMatcher
+from estimator.trackers import misfit
+from estimator.trackers import misfit
+from estimator.trackers.misfit import Refit
+from estimator.trackers.refinement import (NO_MATCH, FieldMatcher)
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"
@@ -78,7 +76,7 @@ class SearchModel(NamedTuple):
     focal_uncertainty: float = 0.0
 
 
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, search.WRONG_FOCAL)
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, star_search.WRONG_FOCAL)
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
     WRONG_FOCAL_SEARCH,
@@ -437,7 +435,7 @@ class StarTracker:
             if calibrated and not variance and misfit.residuals_too_great(solution):
                 # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
                 other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
-                solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
+                solution = other if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX else solution
             clock.lap("identify")
             if not len(solution.star):
                 continue
@@ -469,14 +467,14 @@ class StarTracker:
         """One search of the default identifier, and the factor of the variances if it is known, else 0."""
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
-        if at_once and companions.are_small(sigma_px / self.camera.focal_px):
+        if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
             lights = _lights(centroids, sigma_px)
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
+            return star_search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
         known = not self.focal_uncertainty
-        return quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
+        return star_quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
 
     def refit(
         self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
@@ -491,10 +489,10 @@ class StarTracker:
         if not len(solution.star) or 0 < variance < misfit.TELLING:
             return Refit(solution, camera, variance or 1.0)
         detections = self.detections(
-            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL
+            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else star_search.WRONG_FOCAL
         )
         if not variance:
-            solution, detections = companions.with_companions(solution, detections, self.sky)
+            solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
             if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
                 return Refit(solution, camera, 1.0)

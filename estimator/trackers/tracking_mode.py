@@ -18,15 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import check_frame
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.classify import Flag
 from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
 from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
-from estimator.identification.stars import evidence
+from estimator.identification import star_evidence
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.rolling_shutter import with_streak_rate
@@ -228,7 +228,7 @@ class TrackingMode:
         detections = tracker.detections(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
-        hypothesis = evidence.evaluate(
+        hypothesis = star_evidence.evaluate(
             detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
         )
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
@@ -239,7 +239,7 @@ class TrackingMode:
         )
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
-        solution = evidence.build_solution(detections, tracker.sky, hypothesis)
+        solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution, sigma_px)
         if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(window_centers_px):
             return None

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from skysim.camera.optics import Optics
 from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
 from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
-from skysim.camera.psf.led_disk import DiskImages, disk_images
+from skysim.camera.psf.kernel import (DiskImages, disk_images)
 from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
 from skysim.core.errors import InputError
 from skysim.core.jit import jit

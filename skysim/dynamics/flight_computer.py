@@ -14,17 +14,12 @@ import numpy as np
 
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers.adapter import (
-    NO_SOURCE,
-    ControllerSource,
-    ExternalLaw,
-    external_law,
-)
-from skysim.dynamics.controllers.interface import ControllerSetup
+from skysim.dynamics.controllers import (NO_SOURCE, ControllerSource, ExternalLaw, external_law)
+from skysim.dynamics.controllers import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuators.fans import Desaturator, MomentumDump
-from skysim.dynamics.multibody.actuators.kind import Actuators, ControlInput
+from skysim.dynamics.multibody.actuators.kind import (Actuators, ControlInput)
 from skysim.dynamics.multibody.actuators.registry import IdealTorque, build_actuators
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig

@@ -22,16 +22,9 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.profiles.angle import (
-    AngleProfile,
-    linear_sweep,
-    log_sweep,
-    rest_to_rest,
-    steady,
-    still,
-)
-from skysim.dynamics.profiles.rate_change import integrate_knots, rate_change_state
-from skysim.dynamics.profiles.spline import AttitudeSpline
+from skysim.dynamics.reference_curves import (AngleProfile, linear_sweep, log_sweep, rest_to_rest, steady, still)
+from skysim.dynamics.reference_curves import (integrate_knots, rate_change_state)
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.scene.sections.motion import (
     AttitudeConfig,
     BumpConfig,

@@ -21,7 +21,7 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.guidance import Reference, plan, vibration_intervals
-from skysim.dynamics.profiles.angle import envelope
+from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
     JitterBandConfig,
     JitterLineConfig,

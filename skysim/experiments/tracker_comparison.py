@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.io import files
+from skysim.core import files
 from skysim.core.types import Frame, FrameRow, Truth
 from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
@@ -19,7 +19,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 from skysim.simulation.lab import Lab, build_tracker
 from skysim.tracking import factory
-from skysim.tracking.external.interface import FAILED, SOLVED
+from skysim.tracking.tracker_interface import (FAILED, SOLVED)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.io.files import make_folder, write_image, write_table
+from skysim.core.files import (make_folder, write_image, write_table)
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.annotate import annotate_truth
-from skysim.results.files.frames import remove_results, write_frame
+from skysim.results.files.frame_folder import (remove_results, write_frame)
 from skysim.results.report import Report
 from skysim.results.scoring import Score
 from skysim.simulation.checks import Check

@@ -15,9 +15,10 @@ from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
-from skysim.results import metrics, stretch
-from skysim.results.annotate import annotate, visible
-from skysim.results.report.as_html import embed
+from skysim.results import (metrics)
+from skysim.results import annotate as stretch
+from skysim.results.annotate import (annotate, visible)
+from skysim.results.report.pages import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot

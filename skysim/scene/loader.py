@@ -19,17 +19,9 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import (
-    Files,
-    check_version,
-    explain,
-    is_file,
-    read_yaml,
-    set_key,
-    where_of,
-)
-from skysim.core.paths import DATA, SCENES
+from skysim.core import yaml_reader
+from skysim.core.yaml_reader import (Files, check_version, explain, is_file, read_yaml, set_key, where_of)
+from skysim.core.files import (DATA, SCENES)
 from skysim.core.units import ConfigModel, quantity
 from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration

@@ -11,7 +11,7 @@ import yaml
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import StrictLoader, excerpt, parse_yaml
+from skysim.core.yaml_reader import (StrictLoader, excerpt, parse_yaml)
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 # Allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square.

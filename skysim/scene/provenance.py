@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from skysim.core.io.yaml_reader import parse_yaml, read_yaml
+from skysim.core.yaml_reader import (parse_yaml, read_yaml)
 from skysim.core.units import ConfigModel, si_unit
 from skysim.scene import loader, unused
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge

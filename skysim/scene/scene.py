@@ -15,15 +15,15 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import fault_of
+from skysim.core.yaml_reader import fault_of
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
 from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
-from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
-from skysim.scene.sections.lights import FurtherLight
+from skysim.scene.sections.light import (DomeConfig, Glow, Light, StarsConfig)
+from skysim.scene.sections.light import FurtherLight
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
 from skysim.scene.sections.thermal import Coefficient, ThermalConfig

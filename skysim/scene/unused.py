@@ -16,7 +16,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from skysim.core.errors import OVERRIDES, InputError
-from skysim.core.io.yaml_reader import Files, parse_yaml, where_of
+from skysim.core.yaml_reader import (Files, parse_yaml, where_of)
 from skysim.core.units import ConfigModel
 from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.sections.air import NEGLIGIBLE_PX

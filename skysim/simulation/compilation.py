@@ -17,9 +17,9 @@ import numpy as np
 from numba.core import event
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.detector.detector import saturation_dn
+from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import parse_overrides
+from skysim.core.yaml_reader import parse_overrides
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
 from skysim.scene import loader

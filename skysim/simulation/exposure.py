@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
-from skysim.camera import thermal
-from skysim.camera.detector.added_charge import AddedCharge
-from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
-from skysim.camera.discs.bodies import concatenated, render_bodies
+from skysim.camera import thermal_motion
+from skysim.camera.detector import AddedCharge
+from skysim.camera.detector import (add_snr_and_saturation, expose, saturation_dn, smear)
+from skysim.camera.discs import (concatenated, render_bodies)
 from skysim.camera.glow import background
 from skysim.camera.render import Window, in_view, project, render
-from skysim.camera.stray import ghosts, glare
+from skysim.camera.glow import stray
+from skysim.camera.glow import stray
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
-from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
+from skysim.simulation.lights.light import (Beam, Exposure, Lit, Seeds, any_of, beam_of)
 from skysim.simulation.timing import (
     MARGIN_S,
     exposure_window,
@@ -97,7 +98,7 @@ def exposure_of(
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
-        mount, optics = thermal.camera_at(scene.thermal, mount, optics, middle_s)
+        mount, optics = thermal_motion.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
     return Exposure(
         index,
@@ -149,14 +150,14 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
         for lit in beam.lits:
             if lit.points is not None:
                 drawn = render(image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit)))
-                truths.append(ghosts.as_ghosts(drawn, path.number))
+                truths.append(stray.as_ghosts(drawn, path.number))
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
-                truths += [ghosts.as_ghosts(body, path.number) for body in bodies]
+                truths += [stray.as_ghosts(body, path.number) for body in bodies]
     sources = concatenated(truths)
     for config in beam.glares:
-        glare.add_glare(image, config)
-        sources = glare.without_glare(sources, config)
+        stray.add_glare(image, config)
+        sources = stray.without_glare(sources, config)
     return sources
 
 

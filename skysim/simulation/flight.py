@@ -28,7 +28,8 @@ from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.motion import Motion, history_s
 from skysim.simulation.user_parts import NO_PARTS, UserParts, with_parts
-from skysim.tracking import factory, gyro
+from skysim.tracking import factory
+from skysim.tracking import navigation
 from skysim.tracking.exposure_control import ExposureController
 
 FIRST_OBSERVATION = (
@@ -403,7 +404,7 @@ class Flight:
         samples = self.imu_samples(window.open_s)
         if samples is None:
             return None
-        return gyro.rate_of_frame(samples, window, scene.camera.height_px, config, camera.mount)
+        return navigation.rate_of_frame(samples, window, scene.camera.height_px, config, camera.mount)
 
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.

@@ -10,31 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.detector.detector import Detector
+from skysim.camera.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.multibody.view import mjcf_export
-from skysim.dynamics.profiles.load import load_profiles
-from skysim.dynamics.profiles.spline import AttitudeSpline
+from skysim.dynamics.multibody import mjcf_export
+from skysim.dynamics.profiles import load_profiles
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.motion import PointingConfig
 from skysim.simulation import timing
-from skysim.simulation.lights.light import KnownLight, Light, Seeds
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import (KnownLight, Light, Seeds)
+from skysim.simulation.lights.light import Plan
 from skysim.simulation.lights.registry import build_lights
 from skysim.simulation.user_parts import NO_PARTS, UserParts
 from skysim.sources import catalog, stars
 from skysim.sources.dome.layouts.led_list import led_list
-from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit
-from skysim.sources.orbit.viewpoint import Viewpoint
+from skysim.sources.orbit.camera_orbit import (CameraOrbit, build_orbit)
+from skysim.sources.orbit.camera_orbit import Viewpoint
 from skysim.sources.photometry import Band
-from skysim.tracking import factory, settings
-from skysim.tracking.external.interface import TRACKERS
+from skysim.tracking import factory
+from skysim.tracking import factory
+from skysim.tracking.tracker_interface import TRACKERS
 
 MAIN = "main"  # name of the camera of the scene's section `camera`
 
@@ -208,7 +209,7 @@ def build_canvas(scene: Scene) -> NDArray[Any]:
 
 def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool) -> None:
     """Raise InputError for unusable names and files of the camera and, if it is the scene's, of the tracker."""
-    settings.assumed_settings(scene)  # raises for a wrong algorithm name
+    factory.assumed_settings(scene)  # raises for a wrong algorithm name
     if has_tracker:
         TRACKERS.check_name(scene.tracker.name, programs)
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)

@@ -9,7 +9,7 @@ import numpy as np
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import guidance, imu, multibody
-from skysim.dynamics.controllers.adapter import ControllerSource
+from skysim.dynamics.controllers import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.jitter import Vibration

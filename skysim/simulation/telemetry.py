@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import thermal
+from skysim.camera import thermal_motion
 from skysim.core.types import Floats, Mounting, Telemetry
 from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import Reference
@@ -162,7 +162,7 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     """
     error = camera.mount_error or Rotation.identity()
     config = camera.scene.thermal
-    turned = [(thermal.turned(config, t) if config else Rotation.identity()) * error for t in t_s]
+    turned = [(thermal_motion.turned(config, t) if config else Rotation.identity()) * error for t in t_s]
     return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
 
 

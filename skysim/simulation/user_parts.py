@@ -11,13 +11,13 @@ from typing import Any
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import is_file
-from skysim.dynamics.controllers.adapter import ControllerSource
-from skysim.dynamics.controllers.interface import Factory
+from skysim.core.yaml_reader import is_file
+from skysim.dynamics.controllers import ControllerSource
+from skysim.dynamics.controllers import Factory
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
 from skysim.tracking import factory
-from skysim.tracking.external.function import FunctionTracker
+from skysim.tracking.external_tracker import FunctionTracker
 
 GIVEN_TABLE = "(table)"  # in place of a profile's file
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.io import files
-from skysim.core.io.yaml_reader import excerpt, is_file, parse_yaml
-from skysim.core.paths import CATALOGS
+from skysim.core import files
+from skysim.core.yaml_reader import (excerpt, is_file, parse_yaml)
+from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skysim.sources.orbit.satellites import ID_BASE
-from skysim.sources.solar_system.bodies import NAMES
+from skysim.sources.bodies import NAMES
 
 MIRRORED = 10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
 GHOST = 1_000_000_000_000  # the n-th ghost of a light has n times this number and the light's

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 from skysim.sources import catalog
 from skysim.sources.catalog import Column

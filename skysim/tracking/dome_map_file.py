@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import header_numbers, write_table
+from skysim.core.files import (header_numbers, write_table)
 from skysim.core.types import Floats
 
 

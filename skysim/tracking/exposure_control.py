@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
 from estimator.trackers.pipeline import Settings
 from skysim.core.types import Frame
 from skysim.scene.scene import Scene
-from skysim.tracking.settings import assumed_settings
+from skysim.tracking.factory import assumed_settings
 
 
 class ExposureController:

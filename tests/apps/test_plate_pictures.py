@@ -24,9 +24,9 @@ from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solution, solver
 from skysim.core.errors import InputError
-from skysim.core.io import images
+from skysim.core import images
 from skysim.core.types import Frame, Truth
-from skysim.results.files import frames
+from skysim.results.files import frame_folder
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import simulate_motion
@@ -278,7 +278,7 @@ def test_our_own_frames_say_their_row_order_and_read_as_written(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path
 ) -> None:
     scene, frame, truth = sky
-    frames.write_frame(tmp_path, frame, truth, scene)
+    frame_folder.write_frame(tmp_path, frame, truth, scene)
     seen = images.read_picture(tmp_path / "frame_0000.fits")
     np.testing.assert_array_equal(seen.pixels, frame.image_dn)
     assert seen.row_order_known

@@ -14,8 +14,8 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import retries
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
+from skysim.core import images
+from skysim.core.files import CATALOGS
 from tests.helpers import photographs
 
 SHOT = photographs.Shot(1280, 960, 22.0, 6.3)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.air_glow import airglow_nl, diffuse_air_mass, seen_place, sunlight_nl
-from skysim.camera.glow.background import NANOLAMBERT_V0, glow_map
+from skysim.camera.glow.background import (NANOLAMBERT_V0, glow_map)
 from skysim.core.types import Floats
 from skysim.scene.loader import load
 from skysim.scene.sections.light import SkyGlowConfig
@@ -15,7 +15,7 @@ from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.air import AirGlow, Atmosphere
 from skysim.simulation.lights.light import find_light
-from skysim.sources.air.air import Sky
+from skysim.sources.air import Sky
 
 SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import fixed_quad
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs.disc_image import points_of
+from skysim.camera.discs import points_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import Poses, Window, project, render
 from skysim.core.errors import InputError

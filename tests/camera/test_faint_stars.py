@@ -5,19 +5,12 @@ import pytest
 from scipy.integrate import quad
 
 from skysim.camera.glow.background import glow_map
-from skysim.camera.glow.faint_stars import (
-    CURVATURE,
-    LATITUDE_DEG,
-    LN_LIGHT,
-    SLOPE,
-    faint_starlight_s10,
-    galactic_latitude_deg,
-)
+from skysim.camera.glow.background import (CURVATURE, LATITUDE_DEG, LN_LIGHT, SLOPE, faint_starlight_s10, galactic_latitude_deg)
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.scene.sections.light import FaintStarsGlowConfig, SkyGlowConfig
+from skysim.scene.sections.light import (FaintStarsGlowConfig, SkyGlowConfig)
 from skysim.sources import catalog, gaia
 from skysim.sources.photometry import Band
 from skysim.sources.stars import cam_from_icrs

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.mass_properties.record import BearingRecord, Lab, Prior, inertia_six
-from estimator.core.arrays import Floats
+from estimator.calibration.mass_dynamics import (BearingRecord, Lab, Prior, inertia_six)
+from estimator.core.checks import Floats
 
 GRAVITY_M_S2 = 9.80665
 WHEEL_KG_M2 = 2e-5

@@ -18,7 +18,9 @@ import pytest
 from skysim.core.time import tt_jd
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit import earth, elements, satellites
-from skysim.sources.solar_system import magnitudes, observer, places
+from skysim.sources import body_magnitudes
+from skysim.sources import ephemeris
+from skysim.sources import ephemeris
 
 LIMIT_ARCSEC = 0.1
 LIMIT_MAG = 0.001
@@ -48,7 +50,7 @@ def skyfield() -> Skyfield:
     return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
 
 
-def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Observer, Any, Any]]:
+def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[ephemeris.Observer, Any, Any]]:
     """Random times, and sites if on the ground: our observer, Skyfield's and its time."""
     rng = np.random.default_rng(26)
     for _ in range(COUNT):
@@ -63,7 +65,7 @@ def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Ob
             )
             theirs = theirs + skyfield.at_site(latitude_deg, longitude_deg, 2000.0)
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
-        yield observer.observe_from(time, site), theirs.at(their_time), their_time
+        yield ephemeris.observe_from(time, site), theirs.at(their_time), their_time
 
 
 def named(skyfield: Skyfield, name: str) -> Any:
@@ -76,7 +78,7 @@ def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
     for ours, theirs, _ in observers(skyfield, on_ground):
         for name in NAMES:
             wanted = theirs.observe(named(skyfield, name)).apparent().xyz.au
-            direction = places.place(name, ours).direction
+            direction = ephemeris.place(name, ours).direction
             off = np.arctan2(np.linalg.norm(np.cross(wanted, direction)), wanted @ direction)
             worst[name] = max(worst[name], np.degrees(off) * 3600)
     assert max(worst.values()) < LIMIT_ARCSEC, worst
@@ -103,9 +105,9 @@ def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
         place_m = elements.gcrs_states(ours, time, np.zeros(1))[0][:, 0]
         lit = earth.sunlit_fraction(place_m, earth.sun_m(tt_jd(time)))
 
-        def site_at(after_s: float, time: datetime.datetime = time) -> observer.GcrsState:
+        def site_at(after_s: float, time: datetime.datetime = time) -> ephemeris.GcrsState:
             then = time + datetime.timedelta(seconds=after_s)
-            return observer.site_in_gcrs(then, tt_jd(then), site)
+            return ephemeris.site_in_gcrs(then, tt_jd(then), site)
 
         for n in range(len(ours.numbers)):
             satellite = EarthSatellite(lines[2 * n], lines[2 * n + 1], ts=skyfield.time)
@@ -149,6 +151,6 @@ def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
                 args.append(time.J)
             wanted = float(getattr(library, f"_{name}_magnitude")(*args))
             if np.isfinite(wanted):  # before 2000 it knows Neptune at small phase angles only
-                ours_mag = magnitudes.magnitude(name, places.place(name, ours), ours.tt_jd)
+                ours_mag = body_magnitudes.magnitude(name, ephemeris.place(name, ours), ours.tt_jd)
                 worst[name] = max(worst[name], abs(wanted - ours_mag))
     assert max(worst.values()) < LIMIT_MAG, worst

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.results.files.builder.parts import COLUMNS, PartsList, build_design, parts_list, to_csv
-from skysim.results.files.builder.prices import UNITS, find_prices, read_prices
+from skysim.results.files.parts import (COLUMNS, PartsList, build_design, parts_list, to_csv)
+from skysim.results.files.prices import (UNITS, find_prices, read_prices)
 from skysim.scene import loader
 from skysim.scene.sections.layouts import StringConfig
 from skysim.sources.dome.layouts.string import wind

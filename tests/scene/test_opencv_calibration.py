@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from skysim.apps import plate_solver
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.results.files import frames
+from skysim.core import files
+from skysim.results.files import frame_folder
 from skysim.scene import loader, opencv_calibration
 from skysim.scene.opencv_calibration import Calibration
 from skysim.simulation.flight import simulate_motion
@@ -220,7 +220,7 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     )
     loaded = loader.load(own)
     frame, truth = simulate_motion(loaded).render(0)
-    frames.write_frame(lens.parent, frame, truth, loaded)
+    frame_folder.write_frame(lens.parent, frame, truth, loaded)
     told = opencv_calibration.read(lens)
     off = opencv_calibration.text(
         Calibration(

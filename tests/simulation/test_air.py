@@ -13,7 +13,7 @@ from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.simulation.lights.air import Atmosphere, Skyline
 from skysim.simulation.lights.light import find_light
-from skysim.sources.air import scintillation
+from skysim.sources import scintillation
 from skysim.tracking.factory import solve_frame
 
 TIME = "2012-06-24T23:00:00"

@@ -16,12 +16,7 @@ from scipy.spatial.transform import Rotation
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
-from skysim.dynamics.controllers.interface import (
-    ControllerInput,
-    ControllerSetup,
-    check_torque,
-    torque_of_reply,
-)
+from skysim.dynamics.controllers import (ControllerInput, ControllerSetup, check_torque, torque_of_reply)
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import runner, setups, store
@@ -31,7 +26,7 @@ from skysim.simulation.checks import check
 from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import build_lab
 from skysim.simulation.user_parts import UserParts
-from skysim.tracking.external import process
+from skysim.tracking import process
 
 PD = '''
 import numpy as np
@@ -67,7 +62,7 @@ def crashing(setup):
 PROGRAM = """
 import json, sys
 from mypd import pd
-from skysim.dynamics.controllers.interface import ControllerInput, ControllerSetup
+from skysim.dynamics.controllers import ControllerInput, ControllerSetup
 
 law = pd(ControllerSetup.of_tree(json.loads(sys.stdin.readline())))
 print(json.dumps({"ready": True}), flush=True)

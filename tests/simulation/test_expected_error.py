@@ -19,7 +19,7 @@ from skysim.simulation.checks.expected_error import Common, Independent, covaria
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure, render_frame
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.lights.light import Exposure, Lit, beam_of
+from skysim.simulation.lights.light import (Exposure, Lit, beam_of)
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory

@@ -16,10 +16,12 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, check, detection, facts, plan, sampling
+from skysim.simulation.checks import (attitudes, check, detection, facts, sampling)
+from skysim.simulation.checks import check as plan
 from skysim.simulation.checks.facts import Fact
 from skysim.simulation.checks.sampling import Samples
-from skysim.simulation.checks.sky import claims, depth
+from skysim.simulation.checks import sky_warnings
+from skysim.simulation.checks import depth
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -674,7 +676,7 @@ def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
     nees = [
-        claims.claimed(
+        sky_warnings.claimed(
             *samples_of(
                 lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))
             )

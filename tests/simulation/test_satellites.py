@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
 from skysim.core.types import SourceTruth
-from skysim.results.files.frames import write_frame
+from skysim.results.files.frame_folder import write_frame
 from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker

@@ -10,10 +10,11 @@ import pytest
 from skysim.core.constants import EARTH_RADIUS_M
 from skysim.core.time import tt_jd
 from skysim.scene.sections.orbit import CircularOrbitConfig, ExclusionConfig
-from skysim.sources.orbit import camera_orbit, earth
-from skysim.sources.orbit.availability import Pointing, place_spline, sample
+from skysim.sources.orbit import (earth)
+from skysim.sources.orbit import camera_orbit
+from skysim.sources.orbit.orbit_availability import (Pointing, place_spline, sample)
 from skysim.sources.orbit.camera_orbit import CircularOrbit
-from skysim.sources.solar_system.ephemeris import load_ephemeris
+from skysim.sources.ephemeris import load_ephemeris
 
 START = datetime.datetime(2024, 3, 20, 3)
 POLE = np.array([[0.0, 0.0, 1.0]])

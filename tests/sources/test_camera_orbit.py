@@ -13,7 +13,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
 from skysim.sources.orbit import oem
-from skysim.sources.orbit.camera_orbit import CircularOrbit, build_orbit, state_at
+from skysim.sources.orbit.camera_orbit import (CircularOrbit, build_orbit, state_at)
 
 START = datetime.datetime(2024, 4, 10, 3)
 VANGUARD = (

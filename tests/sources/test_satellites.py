@@ -18,7 +18,7 @@ from skysim.scene.sections.orbit import RandomSatellitesConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit import earth, elements, satellites
 from skysim.sources.orbit.satellites import View
-from skysim.sources.solar_system.observer import GcrsState, site_in_gcrs
+from skysim.sources.ephemeris import (GcrsState, site_in_gcrs)
 
 # Satellite 00005 of Vallado et al. 2006 (AIAA 2006-6753), and its TEME states of tcppver.out, km and km/s.
 VANGUARD = (

@@ -7,7 +7,7 @@ import pytest
 from scipy import fft, special
 
 from skysim.core.types import Floats
-from skysim.sources.air import scintillation
+from skysim.sources import scintillation
 
 RED_M = 650e-9
 ZENITH = np.ones(1)

@@ -18,12 +18,12 @@ from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
 from skysim.simulation.checks import check
-from skysim.simulation.checks.dome import assumptions
+from skysim.simulation.checks import dome_warnings
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
-from skysim.tracking.navigation import Navigation, build_filter
+from skysim.tracking.navigation import (Navigation, build_filter)
 
 PERFECT = (
     "gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, misalignment_arcsec: 0,"
@@ -393,7 +393,7 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
-    lines = assumptions.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
+    lines = dome_warnings.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
     assert len(lines) == 1
     assert lines[0].startswith(told)
     assert lines[0] in check(lab).findings

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
@@ -34,8 +34,9 @@ from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
-from skysim.tracking.external import interface, process
-from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, check_answer
+from skysim.tracking import tracker_interface
+from skysim.tracking import process
+from skysim.tracking.tracker_interface import (Answer, Leds, Picture, Setup, Stars, check_answer)
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
@@ -266,7 +267,7 @@ def test_a_program_s_name_and_command_are_checked(told: str) -> None:
 OFFSET = """
 import numpy as np
 from scipy.spatial.transform import Rotation
-from skysim.tracking.external.interface import Answer
+from skysim.tracking.tracker_interface import Answer
 
 class Offset:
     '''Told each frame's truth by hand, it answers with an error that is known.'''
@@ -303,11 +304,11 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(
 ) -> None:
     told = loader.load("shefex2", {"tracker.name": "offset"})
     before = setups.scene_hash(told)
-    assert interface.TRACKERS.release("offset") == "offset 1.0"
+    assert tracker_interface.TRACKERS.release("offset") == "offset 1.0"
     (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
     )
-    assert interface.TRACKERS.release("offset") == "offset 1.1"
+    assert tracker_interface.TRACKERS.release("offset") == "offset 1.1"
     assert setups.scene_hash(told) != before
 
 
@@ -352,7 +353,7 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
 
 def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, needs in ((None, "skysim[oracle]"), (object(), "")):
-        monkeypatch.setattr(interface, "find_spec", lambda name, there=there: there)
+        monkeypatch.setattr(tracker_interface, "find_spec", lambda name, there=there: there)
         listed = json.loads(CliRunner().invoke(main.app, ["trackers", "--json"]).stdout)
         assert {one["name"]: one["needs"] for one in listed}["tetra3rs"] == needs
         assert {one["name"]: one["needs"] for one in listed}["own"] == ""

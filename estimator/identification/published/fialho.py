@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -41,7 +41,7 @@ from estimator.identification.direct_match import (
     to_star_match,
     triple,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 MAG_GATE_SIGMA = (
     3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %

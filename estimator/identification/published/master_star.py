@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -28,7 +28,7 @@ from estimator.identification.direct_match import (
     no_match,
     to_star_match,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 
 class SearchOptions(NamedTuple):

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.catalog.pair_index import (PairIndex, first_neighbor, pair_range)
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -25,7 +25,7 @@ from estimator.identification.direct_match import (
     to_star_match,
     triple,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
 # Least angle between base stars, and from them, in tolerances: smaller angles carry little information.

@@ -179,7 +179,7 @@ def print_remarks(solution: dict[str, Any]) -> None:
 
 
 def print_json(data: Any) -> None:
-    from skysim.core.io.files import to_json
+    from skysim.core.files import to_json
 
     print(to_json(data))
 
@@ -210,7 +210,7 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.paths import title_of
+    from skysim.core.files import title_of
 
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
@@ -230,8 +230,8 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
-    from skysim.core.io import files
-    from skysim.dynamics.multibody.view import picture
+    from skysim.core import files
+    from skysim.dynamics.multibody import scene_picture
 
     mjcf = lab.export_mjcf()
     joints = log.joints
@@ -240,10 +240,10 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:
-        files.write_image(image_path, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
-        shown = progress(picture.film(mjcf, states), len(states), "rendering the animation")
-        picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
-    except picture.NoPicture as error:
+        files.write_image(image_path, scene_picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        shown = progress(scene_picture.film(mjcf, states), len(states), "rendering the animation")
+        scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
+    except scene_picture.NoPicture as error:
         print_error(str(error))
         return []
     return [image_path, animation_path]

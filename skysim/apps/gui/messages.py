@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
-from skysim.results import stretch
+from skysim.results import annotate
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
@@ -33,7 +33,7 @@ class Display(NamedTuple):
 
     screen_px: tuple[int, int] = (0, 0)
     limits: str | tuple[float, float] = LIMITS[0]
-    curve: str = next(iter(stretch.CURVES))
+    curve: str = next(iter(annotate.CURVES))
     near_px: tuple[int, int] | None = None
 
 
@@ -176,7 +176,7 @@ class FrameView:
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
     exposure_s: float
-    statistics: stretch.FrameStatistics
+    statistics: annotate.FrameStatistics
     lights: Lights
     result: TrackerResult | None
     ms: float

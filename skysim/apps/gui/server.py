@@ -29,7 +29,7 @@ from starlette.routing import Route, Router
 
 from skysim.apps.gui import memory
 from skysim.apps.gui.page.tab import Tab
-from skysim.apps.gui.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.page.photo_panel import LIMIT_BYTES
 from skysim.apps.gui.views.served import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
@@ -321,7 +321,7 @@ def serve(
 
     token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
         empty
-    cameras : live cameras that the page may watch, see `skysim.core.io.images`
+    cameras : live cameras that the page may watch, see `skysim.core.images`
     workers : greatest number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)

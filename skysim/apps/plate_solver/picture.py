@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
@@ -29,7 +29,8 @@ from skysim.apps.plate_solver.solver import (
     validated_date,
 )
 from skysim.core.errors import InputError, printable
-from skysim.core.io import files, images
+from skysim.core import files
+from skysim.core import images
 
 ANNOTATED = ".annotated.png"
 # The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's

@@ -2,7 +2,7 @@
 
 If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
 Otherwise 2 to 100 degrees are split into N overlapping ranges of focal length, each searched by quads of stars
-(`estimator.identification.stars.quads`) with a tracker that fits the focal length within its range. The image's stars
+(`estimator.identification.star_quads`) with a tracker that fits the focal length within its range. The image's stars
 are detected once; all trackers are tried with little effort before any is tried with more. A tracker has the brightest
 stars of the catalog, as many as its narrowest field needs.
 
@@ -27,16 +27,16 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from estimator.catalog import catalog as star_catalog
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
-from estimator.trackers.residuals.refinement import NO_MATCH
+from estimator.trackers.refinement import NO_MATCH
 from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.time import check_year
 
 if TYPE_CHECKING:
@@ -267,7 +267,7 @@ def kept_solver(
 
 def check_stages(stages: Mapping[str, str]) -> None:
     """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
-    from skysim.tracking.settings import STAR_ALGORITHMS
+    from skysim.tracking.factory import STAR_ALGORITHMS
 
     for stage, name in stages.items():
         if name not in STAR_ALGORITHMS[stage]:
@@ -279,7 +279,7 @@ def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Se
 
     Raises InputError with one line.
     """
-    from skysim.camera.detector.detector import saturation_dn
+    from skysim.camera.detector import saturation_dn
     from skysim.scene import loader
     from skysim.scene import opencv_calibration as opencv
 

@@ -18,8 +18,8 @@ from typing import Any
 from skysim.apps.stream.packet import Packet
 from skysim.apps.stream.sinks import encode_png
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.results.stretch import jpeg, to_8bit
+from skysim.core import files
+from skysim.results.annotate import (jpeg, to_8bit)
 
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # for a client that stops reading

@@ -18,7 +18,7 @@ import numpy as np
 
 from skysim.apps.stream.packet import Packet
 from skysim.core.errors import InputError, printable
-from skysim.core.io import files
+from skysim.core import files
 
 QUEUE_LENGTH = 2  # length of a sink's queue, packets
 CLOSE_TIMEOUT_S = 5.0  # for a sink to write its queued packets at the end

@@ -7,18 +7,15 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import fill, pixel_directions, viewing_geometry
+from skysim.camera.glow.background import (fill, pixel_directions, viewing_geometry)
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
-from skysim.scene.sections import layouts, leds, light
-from skysim.sources.dome.displays.display import (
-    black_transmission,
-    panel_strength_e_s_sr,
-    panel_surface,
-)
-from skysim.sources.dome.displays.projector import white_wall_per_m2
+from skysim.scene.sections import (layouts, leds)
+from skysim.scene.sections import light
+from skysim.sources.dome.display import (black_transmission, panel_strength_e_s_sr, panel_surface)
+from skysim.sources.dome.projector import white_wall_per_m2
 from skysim.sources.dome.led import LOBES
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 NODE_SPACING_PX = 16  # of a projector's glow

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, softening_sigma_px
+from skysim.camera.psf.kernel import (FADE_PX, PsfModel, passband, softening_sigma_px)
 from skysim.camera.psf.otf import EXTENT, WINGED
 from skysim.camera.psf.splat import Singles, cubic
 from skysim.core.jit import jit

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.camera.psf import ellipse
-from skysim.camera.psf.kernel import QUANTUM_PX, Kernel, build_kernel
-from skysim.camera.psf.led_disk import DiskImages
+from skysim.camera.psf.kernel import (QUANTUM_PX, Kernel, build_kernel)
+from skysim.camera.psf.kernel import DiskImages
 from skysim.camera.psf.otf import (
     NOT_ROUND,
     WINGED,

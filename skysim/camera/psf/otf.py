@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import is_file
+from skysim.core.yaml_reader import is_file
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
     AiryPsfConfig,
@@ -159,7 +159,7 @@ def read_cells(file: str) -> Floats:
 
     Raises InputError with one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
     """
-    from skysim.core.io.images import monochrome, read_image
+    from skysim.core.images import (monochrome, read_image)
 
     path = Path(file)
     if not is_file(path):

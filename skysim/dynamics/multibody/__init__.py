@@ -11,6 +11,6 @@ from skysim.dynamics.multibody.model import imu_position_m as imu_position_m
 from skysim.dynamics.multibody.occlusion import Obstacles as Obstacles
 from skysim.dynamics.multibody.occlusion import build_obstacles as build_obstacles
 from skysim.dynamics.multibody.occlusion import occluded as occluded
-from skysim.dynamics.multibody.view.shapes import Laboratory as Laboratory
-from skysim.dynamics.multibody.view.shapes import Shape as Shape
-from skysim.dynamics.multibody.view.shapes import laboratory as laboratory
+from skysim.dynamics.multibody.mjcf_export import Laboratory as Laboratory
+from skysim.dynamics.multibody.mjcf_export import Shape as Shape
+from skysim.dynamics.multibody.mjcf_export import laboratory as laboratory

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import joints
+from skysim.dynamics.multibody.actuators.kind import joints
 from skysim.dynamics.multibody.actuators.registry import TRIM
 from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
 

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.actuators.elements import Hinges, joints
+from skysim.dynamics.multibody.actuators.kind import (Hinges, joints)
 from skysim.dynamics.multibody.actuators.fans import Fans
 from skysim.dynamics.multibody.actuators.registry import (
     KINDS,
@@ -42,7 +42,7 @@ from skysim.dynamics.multibody.mass import (
     tree_mass,
     unbalance,
 )
-from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.mjcf import (compile_spec, load, mujoco_warnings, one_line)
 from skysim.scene.sections.vehicle import VehicleConfig
 
 STEP_S = 1e-3

@@ -6,18 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from skysim.experiments.characterize.night.lens import Night
-from skysim.experiments.characterize.night.star_images import ImageSize
-from skysim.experiments.characterize.sensor.dark_current import DarkCurrent
-from skysim.experiments.characterize.sensor.photon_transfer import (
-    BLACK,
-    CURVATURE,
-    FIRST_DARK,
-    GAIN,
-    LIGHT,
-    model,
-)
-from skysim.experiments.characterize.sensor.sensor import Sensor
+from skysim.experiments.characterize.night_sky import Night
+from skysim.experiments.characterize.night_sky import ImageSize
+from skysim.experiments.characterize.fixed_pattern import DarkCurrent
+from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, LIGHT, model)
+from skysim.experiments.characterize.sensor_fit import Sensor
 from skysim.results.plots import INK, png
 from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
 from skysim.scene.sections.camera import CameraConfig

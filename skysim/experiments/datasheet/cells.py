@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.camera import thermal
+from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.experiments.study.factors import Settings
@@ -21,7 +21,7 @@ from skysim.experiments.study.loader import has_survey_errors
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig, StarsConfig)
 
 SCAN_PX = (
     3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
@@ -136,7 +136,7 @@ def states_c(scene: Scene, count: int) -> list[float]:
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":
         hours = hours[:1]
-    return [float(thermal.TEMPERATURES[history.kind](history, hour)) for hour in hours]
+    return [float(thermal_motion.TEMPERATURES[history.kind](history, hour)) for hour in hours]
 
 
 class Designer:

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.components import mean_known, mean_square_ratio
-from skysim.experiments.datasheet.run import Sheet
-from skysim.experiments.datasheet.terms import GROUPS, rms
+from skysim.experiments.datasheet.components import (mean_known, mean_square_ratio)
+from skysim.experiments.datasheet.datasheet_run import Sheet
+from skysim.experiments.datasheet.components import (GROUPS, rms)
 from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.experiments.datasheet import performance, terms
+from skysim.experiments.datasheet import (performance)
+from skysim.experiments.datasheet import components
 from skysim.experiments.datasheet.cells import TRACKED
-from skysim.experiments.datasheet.components import Bounded, Components
+from skysim.experiments.datasheet.components import (Bounded, Components)
 from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
-from skysim.experiments.datasheet.run import Sheet
+from skysim.experiments.datasheet.datasheet_run import Sheet
 from skysim.results.metrics import Summary
 
 NAMES = {
@@ -41,7 +42,7 @@ class Statement(NamedTuple):
     """All numbers of a datasheet, and the sheet they are from."""
 
     sheet: Sheet
-    terms: dict[str, terms.TermTable]
+    terms: dict[str, components.TermTable]
     fields: int
     bias: list[Bounded]
     causes: list[dict[str, Any]]
@@ -60,14 +61,14 @@ class Statement(NamedTuple):
 
 def state(sheet: Sheet) -> Statement:
     """The statement of a measured sheet, with times of this machine. Raises InputError where too few are solved."""
-    _, solved = terms.term_errors(sheet)
+    _, solved = components.term_errors(sheet)
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
         sheet,
-        terms.term_tables(sheet),
+        components.term_tables(sheet),
         int(solved.sum()),
-        terms.mean_errors(sheet),
-        terms.causes(sheet),
+        components.mean_errors(sheet),
+        components.causes(sheet),
         found,
         performance.claims(found),
         performance.quantiles(sheet),
@@ -200,7 +201,7 @@ def term_section(statement: Statement) -> Section:
         for table in tables.values():
             share = table.squares[name].value / table.squares["total"].value
             row += [size(table.squares[name]), f"{100 * share:.1f}"]
-        rows.append([*row, terms.TERMS.get(name, "of the terms of this scene")])
+        rows.append([*row, components.TERMS.get(name, "of the terms of this scene")])
     ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
     x, y, roll = (bounded(one, 2) for one in statement.bias)
     texts = [
@@ -252,7 +253,7 @@ def lowering_section(statement: Statement) -> Section:
     rows = [
         [
             one["cause"],
-            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in terms.GROUPS),
+            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in components.GROUPS),
         ]
         for one in statement.causes
     ]
@@ -320,7 +321,7 @@ def quantile_section(statement: Statement) -> Section:
         consistency_text(statement.consistency),
     ]
     rows = [
-        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
+        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in components.GROUPS)]
         for one in statement.quantiles
     ]
     return Section(
@@ -357,7 +358,7 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
     """Cells of a pair of frames: noise-equivalent angle and error."""
-    return [arcsec(row[f"{kind}_{name}"]) for name in terms.GROUPS for kind in ("nea", "rms")]
+    return [arcsec(row[f"{kind}_{name}"]) for name in components.GROUPS for kind in ("nea", "rms")]
 
 
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]

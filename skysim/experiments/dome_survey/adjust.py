@@ -23,9 +23,9 @@ from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
-from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, assumed
+from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, assumed)
 from skysim.experiments.dome_survey.survey_run import (
     SurveyRun,
     identified,

@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey.frames import SurveyFrame
-from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
+from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty)
 
 Ints = NDArray[np.int64]
 GATE_SIGMAS = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450

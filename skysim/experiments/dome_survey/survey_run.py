@@ -13,9 +13,9 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import GATE_SIGMAS, Correspondences
-from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, image_sizes
+from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, image_sizes)
 
 STRAY_SIGMA_PX = 0.3  # of a ray to a stray light, for the errors of the attitude and of blends
 STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames may be one

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 
 from skysim.experiments.papers import compare
-from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction
+from skysim.experiments.papers.compare import (VERDICTS, Comparison, Reproduction)
 from skysim.results.plots import png
 from skysim.results.report import (
     Cell,

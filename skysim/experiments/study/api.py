@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skysim.core.io.yaml_reader import override_texts
+from skysim.core.yaml_reader import override_texts
 from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import table as tables
 from skysim.experiments.study.execution import runner, store

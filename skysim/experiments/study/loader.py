@@ -11,11 +11,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
-from skysim.core.io.yaml_reader import check_version, explain, read_yaml, set_key, where_of
-from skysim.dynamics.controllers.interface import CONTROLLERS
+from skysim.core.yaml_reader import (check_version, explain, read_yaml, set_key, where_of)
+from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import unused_options
-from skysim.experiments.study.designs import make_point
-from skysim.experiments.study.factors import Distribution, Factor, Levels, Settings, Value
+from skysim.experiments.study.factors import make_point
+from skysim.experiments.study.factors import (Distribution, Factor, Levels, Settings, Value)
 from skysim.experiments.study.plan import (
     TRIAL,
     AttitudeRange,
@@ -35,8 +35,8 @@ from skysim.experiments.study.plan import (
 from skysim.results import metrics
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.tracking.external.interface import OWN, TRACKERS
+from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
+from skysim.tracking.tracker_interface import (OWN, TRACKERS)
 
 SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
@@ -107,7 +107,8 @@ def check(plan: Plan, to_run: bool) -> None:
 
     to_run : whether the trackers and controllers must be installed
     """
-    from skysim.experiments.study.analysis import cost, search
+    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study.analysis import search
     from skysim.experiments.study.execution.store import COLUMNS
 
     study = plan.study
@@ -132,7 +133,7 @@ def check(plan: Plan, to_run: bool) -> None:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
             if study.optimize:
-                cost.check_parts(study.optimize.cost, scene)
+                search.check_parts(study.optimize.cost, scene)
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))

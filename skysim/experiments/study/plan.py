@@ -22,13 +22,13 @@ from pydantic import (
 )
 
 from skysim.core.errors import InputError
-from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import explain, is_file, set_key
-from skysim.core.paths import STUDIES
+from skysim.core import yaml_reader
+from skysim.core.yaml_reader import (explain, is_file, set_key)
+from skysim.core.files import STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
-from skysim.experiments.study.designs import Design, Point, points
-from skysim.experiments.study.factors import Factor, Settings, Value
-from skysim.results.files.builder.prices import Prices, find_prices, read_prices
+from skysim.experiments.study.factors import (Design, Point, points)
+from skysim.experiments.study.factors import (Factor, Settings, Value)
+from skysim.results.files.prices import (Prices, find_prices, read_prices)
 from skysim.scene.loader import find as find_scene
 from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
-from skysim.experiments.study.designs import make_point
-from skysim.experiments.study.factors import Settings, Value
+from skysim.experiments.study.factors import make_point
+from skysim.experiments.study.factors import (Settings, Value)
 from skysim.experiments.study.plan import (
     TRIAL,
     CentroidTrial,
@@ -25,9 +25,9 @@ from skysim.scene import unused
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig, OnPoints
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import (DomeConfig, StarsConfig)
 from skysim.scene.unused import Rule
-from skysim.tracking import settings
+from skysim.tracking import factory
 
 STREAK_ALGORITHMS = (
     "default",
@@ -88,7 +88,7 @@ DETECTOR = tuple(
 
 def ignores_streak(scene: Scene, trial: Trial) -> bool:
     """Whether neither the detector nor the centroider of skysim's tracker uses a measured streak."""
-    chosen = settings.assumed_settings(scene)
+    chosen = factory.assumed_settings(scene)
     used = {chosen.detector, chosen.centroider} & set(STREAK_ALGORITHMS)
     return isinstance(trial, FrameTrial) and not unused.external(scene) and not used
 

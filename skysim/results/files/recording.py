@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.core.io.fits import read_fits
+from skysim.core import files
+from skysim.core.fits import read_fits
 from skysim.core.types import Floats
 from skysim.sources import stars
 

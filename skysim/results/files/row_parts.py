@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import atomic_file
+from skysim.core.files import atomic_file
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
 KEPT_BYTES = (

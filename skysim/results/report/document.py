@@ -9,7 +9,9 @@ from typing import Any
 
 from skysim.core import __version__
 from skysim.core.errors import InputError, unknown_name
-from skysim.results.report import as_html, as_markdown, as_text
+from skysim.results.report import (as_text)
+from skysim.results.report import pages
+from skysim.results.report import pages
 from skysim.results.report.blocks import Block, Cell, Column, Section, Verdict, figure_files, filled
 
 SUFFIXES = (".html", ".md", ".json")
@@ -47,11 +49,11 @@ class Report:
 
     def html(self) -> str:
         """One self-contained page, its images embedded."""
-        return as_html.page(self.title, self.command, self.version, self.blocks)
+        return pages.html_page(self.title, self.command, self.version, self.blocks)
 
     def markdown(self, pictures: str = "") -> str:
         """A Markdown page. pictures : what the paths of its figures begin with; without it they are left out"""
-        return as_markdown.page(self.title, self.command, self.blocks, pictures)
+        return pages.markdown_page(self.title, self.command, self.blocks, pictures)
 
     def json(self) -> dict[str, Any]:
         """Title, command, version and blocks as values for JSON; figures by their captions."""
@@ -74,7 +76,7 @@ class Report:
 
         Raises InputError for another suffix.
         """
-        from skysim.core.io import files
+        from skysim.core import files
 
         path = Path(path)
         if path.suffix not in SUFFIXES:

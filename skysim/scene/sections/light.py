@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
-
 from pydantic import (
     BeforeValidator,
     Field,
@@ -13,7 +12,6 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError
@@ -30,6 +28,19 @@ from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.orbit import SatellitesConfig
+from typing import Annotated, Any, get_args
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    SerializeAsAny,
+    model_validator,
+)
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.plugins import PluginKind
+from skysim.core.units import ConfigModel
+
+
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -472,3 +483,53 @@ Glow = Annotated[
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
+
+
+
+
+# Schema of the scene section `lights`: further lights, of kinds that modules or installed packages
+# add.
+
+
+PLUGINS = PluginKind("light", "skysim.lights", "lights.kind", ())
+CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added
+
+
+def check_kind(kind: str) -> str:
+    """The name of a kind. Raises InputError for an unknown one, with the known ones."""
+    if kind not in CONFIGS:
+        raise InputError(
+            "", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()}))
+        )
+    return kind
+
+
+class LightConfig(ConfigModel):
+    """A further light; each kind has a class derived from this one."""
+
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": True})
+
+    kind: Annotated[str, AfterValidator(check_kind)]
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def validate_by_kind(
+        cls, value: Any, handler: ModelWrapValidatorHandler[LightConfig]
+    ) -> LightConfig:
+        """Validate a section with the class of its `kind` when called on the base class."""
+        kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
+        if kind not in CONFIGS and kind in PLUGINS.entry_points():
+            PLUGINS.entry_points()[kind].load()  # it registers the kind
+        return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
+
+
+def add_kind(config: type[LightConfig]) -> str:
+    """Add a kind of light to the schema; returns its name, the literal of its `kind`."""
+    (kind,) = get_args(config.model_fields["kind"].annotation)
+    CONFIGS[kind] = config
+    return str(kind)
+
+
+FurtherLight = SerializeAsAny[LightConfig]
+
+

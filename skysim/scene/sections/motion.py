@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import existing_file
+from skysim.core.yaml_reader import existing_file
 from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
 from skysim.scene.sections.vehicle import ActuatorsName
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import existing_file
+from skysim.core.yaml_reader import existing_file
 from skysim.core.units import ConfigModel, Fraction, Length, Number
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import existing_file
+from skysim.core.yaml_reader import existing_file
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
 
@@ -16,7 +16,7 @@ class TotalStationConfig(ConfigModel):
     """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one place.
 
     Errors of the sight are drawn for each LED; those of the set-up once, and are common to all LEDs. See
-    `skysim.sources.dome.survey.total_station`. Sizes are standard deviations or tolerances.
+    `skysim.sources.dome.survey_errors`. Sizes are standard deviations or tolerances.
 
     position           : of its center, where its axes meet, in the lab
     angle_sigma_arcsec : of a direction and of a zenith angle, measured in both faces (ISO 17123-3); of each LED

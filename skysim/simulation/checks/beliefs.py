@@ -24,15 +24,15 @@ from estimator.catalog.catalog import StarCatalog
 from skysim.core.types import Floats, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.displays import display
-from skysim.sources.dome.survey.survey_errors import led_covariance_m2
+from skysim.sources.dome import display
+from skysim.sources.dome.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
-from skysim.tracking.onboard_model import assumed_camera, onboard_catalog
-from skysim.tracking.orbit_velocity import assumed_observer, assumed_orbit
-from skysim.tracking.settings import assumed_settings
+from skysim.tracking.onboard_model import (assumed_camera, onboard_catalog)
+from skysim.tracking.onboard_model import (assumed_observer, assumed_orbit)
+from skysim.tracking.factory import assumed_settings
 
 REACH_PX = 7.0  # of neighbors
 WINDOW_PX = 3  # half the side of the fit's window

@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
-from estimator.identification.stars.search import WRONG_FOCAL
+from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
@@ -50,7 +50,8 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
-from skysim.sources.dome.survey import survey_errors, total_station
+from skysim.sources.dome import survey_errors
+from skysim.sources.dome import survey_errors
 
 
 class Independent(NamedTuple):
@@ -115,7 +116,7 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     instrument = context.lab.scene.tracker.survey.instrument
     if instrument is None:
         return None
-    shifts_m = total_station.common_displacements_m(
+    shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
     parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import (DomeConfig, StarsConfig)
 from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import Sampled, Samples
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
-from skysim.sources.dome.shell.room import fit
+from skysim.sources.dome.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
 SIDES = 12  # to which the greatest tilt is tried, and rays around the field

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import thermal
+from skysim.camera import thermal_motion
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Mount, Sources
@@ -28,7 +28,7 @@ from skysim.simulation.checks.expected_error import Independent, believed_sigma_
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short
 from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.views import View
-from skysim.simulation.lights.background import BACKGROUND
+from skysim.simulation.lights.stars import BACKGROUND
 
 MAX_SATURATED = (
     0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
@@ -424,7 +424,7 @@ def thermal_drift(context: Context, samples: Samples) -> str:
     if not (cross_rad > expected_rad).any():
         return ""
     n = int(np.nanargmax(cross_rad))
-    warm_c = thermal.temperature_c(thermal_config, float(at.t_s[n]))
+    warm_c = thermal_motion.temperature_c(thermal_config, float(at.t_s[n]))
     return (
         f"thermal.reference_c: dome, mount and lens turn the solution by {short(cross_rad[n] / ARCSEC_RAD)}″ (cross) at"
         f" {warm_c:.1f} °C, t = {at.t_s[n]:.1f} s, beside an expected error of"
@@ -445,8 +445,8 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     mount = context.lab.camera.mount
     optics = context.camera.optics
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
-    moved = thermal.camera_at(config, mount, optics, t_s)
-    drifted_px = image_px(thermal.leds_at(config, lights, t_s), *moved, lab_from_body)
+    moved = thermal_motion.camera_at(config, mount, optics, t_s)
+    drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
     return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), drifted_px - surveyed_px))
 
 

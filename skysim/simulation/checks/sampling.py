@@ -18,7 +18,7 @@ from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
 from skysim.simulation.checks.views import VISIBLE, View, view
 from skysim.simulation.exposure import expected_exposure
-from skysim.simulation.lights.light import Beam, Exposure, beam_of
+from skysim.simulation.lights.light import (Beam, Exposure, beam_of)
 
 
 class Sampled(NamedTuple):

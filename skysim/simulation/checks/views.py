@@ -33,7 +33,7 @@ from skysim.core.types import Floats
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lens import STRAY_LIGHT
-from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
+from skysim.simulation.lights.light import (Beam, Exposure, Lit, Occluder, beam_of)
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
 NO_ACCELERATION = np.zeros(3)

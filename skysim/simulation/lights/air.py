@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from skysim.camera.glow.air_glow import air_glow
-from skysim.camera.glow.background import node_directions, viewing_geometry
+from skysim.camera.glow.background import (node_directions, viewing_geometry)
 from skysim.camera.render import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.air import AirGlowConfig
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Obstacle, Occluder
-from skysim.simulation.lights.plan import Plan
-from skysim.sources.air.air import Air, Sky
+from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit, Obstacle, Occluder)
+from skysim.simulation.lights.light import Plan
+from skysim.sources.air import (Air, Sky)
 
 
 @dataclass(frozen=True)

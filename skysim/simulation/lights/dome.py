@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
-from skysim.camera.thermal import leds_at
+from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Sources
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
 from skysim.scene.sections.thermal import ThermalConfig
-from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, Lit
+from skysim.simulation.lights.light import (EdgedGlow, Exposure, KnownLight, Lit)
 from skysim.sources.dome.led import warm_up_factor
-from skysim.sources.dome.timing.clocks import Clocks, build_clocks
-from skysim.sources.dome.timing.codes import LedCodes, build_codes
+from skysim.sources.dome.codes import (Clocks, build_clocks)
+from skysim.sources.dome.codes import (LedCodes, build_codes)
 
 MAX_RUNS = 4  # whose timing is kept
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
 from skysim.simulation.lights.dome import CollimatedDisplay, LedDome
 from skysim.simulation.lights.light import KnownLight
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Plan
 from skysim.simulation.lights.stars import stars_of
 from skysim.sources import dome
-from skysim.sources.dome.displays import display
+from skysim.sources.dome import display
 from skysim.sources.dome.led import Emitter
 
 

@@ -9,13 +9,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from skysim.camera.discs.bodies import centers_of
-from skysim.camera.glow.baffle import stray_around_e_s_m2, stray_of_bodies_e_s_m2
-from skysim.camera.stray.ghosts import ghost_optics
+from skysim.camera.discs import centers_of
+from skysim.camera.glow.earth_glow import (stray_around_e_s_m2, stray_of_bodies_e_s_m2)
+from skysim.camera.glow.stray import ghost_optics
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Path, beam_of
-from skysim.simulation.lights.plan import Plan
-from skysim.sources.solar_system.bodies import BodyLight
+from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit, Path, beam_of)
+from skysim.simulation.lights.light import Plan
+from skysim.sources.bodies import BodyLight
 
 STRAY_LIGHT = "stray light"
 

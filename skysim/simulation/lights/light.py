@@ -14,23 +14,27 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import ClassVar, NamedTuple, Self, TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
-from skysim.camera.discs.bodies import FEW, centers_of
-from skysim.camera.discs.disc_image import Exposed
+from skysim.camera.discs import (FEW, centers_of)
+from skysim.camera.discs import Exposed
 from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, poses
 from skysim.core.types import Floats, Mount, SatelliteTruth, Sources, Trajectory
 from skysim.scene.sections.camera import GlareConfig
 from skysim.sources.dome.led import Emitter
 from skysim.sources.orbit.satellites import View
-from skysim.sources.orbit.viewpoint import Viewpoint
+from skysim.sources.orbit.camera_orbit import Viewpoint
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BodyLight
-from skysim.sources.solar_system.observer import Observer
+from skysim.sources.bodies import BodyLight
+from skysim.sources.ephemeris import Observer
+from dataclasses import dataclass
+from skysim.core.types import Mount
+from skysim.dynamics.multibody.model import VehicleModel
+from skysim.scene.scene import Scene
+from skysim.sources.catalog import Catalog
+
 
 
 class Seeds(NamedTuple):
@@ -295,3 +299,32 @@ def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
     for light in lights:
         beam = light.through(beam, exposure)
     return beam
+
+
+
+
+# What a camera's lights are built from.
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The scene and the hardware around a camera.
+
+    scene     : as the camera sees it, see `Scene.of_head`
+    band      : of its chip
+    vehicle   : that carries it
+    viewpoint : its place on the Earth or in its orbit
+    catalog   : the stars of the scene's light; None under a dome
+    known     : the scene's light in this band, where another camera has it already
+    mount     : of a further camera; None for the main one
+    """
+
+    scene: Scene
+    band: Band
+    vehicle: VehicleModel
+    viewpoint: Viewpoint
+    catalog: Catalog | None
+    known: KnownLight | None = None
+    mount: Mount | None = None
+
+

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occluder
-from skysim.simulation.lights.plan import Plan
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.simulation.lights.light import (Exposure, Light, Lit, Obstacle, Occluder)
+from skysim.simulation.lights.light import Plan
+from skysim.sources.dome.surface import (Surface, build_surface)
 
 INWARD_FRACTION = (
     1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing

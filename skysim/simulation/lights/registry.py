@@ -12,20 +12,15 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from skysim.scene.sections.lights import LightConfig, add_kind
-from skysim.simulation.lights import (
-    air,
-    background,
-    earth,
-    lens,
-    obstacles,
-    satellites,
-    solar_system,
-    wall,
-)
+from skysim.scene.sections.light import (LightConfig, add_kind)
+from skysim.simulation.lights import (air, lens, obstacles, wall)
+from skysim.simulation.lights import stars
+from skysim.simulation.lights import sky_bodies
+from skysim.simulation.lights import sky_bodies
+from skysim.simulation.lights import sky_bodies
 from skysim.simulation.lights.known import known_light
 from skysim.simulation.lights.light import Light
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Plan
 
 KINDS: dict[str, Callable[[Any, Plan], Light]] = {}
 
@@ -46,11 +41,11 @@ def further_lights(plan: Plan) -> Iterator[Light]:
 
 
 LIGHTS: dict[str, Callable[[Plan], Iterable[Light]]] = {
-    "background": background.build,
+    "background": stars.build,
     "stars, LEDs or a display": lambda plan: [known_light(plan)],
-    "Sun, Moon and planets": solar_system.build,
-    "Earth": earth.build,
-    "satellites": satellites.build,
+    "Sun, Moon and planets": sky_bodies.build_solar_system,
+    "Earth": sky_bodies.build_earth,
+    "satellites": sky_bodies.build_satellites,
     "air": air.build,
     "further lights": further_lights,
     "wall": wall.build,

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
-
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, StarSources
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.lights.light import Exposure, KnownLight, Lit
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import (Exposure, KnownLight, Lit)
+from skysim.simulation.lights.light import Plan
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+from skysim.camera.glow.background import glow_map
+from skysim.scene.sections.light import Glow
+from skysim.simulation.lights.light import (Exposure, Light, Lit)
+
 
 
 @dataclass(frozen=True)
@@ -70,3 +75,33 @@ def stars_of(config: StarsConfig, plan: Plan) -> KnownLight:
     if viewpoint.orbit is None:
         return Stars(shown, Emitter())
     return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)
+
+
+
+
+# The scene's section `background`: light leaks and the glow of the sky.
+
+
+BACKGROUND = "background"
+
+
+@dataclass(frozen=True)
+class Background(Light):
+    """Extended light that does not change from frame to frame."""
+
+    only_adds: ClassVar[bool] = True
+    glows: tuple[Glow, ...]
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit(
+            BACKGROUND,
+            glow=lambda: glow_map(
+                self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
+            ),
+        )
+
+
+def build(plan: Plan) -> Iterator[Light]:
+    yield Background(plan.scene.background)
+
+

@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from skysim.camera.stray.wall import images_in_wall, wall_glow
+from skysim.camera.glow.stray import (images_in_wall, wall_glow)
 from skysim.core.types import Floats
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.known import known_light
-from skysim.simulation.lights.light import Beam, Exposure, Light, Lit
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit)
+from skysim.simulation.lights.light import Plan
 from skysim.sources.dome.led import warm_up_factor
-from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
+from skysim.sources.dome.interreflection import (ReflectingDome, reflecting_dome)
 
 
 def images_of(name: str) -> str:

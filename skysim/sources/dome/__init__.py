@@ -9,12 +9,12 @@ from skysim.sources.dome.layouts.boards import patch_boards as patch_boards
 from skysim.sources.dome.layouts.placing import cap as cap
 from skysim.sources.dome.layouts.registry import LAYOUTS as LAYOUTS
 from skysim.sources.dome.layouts.registry import board_of as board_of
-from skysim.sources.dome.shell.room import check_room
-from skysim.sources.dome.shell.surface import SURFACES as SURFACES
-from skysim.sources.dome.shell.surface import Ellipsoid as Ellipsoid
-from skysim.sources.dome.shell.surface import Plane as Plane
-from skysim.sources.dome.shell.surface import Surface as Surface
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.room import check_room
+from skysim.sources.dome.surface import SURFACES as SURFACES
+from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
+from skysim.sources.dome.surface import Plane as Plane
+from skysim.sources.dome.surface import Surface as Surface
+from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import Band
 
 

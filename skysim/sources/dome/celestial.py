@@ -19,7 +19,7 @@ from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band, synthetic_mag
 
 

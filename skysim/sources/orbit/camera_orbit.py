@@ -6,16 +6,18 @@ import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
-
 import numpy as np
-
 from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
 from skysim.sources.orbit.elements import Elements, gcrs_states, read_elements
 from skysim.sources.orbit.oem import Ephemeris, read_oem
-from skysim.sources.solar_system.observer import GcrsState
+from skysim.sources.ephemeris import GcrsState
+from skysim.core.time import tt_jd
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.ephemeris import (GcrsState, Observer, observe_at, site_in_gcrs)
+
 
 
 class CameraOrbit(Protocol):
@@ -138,3 +140,39 @@ ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {
 def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
     """The camera's orbit of a scene; None without the section `orbit`. Raises InputError for an unreadable file."""
     return ORBITS[config.kind](config, start) if config else None
+
+
+
+
+# Where a scene's camera is, on the turning Earth or in its orbit, at any time.
+
+
+@dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """The camera's place from the scene's start on.
+
+    start : UTC at t = 0
+    site  : on the ground; a site without a longitude is the Earth's center
+    orbit : None on the ground
+    """
+
+    start: datetime.datetime
+    site: SiteConfig
+    orbit: CameraOrbit | None = None
+
+    def time_at(self, t_s: float) -> datetime.datetime:
+        """UTC at a time since the start."""
+        return self.start + datetime.timedelta(seconds=t_s)
+
+    def state_at(self, t_s: float) -> GcrsState:
+        """The state from the Earth's center at a time since the start: in the orbit, else at the site."""
+        if self.orbit:
+            return state_at(self.orbit, t_s)
+        time = self.time_at(t_s)
+        return site_in_gcrs(time, tt_jd(time), self.site)
+
+    def observer_at(self, t_s: float) -> Observer:
+        """The state among the bodies of the solar system at a time since the start."""
+        return observe_at(self.time_at(t_s), self.state_at(t_s))
+
+

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
 from skysim.core.types import Floats
-from skysim.sources.solar_system.bodies import BODIES
-from skysim.sources.solar_system.ephemeris import load_ephemeris
+from skysim.sources.bodies import BODIES
+from skysim.sources.ephemeris import load_ephemeris
 
 SUN_RADIUS_M = 1e3 * BODIES["sun"].radius_km
 TO_SPHERE = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]) / EARTH_RADIUS_M  # per meter

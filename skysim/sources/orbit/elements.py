@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError, Where
-from skysim.core.io.text import excerpt, read_lines
+from skysim.core.text import (excerpt, read_lines)
 from skysim.core.time import J2000_JD, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats
 

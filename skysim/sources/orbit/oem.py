@@ -16,15 +16,7 @@ from scipy.interpolate import BPoly
 
 from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError, Where
-from skysim.core.io.text import (
-    Segment,
-    check_version,
-    keyword_value,
-    one_of,
-    read_lines,
-    seconds_since,
-    to_numbers,
-)
+from skysim.core.text import (Segment, check_version, keyword_value, one_of, read_lines, seconds_since, to_numbers)
 from skysim.core.time import J2000_JD, SCALES
 from skysim.core.types import Floats
 

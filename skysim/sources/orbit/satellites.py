@@ -19,8 +19,8 @@ from skysim.scene.sections.orbit import RandomSatellitesConfig
 from skysim.sources.orbit.earth import hidden_by_earth, sun_m, sunlit_fraction, to_astronomical
 from skysim.sources.orbit.elements import Elements, gcrs_states
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.colors import WHITE, reflected_chromatic, reflected_flux_e_s_m2
-from skysim.sources.solar_system.observer import GcrsState
+from skysim.sources.bodies import (WHITE, reflected_chromatic, reflected_flux_e_s_m2)
+from skysim.sources.ephemeris import GcrsState
 from skysim.sources.stars import steady_points
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number

@@ -30,9 +30,10 @@ from tests.helpers.labpage import (
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import Detection, Lights, MotionLog, TrackerResult
-from skysim.apps.gui.panels import lights, strips
+from skysim.apps.gui.page import lights_table
+from skysim.apps.gui.page import strips
 from skysim.apps.gui.worker import playback
-from skysim.apps.gui.worker.scene import geometry
+from skysim.apps.gui.worker import geometry
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 
@@ -50,7 +51,7 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
         Detection(10.3, 20.4, 0.05, 700, 3, 0.02),
         Detection(40.0, 50.0, 0.1, 90, 9, 0.5),
     ]
-    table = list(lights.rows(true, found, "LED {}".format))
+    table = list(lights_table.rows(true, found, "LED {}".format))
     assert [row["id"] for row in table] == [3, 4, 5, -1]
     assert [row["state"] for row in table] == ["good", "warn", "quiet", "warn"]
     assert table[0]["cells"] == ["LED 3", "1.50", "5000", "10.00", "20.00", "0.500", "LED 3"]

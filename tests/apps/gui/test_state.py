@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skysim.apps.gui.page import history
-from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.views.state import View
 from skysim.core.errors import InputError
 from tests.helpers.labpage import (
     CHROMIUM,

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
 
-from estimator.calibration.mass_properties.batch import estimate_mass, estimate_with_noise
-from estimator.calibration.mass_properties.dynamics import Motion, States
-from estimator.calibration.mass_properties.record import BearingRecord, Lab, MassEstimate
-from estimator.calibration.mass_properties.recursive import filter_mass
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.calibration.mass_properties import (estimate_mass, estimate_with_noise)
+from estimator.calibration.mass_dynamics import (Motion, States)
+from estimator.calibration.mass_dynamics import (BearingRecord, Lab, MassEstimate)
+from estimator.calibration.mass_properties import filter_mass
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
 from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 
 NINE = slice(0, 9)

@@ -10,23 +10,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from estimator.calibration.magnitude_zero import magnitude_zero
-from estimator.calibration.star_field import (
-    LENS_PRIOR,
-    Calibration,
-    StarFrame,
-    calibrate,
-    disagreement_px,
-    self_calibrate,
-)
+from estimator.calibration.star_field import magnitude_zero
+from estimator.calibration.star_field import (LENS_PRIOR, Calibration, StarFrame, calibrate, disagreement_px, self_calibrate)
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.io import images
-from skysim.core.paths import ROOT
+from skysim.core import images
+from skysim.core.files import ROOT
 from skysim.sources import hipparcos
 
 # SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimator.catalog import spatial_grid
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 
 
 def directions(rng: np.random.Generator, count: int) -> Floats:

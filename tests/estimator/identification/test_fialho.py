@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
-from estimator.identification.options import Options
+from estimator.catalog import (catalog)
+from estimator.catalog import pair_index
+from estimator.core.checks import Floats
+from estimator.core.checks import ImageError
+from estimator.identification.solver_options import Options
 from estimator.identification.published.fialho import (
     MAG_GATE_SIGMA,
     MIN_SIDE_FRACTION,

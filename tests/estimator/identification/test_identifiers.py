@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats, Ints
-from estimator.core.errors import ImageError
+from estimator.catalog import (catalog)
+from estimator.catalog import pair_index
+from estimator.core.checks import (Floats, Ints)
+from estimator.core.checks import ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.registry import IDENTIFIERS
 

@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats
+from estimator.catalog import (catalog)
+from estimator.catalog import pair_index
+from estimator.core.checks import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail

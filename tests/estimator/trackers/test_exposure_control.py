@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
-from skysim.camera.detector.detector import saturation_dn
+from skysim.camera.detector import saturation_dn
 from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.background import Background
+from skysim.simulation.lights.stars import Background
 
 CONTROL = Control(mean_dn=100.0)
 GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)

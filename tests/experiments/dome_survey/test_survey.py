@@ -23,14 +23,16 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import adjust, matching, procedure
-from skysim.experiments.dome_survey import frames as survey_frames
-from skysim.experiments.dome_survey import prior as survey_prior
-from skysim.experiments.dome_survey import stops as survey_stops
-from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey import (adjust, matching)
+from skysim.experiments.dome_survey import survey_procedure
+from skysim.experiments.dome_survey import survey_frames
+from skysim.experiments.dome_survey import survey_prior
+from skysim.experiments.dome_survey import survey_frames as survey_stops
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.tracking import dome_map_file, factory
+from skysim.tracking import (dome_map_file)
+from skysim.tracking import factory
 from tests.helpers.surveyed_dome import NOISE_PX, attitudes, model, pixels
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
@@ -267,7 +269,7 @@ def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
     prior = survey_prior.calibration_prior(lab)
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
-    taken = procedure.simulated_frames(lab, UNCERTAINTY, stops)
+    taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
     for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):
         names = matching.match_by_imu(survey_frame, prior, UNCERTAINTY)

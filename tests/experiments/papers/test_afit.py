@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import INCH_M
 from skysim.experiments.configs import with_config
-from skysim.experiments.papers.afit import led_tests, surface, test1, test2
+from skysim.experiments.papers.afit import (led_tests, test1, test2)
+from skysim.experiments.papers.afit import afit_surface
 from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
@@ -17,7 +18,7 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
-from skysim.experiments.papers.intervals import confidence_interval
+from skysim.experiments.papers.compare import confidence_interval
 from skysim.scene.loader import load
 from skysim.simulation.lab import Lab
 
@@ -73,7 +74,7 @@ def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
 
 
 def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() -> None:
-    found = surface.contour(test2.measured_dome(load("afit_test2_ideal")))
+    found = afit_surface.contour(test2.measured_dome(load("afit_test2_ideal")))
     rim = 48 - 28.60 + 28.60 * np.sqrt(1 - (31 / 38.88) ** 2)
     assert found["rim_z"].ours.value == pytest.approx(rim, abs=1e-9)
     assert found["rim_rho"].ours.value == pytest.approx(np.hypot(31, rim), abs=1e-9)

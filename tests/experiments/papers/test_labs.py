@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.experiments.papers.other_domes import apl, nps, oled
+from skysim.experiments.papers import apl
+from skysim.experiments.papers import nps
+from skysim.experiments.papers import oled
 from skysim.simulation.lab import build_lab
 
 pytestmark = pytest.mark.slow  # much is compiled

@@ -14,16 +14,12 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.core.paths import ROOT
-from skysim.experiments.papers import compare, intervals, papers_report, published
-from skysim.experiments.papers.compare import (
-    Cause,
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-)
+from skysim.core import files
+from skysim.core.files import ROOT
+from skysim.experiments.papers import (papers_report, published)
+from skysim.experiments.papers import compare
+from skysim.experiments.papers import compare
+from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.published import Experiment, Row
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
 from skysim.results import metrics, plots
@@ -137,9 +133,9 @@ TRIED = 1500
 
 def test_intervals_of_four_hold_what_they_promise() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
-    assert abs(covered(intervals.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
+    assert abs(covered(compare.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
     assert (
-        abs(covered(intervals.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
+        abs(covered(compare.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
     )
 
 
@@ -154,7 +150,7 @@ def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
 
 
 def both(values: np.ndarray) -> tuple[Summary, Summary]:
-    return metrics.resampled(values, np.mean), intervals.bootstrap_interval(values, np.mean)
+    return metrics.resampled(values, np.mean), compare.bootstrap_interval(values, np.mean)
 
 
 # What was published.

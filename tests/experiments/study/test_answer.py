@@ -11,7 +11,7 @@ import yaml
 
 from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import PointRow, format_summary
+from skysim.experiments.study.analysis.table import (PointRow, format_summary)
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report

@@ -10,12 +10,13 @@ from scipy.stats import qmc
 
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import sensitivity, table
+from skysim.experiments.study.analysis import table
+from skysim.experiments.study.analysis import table
 from skysim.experiments.study.execution import engines, replay, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
-from skysim.experiments.study.report import export
+from skysim.experiments.study.report import study_export
 from skysim.results import metrics
 
 STUDY = """schema: 1
@@ -115,7 +116,7 @@ def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
         return np.stack([2 * u[:, 0] + u[:, 1], 3 * u[:, 2] + u[:, 0] * u[:, 1]])
 
     mixed = np.stack([f(np.where(np.arange(3) == n, b, a)) for n in range(3)])
-    first, total = sensitivity.generalized(f(a), f(b), mixed)
+    first, total = table.generalized(f(a), f(b), mixed)
     assert first == pytest.approx(np.array([51, 15, 108]) / 175, abs=5e-3)
     assert total == pytest.approx(np.array([52, 16, 108]) / 175, abs=5e-3)
 
@@ -146,7 +147,7 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""
     told, kept = done(tmp_path, ERRORS)
     with kept as rows:
-        found = {(one.response, one.factor): one for one in sensitivity.indices(told, rows)}
+        found = {(one.response, one.factor): one for one in table.indices(told, rows)}
     assert found["roll_arcsec", "turn_z"].total.value > 0.9
     assert found["cross_arcsec", "turn_z"].total.value < 0.05
     assert found["roll_arcsec", "turn_x"].total.value < 0.1
@@ -164,7 +165,7 @@ def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
     told = loader.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
         runner.prepare_store(told, rows, resume=False)
-        found = sensitivity.indices(told, rows)
+        found = table.indices(told, rows)
     assert len(found) == 6
     assert all(math.isnan(one.total.value) for one in found)
 
@@ -205,13 +206,13 @@ def test_exports_say_what_the_store_says(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
         for suffix in ("csv", "parquet", "zarr"):
-            export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
+            study_export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
         columns = rows.columns()
         lines = table.table(rows, told.study.responses)
         with pytest.raises(
             InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"
         ):
-            export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
+            study_export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
     with (tmp_path / "trials.csv").open() as file:
         written = list(csv.DictReader(file))
     assert len(written) == told.trials == 16
@@ -235,7 +236,7 @@ def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
     """A study of centroids has no pointing error and no streak; the columns that are left are the store's, in order."""
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
-        export.export(rows, told.study.responses, tmp_path / "trials.csv")
+        study_export.export(rows, told.study.responses, tmp_path / "trials.csv")
         columns = table.trial_columns(rows)
     written = (tmp_path / "trials.csv").read_text().splitlines()[0].split(",")
     empty = {"pointing_arcsec", "filter_arcsec", "streak_px", "body_tilt_deg"}

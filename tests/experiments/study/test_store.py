@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, SceneArg, load
+from skysim.apps.cli.options import (Json, Overrides, SceneArg, load)
 from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
@@ -17,7 +17,7 @@ from skysim.results.report.blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
-    from skysim.sources.orbit.availability import Pointing, Samples
+    from skysim.sources.orbit.orbit_availability import (Pointing, Samples)
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 LAWS = ("inertial", "zenith")
@@ -87,7 +87,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 
     from skysim.camera.glow.background import direction
     from skysim.scene.sections.motion import PointingConfig
-    from skysim.sources.orbit.availability import Pointing
+    from skysim.sources.orbit.orbit_availability import Pointing
 
     start = scene.motion.start
     if law == "zenith":
@@ -105,7 +105,7 @@ def computed(
 
     from skysim.core.constants import EARTH_MU_M3_S2
     from skysim.sources import catalog, stars
-    from skysim.sources.orbit.availability import sample
+    from skysim.sources.orbit.orbit_availability import sample
     from skysim.sources.orbit.camera_orbit import build_orbit
 
     orbit = build_orbit(scene.orbit, scene.start_time)
@@ -151,7 +151,7 @@ def write_picture(path: Path, found: Samples, scene: Scene) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
     import numpy as np
 
-    from skysim.core.io.files import atomic_file
+    from skysim.core.files import atomic_file
     from skysim.results.plots import INK, png
 
     assert scene.orbit is not None

@@ -10,28 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skysim.apps.cli import terminal
-from skysim.apps.cli.option_names import with_location
-from skysim.apps.cli.options import (
-    LOADED,
-    TRACKER_HELP,
-    Centroider,
-    Detector,
-    Frames,
-    Identifier,
-    Json,
-    OpenReport,
-    Out,
-    Overrides,
-    Programs,
-    SceneArg,
-    Seed,
-    SolverName,
-    load,
-    output_folder,
-    scene_names,
-    selected_stages,
-    used_programs,
-)
+from skysim.apps.cli.options import with_location
+from skysim.apps.cli.options import (LOADED, TRACKER_HELP, Centroider, Detector, Frames, Identifier, Json, OpenReport, Out, Overrides, Programs, SceneArg, Seed, SolverName, load, output_folder, scene_names, selected_stages, used_programs)
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
@@ -117,14 +97,14 @@ def render(
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.results.run import FlightRecorder
-    from skysim.simulation.checks.dome import assumptions
+    from skysim.simulation.checks import dome_warnings
     from skysim.simulation.flight import open_flight
 
     loaded = load(scene, frames, seed, set_)
     folder = output_folder(out, loaded.name)
     paths = list[str]()
     with open_flight(loaded) as flight:
-        if warning := assumptions.camera_outside_warning(
+        if warning := dome_warnings.camera_outside_warning(
             loaded, flight.lab.camera.mount, flight.lab.start
         ):
             terminal.print_error(warning)
@@ -186,12 +166,12 @@ def compare(
 
 def trackers(json: Json = False) -> None:
     """List the available trackers, and what each still needs to be installed."""
-    from skysim.tracking.external import interface
+    from skysim.tracking import tracker_interface
 
-    entries = [{"name": interface.OWN, "from": "skysim", "needs": ""}]
+    entries = [{"name": tracker_interface.OWN, "from": "skysim", "needs": ""}]
     entries += [
-        {"name": name, "from": point.value, "needs": interface.missing_extra(point)}
-        for name, point in interface.TRACKERS.entry_points().items()
+        {"name": name, "from": point.value, "needs": tracker_interface.missing_extra(point)}
+        for name, point in tracker_interface.TRACKERS.entry_points().items()
     ]
 
     def line(entry: dict[str, str]) -> str:

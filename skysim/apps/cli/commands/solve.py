@@ -7,15 +7,7 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import (
-    Centroider,
-    Detector,
-    Identifier,
-    Json,
-    SolverName,
-    datetime_from_iso,
-    selected_stages,
-)
+from skysim.apps.cli.options import (Centroider, Detector, Identifier, Json, SolverName, datetime_from_iso, selected_stages)
 from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
 from skysim.core.errors import InputError
 
@@ -68,8 +60,8 @@ def solve(
     """
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
-    from skysim.core.io import files
-    from skysim.core.io.images import grab_frame
+    from skysim.core import files
+    from skysim.core.images import grab_frame
 
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.options import (Frames, Json, Overrides, SceneArg, Seed, load)
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ def stream(
 ) -> None:
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
     from skysim.apps.stream import sender
-    from skysim.apps.stream.pacing import Pace
+    from skysim.apps.stream.sender import Pace
     from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
-    from skysim.core.io import files
+    from skysim.core import files
     from skysim.simulation.flight import open_flight
 
     if folder is None and http is None and pipe is None:

@@ -9,23 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import (
-    Json,
-    OpenReport,
-    Out,
-    Overrides,
-    Programs,
-    complete_study,
-    output_folder,
-    study_names,
-    used_programs,
-)
-from skysim.apps.cli.study_summary import (
-    print_replay,
-    print_study_status,
-    print_worst,
-    study_status,
-)
+from skysim.apps.cli.options import (Json, OpenReport, Out, Overrides, Programs, complete_study, output_folder, study_names, used_programs)
+from skysim.apps.cli.summaries import (print_replay, print_study_status, print_worst, study_status)
 from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 
@@ -61,7 +46,7 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.paths import STUDIES
+    from skysim.core.files import STUDIES
 
     print_titles(STUDIES, json)
 
@@ -83,9 +68,9 @@ def run(
 ) -> None:
     """Run a study, or a search if called as `optimize`, that has no store yet."""
     start_workers(engine)
-    from skysim.core.io.yaml_reader import parse_overrides
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
-    from skysim.tracking.external import process
+    from skysim.tracking import process
 
     overrides = parse_overrides(set_)
     plan = loader.load(study, overrides, process.program_commands(program))
@@ -163,7 +148,7 @@ def export(
     out: Out = None,
 ) -> None:
     """Write a study's results for other tools."""
-    from skysim.experiments.study.report import export as study_export
+    from skysim.experiments.study.report import study_export
 
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
@@ -258,7 +243,7 @@ def worst(
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.io.yaml_reader import parse_overrides, parse_yaml
+    from skysim.core.yaml_reader import (parse_overrides, parse_yaml)
 
     return {
         key: parse_yaml(text)[1]
@@ -328,7 +313,8 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study.analysis import search, table
+    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study.analysis import table
     from skysim.experiments.study.report import study_report
 
     path = folder_of(study, out) / "report.html"
@@ -385,10 +371,10 @@ def load_stored_plan(
 
     Raises InputError if the store holds another study, or this one before it was changed.
     """
-    from skysim.core.io.yaml_reader import parse_overrides
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
     from skysim.experiments.study.execution import runner
-    from skysim.tracking.external import process
+    from skysim.tracking import process
 
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)

@@ -6,28 +6,100 @@ will show and how accurate its tracker will be.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
+from typing import Any
+from pydantic import BaseModel
+from skysim.experiments.study.plan import Study
+from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.camera import CameraConfig
+import contextlib
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
-
 import typer
-
-from skysim.apps.cli.option_names import with_location
-from skysim.apps.cli.options import (
-    Json,
-    Overrides,
-    Programs,
-    SceneArg,
-    load,
-    scene_names,
-    study_names,
-    used_programs,
-)
+from skysim.apps.cli.options import with_location
+from skysim.apps.cli.options import (Json, Overrides, Programs, SceneArg, load, scene_names, study_names, used_programs)
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
-from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS
+
+
+
+
+
+# JSON Schema of scene and study files, for editors.
+
+
+SCHEMA_KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
+EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
+    Scene.__name__: {
+        "base": {
+            "type": "string",
+            "description": "another scene: its name, or a file beside this one",
+        }
+    },
+    CameraConfig.__name__: {
+        "preset": {
+            "type": "string",
+            "description": "a file of data/cameras that supplies the missing keys",
+        },
+        "calibration": {
+            "type": "string",
+            "description": "an OpenCV calibration file: focal length, center, distortion",
+        },
+    },
+}
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+DROPPED_KEYWORDS = ("required", "discriminator", "default")
+BOUND_KEYWORDS = {
+    "ge": "minimum",
+    "gt": "exclusiveMinimum",
+    "le": "maximum",
+    "lt": "exclusiveMaximum",
+}
+
+
+def json_schema(kind: str) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of a kind of file."""
+    model = SCHEMA_KINDS[kind]
+    schema = relaxed(model.model_json_schema(by_alias=True), model.__name__)
+    return {"$schema": DIALECT, "title": f"A {kind} of skysim", "required": ["schema"]} | {
+        key: value for key, value in schema.items() if key != "title"
+    }
+
+
+def relaxed(node: Any, name: str = "") -> Any:
+    """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
+
+    name : of the definition that `node` is, for which EXTRA_KEYS may add keys
+    """
+    if isinstance(node, list):
+        return [relaxed(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    relaxed_node: dict[str, Any] = {}
+    for key, value in node.items():
+        if key == "properties":
+            properties = {
+                key_name: relaxed(child)
+                for key_name, child in value.items()
+                if key_name != NAME_ALIAS
+            }
+            relaxed_node[key] = properties | EXTRA_KEYS.get(name, {})
+        elif key == "$defs":
+            relaxed_node[key] = {
+                key_name: relaxed(child, key_name) for key_name, child in value.items()
+            }
+        elif (
+            key in BOUND_KEYWORDS
+        ):  # pydantic's keyword remains where a validator precedes the bound
+            relaxed_node |= (
+                {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+            )
+        elif key not in DROPPED_KEYWORDS and (key != "title" or name):
+            relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
+    return relaxed_node
+
 
 KINDS = ("scene", "study")
 
@@ -58,17 +130,16 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     if schema is not None:
-        from skysim.apps.cli import json_schema
 
         if schema not in KINDS:
             raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
-        print_json(json_schema.json_schema(schema))
+        print_json(json_schema(schema))
         return
     if not files:
         raise InputError("", "no files", "files, or --schema scene")
     programs = {}
     if program:
-        from skysim.tracking.external import process
+        from skysim.tracking import process
 
         programs = process.program_commands(program)
     verdicts = [check_file(path, programs) for path in files]
@@ -117,7 +188,7 @@ def describe_file(
     path: Path, programs: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
-    from skysim.core.io.yaml_reader import is_file, read_yaml
+    from skysim.core.yaml_reader import (is_file, read_yaml)
     from skysim.scene import opencv_calibration
 
     path = path if path.suffix else find_shipped(path)
@@ -165,8 +236,8 @@ def names_in_file(path: Path) -> set[str | None]:
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
-    from skysim.core.io.yaml_reader import find_file
-    from skysim.core.paths import DATA, SCENES, STUDIES
+    from skysim.core.yaml_reader import find_file
+    from skysim.core.files import (DATA, SCENES, STUDIES)
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
     return next((file for file in names if file.is_file()), None) or find_file(
@@ -207,3 +278,5 @@ def describe_table(path: Path) -> str:
     if "{name: hip," in first:
         return f"a catalog of {len(catalog.read(path).hip)} stars"
     return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"
+
+

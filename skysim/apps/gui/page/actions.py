@@ -10,10 +10,10 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.shared import keys
-from skysim.apps.gui.shared.context import PageContext
+from skysim.apps.gui.views import keys
+from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.worker.scene import pointing
+from skysim.apps.gui.worker import geometry
 
 Action = Callable[[], Awaitable[None] | None]
 
@@ -161,8 +161,8 @@ class Actions:
             return
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
-            step = pointing.COARSE if event.modifiers.shift else pointing.FINE
-            roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
+            step = geometry.COARSE if event.modifiers.shift else geometry.FINE
+            roll = geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
             await self.move(right * step, up * step, roll_sign * roll)
         elif action == "step":
             await self.step(1 if name == "." else -1)

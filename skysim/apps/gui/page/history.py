@@ -12,8 +12,8 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.shared.context import Shown
-from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.views.context import Shown
+from skysim.apps.gui.views.state import View
 
 SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s

@@ -15,26 +15,29 @@ from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.page.arrangement import Arrangement
+from skysim.apps.gui.page.head import Arrangement
 from skysim.apps.gui.page.head import Head
 from skysim.apps.gui.page.history import History
-from skysim.apps.gui.page.log import LogPanel
-from skysim.apps.gui.panels import lights, monte_carlo
-from skysim.apps.gui.panels.attitude import AttitudeCard
-from skysim.apps.gui.panels.lights import LightsPanel
-from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
-from skysim.apps.gui.panels.photo import PhotoPanel
-from skysim.apps.gui.panels.plan import PlanPanel
-from skysim.apps.gui.panels.run import RunPanel
-from skysim.apps.gui.panels.settings import ScenePanel, TrackerPanel
-from skysim.apps.gui.shared import forms, keys, style
-from skysim.apps.gui.shared.live import Contents
-from skysim.apps.gui.shared.state import View
-from skysim.apps.gui.shared.texts import for_page
+from skysim.apps.gui.page.log_panel import LogPanel
+from skysim.apps.gui.page import lights_table
+from skysim.apps.gui.page import monte_carlo_panel
+from skysim.apps.gui.page.attitude_card import AttitudeCard
+from skysim.apps.gui.page.lights_table import LightsPanel
+from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
+from skysim.apps.gui.page.photo_panel import PhotoPanel
+from skysim.apps.gui.page.plan_panel import PlanPanel
+from skysim.apps.gui.page.run_panel import RunPanel
+from skysim.apps.gui.page.settings_panel import (ScenePanel, TrackerPanel)
+from skysim.apps.gui.views import forms
+from skysim.apps.gui.views import keys
+from skysim.apps.gui.views import style
+from skysim.apps.gui.views.live import Contents
+from skysim.apps.gui.views.state import View
+from skysim.apps.gui.views.live import for_page
 from skysim.apps.gui.views.sensor import Sensor
 from skysim.apps.gui.views.served import FRAMES
 from skysim.apps.gui.views.space import Scene3D
-from skysim.apps.gui.worker import export
+from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
@@ -139,8 +142,8 @@ class Tab:
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
         # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
-        ui.timer(lights.UPDATE_S, self.update_lights)
-        ui.timer(monte_carlo.POLL_S, self.study_panel.poll)
+        ui.timer(lights_table.UPDATE_S, self.update_lights)
+        ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
     async def build_panels(self) -> None:
         with ui.element("div").classes("lab-panes"):
@@ -213,7 +216,7 @@ class Tab:
             *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
             *(
                 Command(f"export: {name}", "", partial(self.head.export, name))
-                for name in export.FILE_BY_ITEM
+                for name in image_export.FILE_BY_ITEM
             ),
         ]
 

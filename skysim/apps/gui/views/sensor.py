@@ -29,19 +29,19 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.shared import keys
-from skysim.apps.gui.shared.live import Contents, LiveText
+from skysim.apps.gui.views import keys
+from skysim.apps.gui.views.live import (Contents, LiveText)
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
-from skysim.apps.gui.views.star_names import NAMES
+from skysim.apps.gui.views.overlay import NAMES
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
-from skysim.results import stretch
-from skysim.sources.solar_system.bodies import NAMES as BODIES
+from skysim.results import annotate
+from skysim.sources.bodies import NAMES as BODIES
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
-STRETCHES = list(stretch.CURVES)
+STRETCHES = list(annotate.CURVES)
 COLOR_MAPS = {
     "gray": None,
     "gray, inverted": None,
@@ -302,7 +302,7 @@ def color_table(name: str) -> str:
 
 def statistics_text(
     size_px: tuple[int, int],
-    statistics: stretch.FrameStatistics,
+    statistics: annotate.FrameStatistics,
     result: TrackerResult | None,
     view: FrameView | None = None,
     scene_info: SceneInfo | None = None,

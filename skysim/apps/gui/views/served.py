@@ -15,7 +15,7 @@ from nicegui import json
 from skysim.apps.gui.messages import LIMITS, Display, Pixels
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
-from skysim.results.stretch import CURVES
+from skysim.results.annotate import CURVES
 
 MAX_SCREEN_PX = 10**5
 KEPT_FRAMES = 5

@@ -16,10 +16,10 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
-from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.style import DARK, color_scale
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.style import (DARK, color_scale)
 from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.worker.scene.push import Grip
+from skysim.apps.gui.worker.push import Grip
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 

@@ -25,23 +25,17 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     Triple,
 )
-from skysim.apps.gui.worker.scene import lens as lenses
-from skysim.apps.gui.worker.workbench import (
-    detection_views,
-    id_prefix,
-    magnitude_by_id,
-    matches_by_row,
-    tracker_result,
-    true_lights,
-)
+from skysim.apps.gui.worker import geometry as lenses
+from skysim.apps.gui.worker.workbench import (detection_views, id_prefix, magnitude_by_id, matches_by_row, tracker_result, true_lights)
 from skysim.core.errors import InputError
-from skysim.core.io import images
+from skysim.core import images
 from skysim.experiments.study import loader
 from skysim.experiments.study.execution import replay, store
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
-from skysim.results import scoring, stretch
+from skysim.results import (scoring)
+from skysim.results import annotate
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +51,7 @@ class Photo:
     size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
-    statistics: stretch.FrameStatistics
+    statistics: annotate.FrameStatistics
     pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
     lens: Lens | None = None
@@ -116,7 +110,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         (width, height),
         result,
         {},
-        stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
+        annotate.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.lab.camera.mount),
         lights=true_lights(truth, magnitude_by_id(setup.lab)),
@@ -148,7 +142,7 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    statistics = stretch.frame_statistics(image, saturation_dn)
+    statistics = annotate.frame_statistics(image, saturation_dn)
     photo = Photo((width, height), result, solution, statistics)
     if attitude.solved:
         camera = attitude.camera or tracker.camera

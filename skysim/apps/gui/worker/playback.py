@@ -13,7 +13,7 @@ import numpy as np
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
 from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.workbench import Workbench, tracker_result
+from skysim.apps.gui.worker.workbench import (Workbench, tracker_result)
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry

@@ -24,12 +24,15 @@ from skysim.apps.gui.messages import (
     SurveyPlan,
     Triple,
 )
-from skysim.apps.gui.worker import export, photo, pixels, playback
-from skysim.apps.gui.worker.scene import planning, pointing, survey
-from skysim.apps.gui.worker.scene.push import Grip, Push
+from skysim.apps.gui.worker import (photo, pixels, playback)
+from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.worker import workbench as planning
+from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.worker import survey_flight
+from skysim.apps.gui.worker.push import (Grip, Push)
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
-from skysim.core.io import images
+from skysim.core import images
 
 KEPT_IMAGES = 3  # the page may still show one before the newest
 
@@ -51,7 +54,7 @@ class Worker:
     number: int = 0
     flight: playback.Playback | None = None
     pushed: Push | None = None
-    surveyed: survey.Survey | None = None
+    surveyed: survey_flight.Survey | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -85,7 +88,7 @@ class Worker:
         return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
 
     @property
-    def survey_of_scene(self) -> survey.Survey:
+    def survey_of_scene(self) -> survey_flight.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
         if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
             raise InputError("", "no survey of this scene: plan one")
@@ -122,7 +125,7 @@ class Worker:
         """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = pointing.from_angles(
+            bench.lab_from_body = geometry.from_angles(
                 bench.scene, bench.lab.camera.mount, angles_deg
             )
         self.current = bench
@@ -139,12 +142,12 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
+        bench.lab_from_body = geometry.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.moved(
+        bench.lab_from_body = geometry.moved(
             bench.scene, bench.lab.camera.mount, bench.lab_from_body, right, up, roll_deg
         )
         return self.render(solve)
@@ -174,7 +177,7 @@ class Worker:
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
-        self.surveyed, plan = survey.begin(self.workbench.scene, frames)
+        self.surveyed, plan = survey_flight.begin(self.workbench.scene, frames)
         return plan
 
     def adjust_survey(self, frames: int) -> SurveyFound:
@@ -212,10 +215,10 @@ class Worker:
     def export(self) -> dict[str, bytes]:
         """The files of the image on the page."""
         if self.other is not None and self.image is not None:
-            return export.photo_files(self.other, self.image)
+            return image_export.photo_files(self.other, self.image)
         if self.flight:
             self.flight.render()
-        return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
+        return image_export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

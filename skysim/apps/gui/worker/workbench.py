@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
 from estimator.attitude.dome_map import project
 from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
@@ -24,11 +22,13 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.worker.scene import geometry, lens
+from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.worker import geometry as lens
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.results import scoring, stretch
+from skysim.results import (scoring)
+from skysim.results import annotate
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -37,7 +37,14 @@ from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory
-from skysim.tracking import settings as tracker_settings
+from skysim.tracking import factory as tracker_settings
+from skysim.apps.gui.messages import AmbiguityMap, PlanCheck
+from skysim.experiments.dome_survey import survey_prior
+from skysim.simulation import checks
+from skysim.simulation.lab import Lab
+from skysim.tracking import onboard_model
+
+
 
 STAGES = ("detector", "centroider", "identifier", "solver")
 
@@ -155,7 +162,7 @@ class Workbench:
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
-            stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
+            annotate.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
             result,
             1e3 * seconds,
@@ -270,3 +277,32 @@ def search_windows_px(
     _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
+
+
+
+
+# What a lab wants to know before it runs a scene: its check and its ambiguous fields.
+
+
+def check(lab: Lab) -> PlanCheck:
+    """The facts of a scene and its warnings, as `skysim check` prints them."""
+    found = checks.check(lab)
+    return PlanCheck(
+        tuple((fact.name, tuple(fact.lines)) for fact in found.facts), tuple(found.findings)
+    )
+
+
+def ambiguity(lab: Lab) -> AmbiguityMap:
+    """How much of the field about each LED another field shows too. Raises InputError for a scene without such fields.
+
+    See `skysim.sources.dome.layouts.ambiguity`.
+    """
+    found, coincidence_m = checks.ambiguity_map(lab)
+    ids = onboard_model.assumed_dome(
+        lab.scene, survey_prior.require_dome(lab.scene), lab.camera.sources
+    ).id
+    return AmbiguityMap(
+        ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m
+    )
+
+

@@ -15,15 +15,8 @@ from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import Hinges, add_motor, joints, member_values
-from skysim.dynamics.multibody.actuators.kind import (
-    RANK_TOLERANCE,
-    ActuatorKind,
-    ControlInput,
-    positive_values,
-    scale_to_limit,
-    unit_columns,
-)
+from skysim.dynamics.multibody.actuators.kind import (Hinges, add_motor, joints, member_values)
+from skysim.dynamics.multibody.actuators.kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
 from skysim.scene.sections.vehicle import CmgsConfig
 
 GIMBAL = "gimbal_"

@@ -12,15 +12,8 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import add_motor, all_names, sites
-from skysim.dynamics.multibody.actuators.kind import (
-    RANK_TOLERANCE,
-    ActuatorKind,
-    Actuators,
-    ControlInput,
-    scale_to_limit,
-    unit_columns,
-)
+from skysim.dynamics.multibody.actuators.kind import (add_motor, all_names, sites)
+from skysim.dynamics.multibody.actuators.kind import (RANK_TOLERANCE, ActuatorKind, Actuators, ControlInput, scale_to_limit, unit_columns)
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
 

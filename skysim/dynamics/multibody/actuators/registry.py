@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuators.cmgs import CMGS
-from skysim.dynamics.multibody.actuators.elements import add_motor, joints, sites
+from skysim.dynamics.multibody.actuators.kind import (add_motor, joints, sites)
 from skysim.dynamics.multibody.actuators.fans import FANS
-from skysim.dynamics.multibody.actuators.kind import ActuatorKind, Actuators, ControlInput
+from skysim.dynamics.multibody.actuators.kind import (ActuatorKind, Actuators, ControlInput)
 from skysim.dynamics.multibody.actuators.wheels import WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
 

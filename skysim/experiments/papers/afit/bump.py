@@ -13,15 +13,9 @@ import numpy as np
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.afit.test3_images import angles_deg
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import prediction_interval
+from skysim.experiments.papers.afit.test3 import angles_deg
+from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.plots import INK
 from skysim.scene import loader

@@ -25,14 +25,8 @@ from skysim.experiments.papers.afit.test_stand import (
     measure_lights,
     render_at_attitude,
 )
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import confidence_interval
+from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK

@@ -23,14 +23,8 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import confidence_interval
+from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -39,7 +33,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import SlewConfig
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.known import known_light
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Plan
 from skysim.tracking import onboard_model
 
 LEDS = 9

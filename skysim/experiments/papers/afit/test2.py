@@ -19,26 +19,15 @@ from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config
-from skysim.experiments.papers.afit.surface import contour
+from skysim.experiments.papers.afit.afit_surface import contour
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
     build_test_stand,
     measure_frame,
     separations_arcsec,
 )
-from skysim.experiments.papers.compare import (
-    Drawing,
-    ExperimentOptions,
-    ExperimentResult,
-    RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import (
-    bootstrap_interval,
-    confidence_interval,
-    sample_std,
-    symmetric_interval,
-)
+from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import (bootstrap_interval, confidence_interval, sample_std, symmetric_interval)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
@@ -47,7 +36,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import MoffatPsfConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.surface import (Surface, build_surface)
 from skysim.tracking import onboard_model
 
 PLACES_DEG = (

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.calibration.home_position import instrument_brightness
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
@@ -24,7 +24,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Plan
 from skysim.simulation.lights.registry import build_lights
 from skysim.tracking import onboard_model
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import PointRow, format_level
-from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
+from skysim.experiments.study.analysis.table import (PointRow, format_level)
+from skysim.experiments.study.factors import (Distribution, Levels, Range, Value, split_quantity)
 from skysim.experiments.study.plan import Figure, Study, Threshold
 from skysim.results import metrics
 

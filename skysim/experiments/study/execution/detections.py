@@ -26,7 +26,7 @@ from skysim.simulation.exposure import exposure_of
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.simulation.lights.air import Atmosphere
 from skysim.simulation.lights.dome import LedDome
-from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
+from skysim.simulation.lights.light import (Exposure, Obstacle, any_of, find_light)
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 

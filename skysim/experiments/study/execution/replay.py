@@ -12,15 +12,15 @@ import numpy as np
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
-from skysim.core.io import files as file_io
+from skysim.core import files as file_io
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
 from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.results.annotate import annotate, visible
-from skysim.results.files import frames
+from skysim.results.annotate import (annotate, visible)
+from skysim.results.files import frame_folder
 from skysim.tracking import factory
 
 MAX_FRAMES = 100  # maximum number of frames written for a flight
@@ -61,10 +61,10 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     pictures = []
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
-        frames.remove_results(file_io.make_folder(folder))
+        frame_folder.remove_results(file_io.make_folder(folder))
         try:
             for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
-                frames.write_frame(folder, frame, truth, setup.lab.scene)
+                frame_folder.write_frame(folder, frame, truth, setup.lab.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
                 match = report.attitude.match

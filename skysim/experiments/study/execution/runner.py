@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.setups import code_version, scene_hash
 from skysim.experiments.study.execution.store import Store

@@ -12,17 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.paths import DATA, ROOT
-from skysim.dynamics.controllers.interface import CONTROLLERS
+from skysim.core.files import (DATA, ROOT)
+from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
-from skysim.scene.sections.lights import PLUGINS
+from skysim.scene.sections.light import PLUGINS
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.simulation.user_parts import UserParts
 from skysim.tracking import factory
-from skysim.tracking.external.interface import TRACKERS
+from skysim.tracking.tracker_interface import TRACKERS
 
 CACHE_SIZE = 4  # setups that a worker caches
 

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import make_folder, remove
-from skysim.experiments.study.designs import Point
+from skysim.core.files import (make_folder, remove)
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.results.files import row_parts

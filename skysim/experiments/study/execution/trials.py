@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
-from skysim.camera.detector.added_charge import AddedCharge
+from skysim.camera.detector import AddedCharge
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
 from skysim.experiments.study.execution.detections import (
@@ -63,9 +63,9 @@ from skysim.simulation.flight import Flight
 from skysim.simulation.lab import StarCamera
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.simulation.user_parts import UserParts
-from skysim.sources.air.air import topocentric_axes
-from skysim.sources.solar_system.observer import observe_from
-from skysim.sources.solar_system.places import place
+from skysim.sources.air import topocentric_axes
+from skysim.sources.ephemeris import observe_from
+from skysim.sources.ephemeris import place
 from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second

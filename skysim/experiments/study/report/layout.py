@@ -23,7 +23,7 @@ from skysim.experiments.study.analysis.axes import (
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.table import PointRow, format_level, has_few_values
+from skysim.experiments.study.analysis.table import (PointRow, format_level, has_few_values)
 from skysim.experiments.study.analysis.thresholds import thresholds_of
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics

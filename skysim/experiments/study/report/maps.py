@@ -18,7 +18,7 @@ from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo
+from skysim.experiments.study.report.figures import (HATCHED, add_color_bar, color_scale, halo)
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns

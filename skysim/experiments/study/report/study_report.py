@@ -9,18 +9,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skysim.core.paths import STUDIES
+from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import answer, search, sensitivity
+from skysim.experiments.study.analysis import answer
+from skysim.experiments.study.analysis import search
+from skysim.experiments.study.analysis import table as sensitivity
 from skysim.experiments.study.analysis import table as tables
 from skysim.experiments.study.analysis.axes import axis, is_sampled, same, shown_points
 from skysim.experiments.study.analysis.search import SearchResult
-from skysim.experiments.study.analysis.sensitivity import Index
-from skysim.experiments.study.analysis.table import PointRow, format_response, format_summary
+from skysim.experiments.study.analysis.table import Index
+from skysim.experiments.study.analysis.table import (PointRow, format_response, format_summary)
 from skysim.experiments.study.analysis.worst import ColumnsOf
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
-from skysim.experiments.study.report import figures, layout, maps
+from skysim.experiments.study.report import (layout, maps)
+from skysim.experiments.study.report import figures
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
 from skysim.results.report import (

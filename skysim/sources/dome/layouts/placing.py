@@ -23,8 +23,8 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.placement.neighborhoods import unique_levels
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.layouts.neighborhoods import unique_levels
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 Ints = NDArray[np.int64]

@@ -1,0 +1,419 @@
+"""Read YAML files safely, and turn a pydantic validation error into an InputError with file and line.
+
+Input files may come from untrusted sources, so their size, depth and number of values are limited (`StrictLoader`),
+and duplicate keys are rejected (`reject_duplicate_keys`). `explain` takes the first error that pydantic reports,
+translates its location to the keys of the YAML tree, and `where_of` finds the line of that key in the file that defines
+it.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+from skysim.core import __version__
+from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
+
+
+
+Files = list[tuple[Path, str]]  # paths and texts
+VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
+
+
+MAX_BYTES = 1 << 20  # of a file: a minute of reading
+MAX_KEPT = 1 << 15  # characters of a text whose values are kept
+MAX_NODES = 100_000  # of a document, counting the content of an alias each time
+MAX_EXCERPT = 200  # characters of a value in a message
+MAX_DEPTH = 40  # levels of nesting
+
+
+class StrictLoader(yaml.SafeLoader):
+    """SafeLoader with limits: nested aliases that expand, deep nesting and recursive aliases raise an error."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.depth = self.nodes = 0
+        self.size: dict[int, int] = {}  # nodes within each completely composed node, by id
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        before = self.nodes
+        mark = self.peek_event().start_mark
+        aliased = self.check_event(yaml.AliasEvent)
+        # Limits are checked while composing, before any value is constructed from an expanding alias.
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            raise yaml.composer.ComposerError(
+                None, None, f"more than {MAX_DEPTH} sections deep", mark
+            )
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        # An alias of a node that is not yet complete lies within that node: it is recursive.
+        if aliased and id(node) not in self.size:
+            raise yaml.composer.ComposerError(None, None, "an alias within its own anchor", mark)
+        self.nodes += self.size[id(node)] if aliased else 1
+        self.size[id(node)] = self.nodes - before
+        if self.nodes > MAX_NODES:
+            raise yaml.composer.ComposerError(None, None, f"more than {MAX_NODES} values", mark)
+        return node
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """As in SafeLoader, but report invalid numbers and dates as YAML errors."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
+            problem = (
+                f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
+            )
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
+
+def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml.Node | None, Any]:
+    """The node tree of a YAML document, and its values. Raises YAMLError."""
+    loader = kind(text)
+    try:
+        node = loader.get_single_node()
+        return node, None if node is None else loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+@functools.lru_cache(maxsize=16)
+def parse_kept(text: str) -> tuple[yaml.Node | None, Any]:
+    """`parse_yaml`, kept for the next time: each point of a study has the same scene and camera file, whose parsing
+    takes ten times as long as all else of it. The result must not be changed."""
+    return parse_yaml(text)
+
+
+def is_file(path: Path) -> bool:
+    """Whether the file exists; False for a name that no file can have."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def existing_file(value: str) -> str:
+    """Validator of a key: the path of a file that exists. Raises InputError."""
+    if not is_file(Path(value)):
+        raise InputError("", f"{value!r} is not a file", "a path, or a file in the scene's folder")
+    return value
+
+
+def find_file(name: str, folder: Path, what: str) -> Path:
+    """The path of a file given by path, or by its name in a folder. Raises InputError."""
+    path = Path(name)
+    shipped = folder / f"{name}.yaml"
+    if path.suffix in {".yaml", ".yml"} and is_file(path):
+        return path
+    if not path.suffix and is_file(shipped):
+        return shipped
+    near = Path(f"{name}.yaml")
+    if is_file(near):
+        raise InputError(excerpt(name), f"no such {what}; did you mean {excerpt(near)}?")
+    names = sorted(file.stem for file in folder.glob("*.yaml"))
+    raise InputError(excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}")
+
+
+def excerpt(value: object) -> str:
+    """A value for a message: on one line, truncated to LONGEST characters."""
+    text = printable(value)
+    return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
+
+
+def parse_overrides(
+    sets: list[str] | None, parameter: str = "overrides", form: str = "path.to.key=value"
+) -> dict[str, str]:
+    """Keys and values of texts `path.to.key=value`, or of another form. Raises InputError that names the parameter."""
+    overrides = {}
+    for item in sets or []:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise InputError(parameter, excerpt(item), form)
+        overrides[key] = value
+    return overrides
+
+
+def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
+    """The values of overrides as YAML text, as `--set` takes them: strings unchanged, other values as JSON."""
+    return {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in (overrides or {}).items()
+    }
+
+
+def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
+    """A YAML mapping and its text. Raises InputError."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(path, f"{path.stat().st_size} bytes", f"up to {MAX_BYTES}")
+        text = path.read_text(encoding="utf-8")
+        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = Where(path, mark.line + 1 if mark else None)
+        raise InputError(
+            path, f"not YAML: {getattr(error, 'problem', error)}", where=where
+        ) from error
+    if not isinstance(tree, dict):
+        raise InputError(path, "", "a mapping of keys to values")
+    reject_duplicate_keys(node, path)
+    return copy.deepcopy(tree), text
+
+
+def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
+    """Raise InputError for a key that occurs twice in a mapping; YAML would silently use the last."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            reject_duplicate_keys(item, path)
+    if isinstance(node, yaml.MappingNode):
+        names: set[str] = set()
+        for key, value in node.value:
+            if str(key.value) in names:
+                where = Where(path, key.start_mark.line + 1)
+                raise InputError(excerpt(key.value), "duplicate key", where=where)
+            names.add(str(key.value))
+            reject_duplicate_keys(value, path)
+
+
+def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
+    """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
+    if "schema" not in tree:
+        raise InputError("schema", f"missing; add the line schema: {VERSION}", where=Where(path))
+    version = tree["schema"]
+    if type(version) is int and version == VERSION:
+        return
+    problem = f"unknown version {excerpt(repr(version))}"
+    if type(version) is int:
+        problem = f"version {version} is " + (
+            f"newer than skysim {__version__} supports"
+            if version > VERSION
+            else "no longer supported"
+        )
+    raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
+
+
+def set_key(tree: dict[str, Any], key: str, value: str) -> None:
+    """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
+    *parents, last = key.split(".")
+    if not all((*parents, last)):
+        raise InputError(OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value")
+    node: Any = tree
+    for depth, parent in enumerate(parents):
+        node = (
+            node.setdefault(parent, {})
+            if isinstance(node, dict)
+            else node[list_index(node, parent, key)]
+        )
+        if not isinstance(node, dict | list):
+            section = excerpt(".".join(parents[: depth + 1]))
+            raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)
+    try:
+        node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(value)[1]
+    except yaml.YAMLError as error:
+        raise InputError(
+            excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES
+        ) from error
+
+
+def list_index(values: list[Any], component: str, key: str) -> int:
+    """The list index that a component of a dotted key gives. Raises InputError."""
+    digits = component.isascii() and component.isdigit() and len(component) < 10
+    if not digits or int(component) >= len(values):
+        raise InputError(
+            excerpt(key),
+            f"{excerpt(component)} is not a list index",
+            f"0 to {len(values) - 1}",
+            OVERRIDES,
+        )
+    return int(component)
+
+
+# What a value should be, by pydantic's type of the error, with its context.
+EXPECTED = {
+    "greater_than": "greater than {gt}",
+    "greater_than_equal": "greater than or equal to {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "less than or equal to {le}",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "text that matches the pattern '{pattern}'",
+    "string_too_short": "at least {min_length} characters",
+    "string_too_long": "at most {max_length} characters",
+    "too_short": "at least {min_length} values",
+    "too_long": "at most {max_length} values",
+    "model_type": "a mapping of keys to values",
+    "model_attributes_type": "a mapping of keys to values",
+    "int_type": "a valid integer",
+    "int_parsing": "a valid integer",
+    "int_parsing_size": "a valid integer",
+    "int_from_float": "a valid integer",
+    "float_type": "a valid number",
+    "float_parsing": "a valid number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "datetime_type": "a valid datetime",
+    "datetime_parsing": "a valid datetime",
+    "datetime_from_date_parsing": "a valid datetime",
+    "dict_type": "a mapping of keys to values",
+    "string_type": "text",
+}
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    tree: dict[str, Any],
+    files: Files,
+    overrides: Mapping[str, str],
+) -> InputError:
+    """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
+
+    tree is the merged content of the files; files are their paths and texts, the one with the highest priority first.
+    """
+    # A misspelled key causes two errors, unknown and missing. Report the unknown one.
+    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+    missing = first["type"] == "missing"
+    keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
+    found = fault_of(first, model)
+    if found.key:
+        keys += found.key.split(".")
+    # A missing key has no line of its own, so its section's is given. (A file may have it in a section or list that
+    # another file replaces.)
+    where = where_of(keys[:-1] if missing else keys, files, overrides)
+    return InputError(excerpt(".".join(keys)), found.problem, found.allowed, where)
+
+
+def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
+    """One error of pydantic; its key is relative to the error's location."""
+    kind = error["type"]
+    context = error.get("ctx", {})
+    if kind == "value_error":  # a validator's own, which may name a key below
+        cause = context["error"]
+        return cause if isinstance(cause, InputError) else InputError("", cause)
+    if kind == "extra_forbidden":
+        known = allowed_keys(model, error["loc"][:-1])
+        names = ", ".join(name for name in known if name.isidentifier())
+        return InputError("", f"unknown key{suggestion(str(error['loc'][-1]), known)}", names)
+    if kind == "missing":
+        return InputError("", "missing")
+    if kind == "union_tag_invalid":
+        return InputError(
+            "kind",
+            *unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")]),
+        )
+    if kind == "union_tag_not_found":
+        return InputError("", "kind is missing")
+    value = excerpt(repr(error["input"]))
+    if kind not in EXPECTED:
+        return InputError("", f"{value} is not allowed: {error['msg']}")
+    limits = {name: plain_number(limit) for name, limit in context.items()}
+    return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
+
+
+def plain_number(value: Any) -> Any:
+    """A float without an exponent, 0.000001, as text; other values unchanged."""
+    return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
+
+
+def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where:
+    """Where a key was given: OVERRIDES, or the place in the file that has most of its components."""
+    dotted = ".".join(keys)
+    if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
+        return OVERRIDES
+    matches = [(*line_of(text, keys), path) for path, text in files]
+    _, line, path = max(matches, key=lambda match: match[0])  # the first of equal depth
+    return Where(path, line)
+
+
+def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
+    """The error's location as keys of the tree, without pydantic's names of union branches; the last may be missing."""
+    keys: list[int | str] = []
+    for n, key in enumerate(loc):
+        last = missing and n == len(loc) - 1
+        if isinstance(tree, dict) and (key in tree or last):
+            keys.append(key)
+            tree = tree.get(key)
+        elif isinstance(tree, list) and isinstance(key, int) and (key < len(tree) or last):
+            keys.append(key)
+            tree = tree[key] if key < len(tree) else None
+    return keys
+
+
+def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """The keys that a section takes, found by following an error's location through the JSON schema."""
+    schema = model.model_json_schema(by_alias=True)
+    node: dict[str, Any] = schema
+    for key in loc:
+        node = resolve(node, schema)
+        # Branches of a union; an optional section has its union nested one level deeper.
+        options = [
+            resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])
+        ]
+        options += [
+            resolve(option, schema) for outer in options for option in outer.get("oneOf", [])
+        ]
+        if key in node.get("properties", {}):
+            node = node["properties"][key]
+        elif isinstance(key, int):
+            node = node.get("items", {})
+        else:
+            named = [o for o in options if key in (o.get("title"), kind_of(o))]
+            node = named[0] if named else node
+    return list(resolve(node, schema).get("properties", {}))
+
+
+def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """The schema that a node refers to; for an optional section, the section's."""
+    options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
+    if len(options) == 1:
+        node = options[0]
+    return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
+
+
+def kind_of(node: dict[str, Any]) -> str | None:
+    return node.get("properties", {}).get("kind", {}).get("const")
+
+
+def suggestion(word: str, allowed: Sequence[str]) -> str:
+    """The most similar of the allowed words, as the end of a problem; empty if none is similar."""
+    close = difflib.get_close_matches(word, allowed, 1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
+    """How many components of a dotted key occur in the text, and the line of the last one that does."""
+    node = yaml.compose(text, yaml.SafeLoader)
+    depth = 0
+    line = None
+    for key in keys:
+        entry = None
+        if isinstance(node, yaml.MappingNode):
+            entry = next(((k, v) for k, v in node.value if k.value == key), None)
+        elif (
+            isinstance(node, yaml.SequenceNode)
+            and key.isascii()
+            and key.isdigit()
+            and int(key) < len(node.value)
+        ):
+            entry = (node.value[int(key)],) * 2
+        if not entry:
+            break
+        depth = depth + 1
+        line = entry[0].start_mark.line + 1
+        node = entry[1]
+    return depth, line
+
+

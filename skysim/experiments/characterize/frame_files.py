@@ -1,0 +1,287 @@
+"""Frames of a camera from image files, grouped by exposure time and temperature.
+
+A frame's exposure time and temperature are those of its folder's `frames.csv` (columns file, exposure_s and, if known,
+temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or that of a folder above it: `100ms`,
+`2s`, `-5C` between other words, as in `dark_100ms_-5C_03.tif`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+import numpy as np
+from numpy.typing import NDArray
+from skysim.core.errors import InputError
+from skysim.core import images
+from skysim.core.text import read_named_rows
+from skysim.experiments.characterize.photon_transfer import (Level, LevelBuilder)
+from skysim.camera import detector
+from skysim.camera.detector import Detector
+from skysim.core.files import (atomic_file, make_folder)
+from skysim.core.random_streams import random_stream
+from skysim.scene.sections.camera import CameraConfig, DetectorConfig
+
+
+
+TABLE = "frames.csv"
+UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
+TEMPERATURE = re.compile(r"(?:^|[_\- ])([-+]?\d+(?:\.\d+)?)C(?=$|[_\- ])")
+TEMPERATURE_STEP_C = (
+    0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
+)
+
+
+class Setting(NamedTuple):
+    """Exposure time, and temperature of the chip if known."""
+
+    exposure_s: float
+    temperature_c: float | None
+
+
+@dataclass
+class Stack:
+    """Levels of a folder's frames, and the median of each frame."""
+
+    folder: Path
+    levels: list[Level] = field(default_factory=list)
+    medians: dict[Setting, list[tuple[float, Path]]] = field(default_factory=dict)
+    shape: tuple[int, ...] = ()
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "a folder of images")
+    best: dict[Path, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
+            stem = path.with_name(path.name[: -len(suffix)])
+            best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
+    found = list(best.values())
+    if not found:
+        raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
+    return found
+
+
+def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+    """The frames of a folder. Raises InputError for a frame that cannot be used."""
+    tables: dict[Path, dict[str, Setting]] = {}
+    for path in image_files(folder):
+        parent = path.parent
+        if parent not in tables:
+            tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+        picture = images.read_picture(path)
+        yield (
+            path,
+            setting_of(path, folder, picture, tables[parent]),
+            raw_numbers(path, picture.pixels),
+        )
+
+
+def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
+    """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
+    if pixels.ndim != 2:
+        raise InputError(path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel")
+    if images.image_suffix(path.name) in (".jpg", ".jpeg"):
+        raise InputError(path, "JPEG changes the noise", "raw frames in FITS, PNG or TIFF")
+    if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
+        raise InputError(path, "numbers that are not whole, as of an average", "raw frames")
+    if pixels.min() < 0 or pixels.max() > 65535:
+        raise InputError(path, f"{pixels.min()} to {pixels.max()} DN", "0 to 65535")
+    return pixels.astype(np.uint16)
+
+
+def setting_of(
+    path: Path, root: Path, picture: images.Picture, table: dict[str, Setting]
+) -> Setting:
+    """Exposure and temperature of a frame. Raises InputError without an exposure."""
+    if path.name in table:
+        return table[path.name]
+    names = [
+        path.name[: -len(images.image_suffix(path.name))],
+        *path.relative_to(root).parts[-2::-1],
+    ]
+    exposure_s = picture.exposure_s
+    temperature_c = picture.temperature_c
+    if exposure_s is None:
+        exposure_s = next(
+            (float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))),
+            None,
+        )
+    if temperature_c is None:
+        temperature_c = next(
+            (float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None
+        )
+    if exposure_s is None or exposure_s < 0:
+        raise InputError(
+            path,
+            "no exposure time",
+            f"EXPTIME in a FITS header, a row of {TABLE} beside it (file, exposure_s, temperature_c), or a name such"
+            " as dark_100ms_20C_01.png",
+        )
+    if temperature_c is not None:
+        temperature_c = round(temperature_c / TEMPERATURE_STEP_C) * TEMPERATURE_STEP_C
+    return Setting(float(f"{exposure_s:.6g}"), temperature_c)
+
+
+def read_settings(path: Path) -> dict[str, Setting]:
+    """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
+    refusal = InputError(
+        path, "no exposures", "columns file, exposure_s and, if known, temperature_c"
+    )
+    files, numbers = read_named_rows(path, "file", ["exposure_s"], refusal, ["temperature_c"])
+    if (numbers[:, 0] < 0).any():
+        raise InputError(path, "an exposure below 0", "seconds, 0 or more")
+    return {
+        name: Setting(float(row[0]), float(row[1]) if len(row) == 2 else None)
+        for name, row in zip(files, numbers, strict=True)
+    }
+
+
+def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
+    """The levels of a folder's frames, by exposure. Raises InputError with one line.
+
+    Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
+    shape : (height, width) of the camera's frames
+    """
+    builders: dict[Setting, LevelBuilder] = {}
+    stack = Stack(folder)
+    shift = None
+    for path, setting, frame in read_frames(folder):
+        if frame.shape != shape:
+            size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
+            raise InputError(path, size, f"{shape[1]} x {shape[0]}, as the camera has them")
+        shift = padding_bits(frame, bits) if shift is None else shift
+        numbers = np.right_shift(frame, np.uint16(shift))
+        if numbers.max() >= 2**bits:
+            raise InputError(
+                path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera"
+            )
+        builders.setdefault(setting, LevelBuilder()).add(numbers)
+        stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
+    check_settings(stack, builders)
+    for setting in sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)):
+        stack.levels.append(builders[setting].level(*setting))
+    return stack
+
+
+def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
+    """By how many bits the numbers are shifted to the left, if they are beyond the camera's range; otherwise 0."""
+    if frame.max() < 2**bits:
+        return 0
+    union = int(np.bitwise_or.reduce(frame, axis=None))
+    zeros = (union & -union).bit_length() - 1
+    return min(zeros, 16 - bits)
+
+
+def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
+    """Raise InputError for a single frame of an exposure, and if the temperature of some frames only is known."""
+    for setting, builder in builders.items():
+        if builder.frames < 2:
+            path = stack.medians[setting][0][1]
+            raise InputError(path, f"the only frame of {describe(setting)}", "2 or more, alike")
+    unknown = [setting for setting in builders if setting.temperature_c is None]
+    if unknown and len(unknown) < len(builders):
+        path = stack.medians[unknown[0]][0][1]
+        raise InputError(
+            path, "no temperature, which other frames have", "of all frames, or of none"
+        )
+
+
+def describe(setting: Setting) -> str:
+    """An exposure and temperature for a message."""
+    at = "" if setting.temperature_c is None else f" at {setting.temperature_c:g} °C"
+    return f"{setting.exposure_s:g} s{at}"
+
+
+
+
+# Darks and flats as a camera of a scene would take them, written as files: to try the command, and
+# to test it.
+
+
+# frames of a dark's exposure, and of a flat's
+DARKS = 16
+PAIR = 2
+DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks, of the longest
+# dark current of the longest dark: squared read noises, electrons
+DARK_NOISES = 8.0
+LEAST_DARK_E = 200.0
+WARMER_C = 10.0
+FLAT_S = 0.1  # exposure that saturates a flat
+FLAT_PARTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66, 0.8, 0.9, 1.3, 1.5)
+
+
+class Shot(NamedTuple):
+    """Frames to take: their kind, exposure, temperature, light in electrons a second, and number of frames."""
+
+    kind: str
+    exposure_s: float
+    temperature_c: float
+    light_e_s: float
+    frames: int
+
+
+def shots(config: DetectorConfig) -> Iterator[Shot]:
+    """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
+    own_c = config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    own_e_s = config.dark_e_s * 2.0**config.doublings
+    wanted_e = min(max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16)
+    longest_s = float(f"{wanted_e / own_e_s:.2g}") if own_e_s > 0 else 10.0
+    for temperature_c in (own_c, own_c + WARMER_C):
+        for part in DARK_PARTS:
+            yield Shot("darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS)
+    for part in FLAT_PARTS:
+        yield Shot("flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR)
+
+
+def capacity_e(config: DetectorConfig) -> float:
+    """Electrons at which a pixel or the converter is full."""
+    return min(config.full_well_e, (2**config.bits - 1 - config.offset_dn) * config.gain_e_dn)
+
+
+def frames_of(camera: CameraConfig, shot: Shot, seed: int) -> Iterator[NDArray[np.uint16]]:
+    """The frames of a shot by the simulated detector, uniform light."""
+    at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
+    made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
+    key = (
+        shot.kind == "flats",
+        round(1e6 * shot.exposure_s),
+        round(10 * (shot.temperature_c + 300)),
+    )
+    for n in range(shot.frames):
+        light_e = np.full(
+            (camera.height_px, camera.width_px), shot.light_e_s * shot.exposure_s, np.float32
+        )
+        detector.smear(light_e, max(shot.exposure_s, 1e-9), camera.shutter)
+        yield detector.expose(
+            light_e, shot.exposure_s, made, random_stream(seed, *map(int, key), n)
+        )
+
+
+def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path]:
+    """Write the frames of all shots to folder/darks and folder/flats, with exposure and temperature in the headers."""
+    from astropy.io import fits
+
+    for shot in shots(camera.detector):
+        parent = make_folder(folder / shot.kind)
+        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace("/", "")
+        for n, frame in enumerate(frames_of(camera, shot, seed)):
+            header = fits.Header()
+            header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
+            header["CCD-TEMP"] = (shot.temperature_c, "temperature of the chip [C]")
+            path = parent / f"{name}_{n:03d}.fits"
+            with atomic_file(path) as temporary:
+                fits.PrimaryHDU(frame, header).writeto(temporary, overwrite=True)
+            yield path
+
+
+def frame_count(config: DetectorConfig) -> int:
+    """Number of files of `write_frames`."""
+    return sum(shot.frames for shot in shots(config))
+
+

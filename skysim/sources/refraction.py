@@ -1,0 +1,190 @@
+"""Astronomical refraction: the bending of light in a standard atmosphere, by quadrature along the ray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+import numpy as np
+from scipy.interpolate import CubicSpline
+from skysim.core.constants import STANDARD_PRESSURE_HPA, STANDARD_TEMPERATURE_K, ZERO_CELSIUS_K
+from skysim.core.types import Floats
+
+
+
+# The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
+GAS_J_KMOL_K = 8314.32
+DRY_KG_KMOL = 28.9644
+WATER_KG_KMOL = 18.0152
+EARTH_M = 6_378_120.0
+TROPOPAUSE_M = 11_000.0
+TOP_M = 80_000.0
+LAPSE_K_M = 0.0065  # ISO 2533's, too
+VAPOR_EXPONENT = 18.36  # of the water vapor's pressure in the temperature
+NODES = 24  # of the Gauss-Legendre rule in each layer
+LOWEST_RAD = np.radians(90.0)  # apparent zenith distance of the last ray
+RAYS = 181
+
+Layer = Callable[[Floats], tuple[Floats, Floats]]  # refractive index n and r dn/dr at radii
+
+
+class Weather(NamedTuple):
+    """Air at the site: height above the sea, pressure, temperature, relative humidity, wavelength of the light."""
+
+    height_m: float
+    latitude_rad: float
+    pressure_hpa: float
+    temperature_c: float
+    humidity: float
+    wavelength_m: float
+
+
+def standard_pressure_hpa(height_m: float) -> float:
+    """Pressure of the International Standard Atmosphere (ISO 2533) in the troposphere."""
+    return float(
+        STANDARD_PRESSURE_HPA * (1 - LAPSE_K_M * height_m / STANDARD_TEMPERATURE_K) ** 5.25588
+    )
+
+
+def standard_temperature_c(height_m: float) -> float:
+    """Temperature of the International Standard Atmosphere (ISO 2533) in the troposphere."""
+    return 15.0 - LAPSE_K_M * height_m
+
+
+@dataclass(frozen=True, slots=True)
+class Atmosphere:
+    """A troposphere with a constant lapse rate and water vapor, and an isothermal stratosphere.
+
+    Refractivity n - 1 = C1 (T / T0)^(gamma - 1) - C2 (T / T0)^(delta - 1) with T = T0 - lapse (r - r0), and above the
+    tropopause falling exponentially. Dry air's dispersion is that of IAG 1999. Source: Hohenkerk & Sinclair (1985),
+    NAO Technical Note 63; Explanatory Supplement to the Astronomical Almanac (1992), section 3.281.
+    """
+
+    r0_m: float
+    t0_k: float
+    gamma: float
+    scale_per_k: (
+        float  # g M / R: the gradient of the logarithm of the pressure times the temperature
+    )
+    dry: float  # C1
+    wet: float  # C2
+
+    @classmethod
+    def from_weather(cls, weather: Weather) -> Atmosphere:
+        """The atmosphere above a site."""
+        t_c = weather.temperature_c
+        t0_k = weather.temperature_c + ZERO_CELSIUS_K
+        p_hpa = weather.pressure_hpa
+        gravity = 9.784 * (
+            1 - 0.0026 * np.cos(2 * weather.latitude_rad) - 2.8e-7 * weather.height_m
+        )
+        scale_per_k = gravity * DRY_KG_KMOL / GAS_J_KMOL_K
+        gamma = scale_per_k / LAPSE_K_M
+        um2 = (weather.wavelength_m * 1e6) ** 2
+        per_hpa = (
+            (287.6155 + (1.62887 + 0.0136 / um2) / um2)
+            * 1e-6
+            * ZERO_CELSIUS_K
+            / STANDARD_PRESSURE_HPA
+        )
+        saturated_hpa = 10 ** ((0.7859 + 0.03477 * t_c) / (1 + 0.00412 * t_c))
+        saturated_hpa *= 1 + p_hpa * (4.5e-6 + 6e-10 * t_c**2)
+        humidity = weather.humidity
+        vapor_hpa = (
+            humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
+            if p_hpa > 0
+            else 0.0
+        )
+        lighter_hpa = (
+            vapor_hpa * (1 - WATER_KG_KMOL / DRY_KG_KMOL) * gamma / (VAPOR_EXPONENT - gamma)
+        )
+        dry = per_hpa * (p_hpa + lighter_hpa) / t0_k
+        wet = (per_hpa * lighter_hpa + 1.12684e-5 * vapor_hpa) / t0_k
+        return cls(EARTH_M + weather.height_m, t0_k, gamma, scale_per_k, dry, wet)
+
+    def troposphere(self, r_m: Floats) -> tuple[Floats, Floats]:
+        """Refractive index n and r dn/dr."""
+        relative = np.clip((self.t0_k - LAPSE_K_M * (r_m - self.r0_m)) / self.t0_k, 0.3, 1.2)
+        dry = self.dry * relative ** (self.gamma - 1)
+        wet = self.wet * relative ** (VAPOR_EXPONENT - 1)
+        slope = (self.gamma - 1) * dry - (VAPOR_EXPONENT - 1) * wet
+        return 1 + dry - wet, -r_m * LAPSE_K_M / self.t0_k * slope / relative
+
+    def stratosphere(self, r_m: Floats) -> tuple[Floats, Floats]:
+        """Refractive index n and r dn/dr."""
+        tropopause = np.array(EARTH_M + TROPOPAUSE_M)
+        t_k = self.t0_k - LAPSE_K_M * (float(tropopause) - self.r0_m)
+        fall_per_m = self.scale_per_k / t_k
+        excess = (self.troposphere(tropopause)[0] - 1) * np.exp(-fall_per_m * (r_m - tropopause))
+        return 1 + excess, -r_m * fall_per_m * excess
+
+
+def refraction_rad(apparent_zenith_rad: Floats, atmosphere: Atmosphere) -> Floats:
+    """(N,) refraction of rays that arrive at these apparent zenith distances.
+
+    R = - ∫ (r dn/dr) / (n + r dn/dr) dz over the local zenith distance z of the ray, n r sin z = n0 r0 sin z0, which is
+    smooth down to the horizon (Auer & Standish 2000, AJ 119, 2472), by a Gauss-Legendre rule in each layer.
+    """
+    n0 = atmosphere.troposphere(np.array(atmosphere.r0_m))[0]
+    invariant = n0 * atmosphere.r0_m * np.sin(apparent_zenith_rad)
+    tropopause_m = EARTH_M + TROPOPAUSE_M
+    top_m = EARTH_M + TOP_M
+    at_tropopause = atmosphere.troposphere(np.array(tropopause_m))[0]
+    z_tropopause = np.arcsin(invariant / (at_tropopause * tropopause_m))
+    z_top = np.arcsin(invariant / (atmosphere.stratosphere(np.array(top_m))[0] * top_m))
+    low = layer_rad(
+        atmosphere.troposphere, invariant, apparent_zenith_rad, z_tropopause, tropopause_m
+    )
+    return low + layer_rad(atmosphere.stratosphere, invariant, z_tropopause, z_top, top_m)
+
+
+def layer_rad(
+    layer: Layer, invariant: Floats, z_low: Floats, z_high: Floats, top_m: float
+) -> Floats:
+    """(N,) the integral over one layer between the ray's zenith distances at its ends; radius by Newton's method."""
+    x, weight = np.polynomial.legendre.leggauss(NODES)
+    half = (z_low - z_high)[:, None] / 2
+    z = (z_low + z_high)[:, None] / 2 + half * x
+    sine = np.maximum(np.sin(z), 1e-12)
+    r_m = np.minimum(invariant[:, None] / sine, top_m)
+    for _ in range(6):
+        n, slope = layer(r_m)
+        r_m = r_m - (n * r_m - invariant[:, None] / sine) / (n + slope)
+    n, slope = layer(r_m)
+    return np.asarray(-(slope / (n + slope)) @ weight * half[:, 0])
+
+
+class Refraction:
+    """Refraction against the zenith distance of the source as without air, tabulated once; 0.001" from the integral.
+
+    Beyond the horizon, where nothing is seen, the refraction is that of the horizon.
+    """
+
+    def __init__(self, weather: Weather) -> None:
+        apparent_rad = LOWEST_RAD * np.sin(
+            np.linspace(0, np.pi / 2, RAYS)
+        )  # densest at the horizon
+        bending_rad = np.zeros(RAYS)
+        if weather.pressure_hpa > 0:
+            bending_rad[1:] = refraction_rad(apparent_rad[1:], Atmosphere.from_weather(weather))
+        true_rad = apparent_rad + bending_rad
+        self.last_rad = float(true_rad[-1])
+        self.spline = CubicSpline(true_rad, bending_rad)
+
+    def bending_rad(self, zenith_rad: Floats) -> Floats:
+        """How much nearer to the zenith a source appears, (N,) zenith distances without air."""
+        return np.asarray(self.spline(np.minimum(zenith_rad, self.last_rad)))
+
+    def apparent(self, directions: Floats, zenith: Floats) -> Floats:
+        """(N, 3) unit vectors as seen through the air, of (N, 3) as without it; zenith: (3,), in the same axes.
+
+        The direction is turned toward the zenith in the vertical plane.
+        """
+        cosine = directions @ zenith
+        across = zenith - cosine[:, None] * directions
+        sine = np.linalg.norm(across, axis=1)
+        bending = self.bending_rad(np.arctan2(sine, cosine))
+        along = np.sin(bending) / np.maximum(sine, 1e-12)
+        return np.asarray(np.cos(bending)[:, None] * directions + along[:, None] * across)
+
+

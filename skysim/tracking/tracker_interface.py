@@ -1,0 +1,236 @@
+"""The interface for external star trackers: set-up, frame, answer, and discovery by entry points `skysim.trackers`.
+
+An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in its own process, so that a hang or
+a crash there becomes a failed answer and does not end the run; docs/howto/external_tracker.md has examples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from importlib import metadata
+from importlib.util import find_spec
+from typing import Any, Literal, Protocol, Self
+import numpy as np
+from numpy.typing import NDArray
+from skysim.core.errors import printable
+from skysim.core.plugins import MAX_STATUS_CHARS, PluginKind, finite_array, to_lists
+
+
+
+OWN = "own"  # the name of skysim's own estimator
+TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
+SOLVED = "solved"
+FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
+PROTOCOL = 1  # version, the first key of the set-up
+UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision passes and is normalized
+MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
+EXTRAS = {
+    "skysim.tracking.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")
+}  # module and extra of the trackers in our own package
+MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
+MAX_CENTROIDS = 100_000
+MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """The star catalog given to the tracker, brightest first.
+
+    id : (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame at the scene's date
+    (proper motion, parallax, aberration); magnitude : (N,) V
+    """
+
+    id: NDArray[np.int64]
+    direction: Floats
+    magnitude: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Leds:
+    """The surveyed dome. The vehicle rotates about the lab's origin; the camera is offset from it.
+
+    id : (N,); position_m : (N, 3) in the lab
+    camera_body_m : (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
+    """
+
+    id: NDArray[np.int64]
+    position_m: Floats
+    camera_body_m: Floats
+    cam_from_body_xyzw: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a tracker gets before the first frame: the hardware as the scene's tracker assumes it.
+
+    reference  : frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
+    time_utc   : ISO 8601, when t_s is 0
+    width_px, height_px, focal_px, center_px : a pinhole in camera axes, +x right, +y down, +z boresight;
+        the center of the first pixel is (0, 0)
+    distortion : k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
+    stars, leds: the map; one of them is None
+    seed       : for a tracker that draws random numbers
+    options    : the scene's `tracker.options`
+    """
+
+    reference: Literal["icrs", "lab"]
+    time_utc: str
+    width_px: int
+    height_px: int
+    focal_px: float
+    center_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    gain_e_dn: float
+    saturation_dn: float
+    seed: int
+    stars: Stars | None = None
+    leds: Leds | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; arrays become lists."""
+        tree: dict[str, Any] = to_lists(asdict(self))
+        return {"skysim_tracker": PROTOCOL, **tree}
+
+    @classmethod
+    def of_tree(cls, tree: Mapping[str, Any]) -> Self:
+        """The inverse of `as_tree`."""
+        values = {name: value for name, value in tree.items() if name != "skysim_tracker"}
+        for name, map_type in (("stars", Stars), ("leds", Leds)):
+            if values[name] is not None:
+                values[name] = map_type(
+                    **{key: np.array(value) for key, value in values[name].items()}
+                )
+        values["center_px"], values["distortion"] = (
+            tuple(values["center_px"]),
+            tuple(values["distortion"]),
+        )
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One frame as a tracker gets it.
+
+    image_dn   : (height_px, width_px), uint16; float64 from a camera without noise
+    frame      : its number; t_s : mid-exposure since the scene's start; exposure_s
+    streak_px  : (dx, dy) that lights move in the exposure, if a gyro measures it; else None
+    """
+
+    image_dn: NDArray[Any]
+    frame: int
+    t_s: float
+    exposure_s: float
+    streak_px: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A tracker's solution of a frame.
+
+    status             : "solved", or why there is no attitude
+    cam_from_ref_xyzw  : (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if solved
+    covariance_rad2    : (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
+    centroids_px       : (N, 2) x and y of the lights found, optional
+    seconds            : processing time; if None, the time from sending the frame to its answer
+    """
+
+    status: str
+    cam_from_ref_xyzw: Any = None
+    covariance_rad2: Any = None
+    centroids_px: Any = None
+    seconds: float | None = None
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; entries that are None are left out."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: to_lists(value) for name, value in values.items() if value is not None}
+
+    @classmethod
+    def of_tree(cls, tree: Any) -> Self:
+        """The inverse of `as_tree`. Raises ValueError for unknown keys or a missing status."""
+        if not isinstance(tree, dict) or "status" not in tree:
+            raise ValueError("status: missing; allowed: a JSON object with a status")
+        names = [item.name for item in fields(cls)]
+        unknown = [name for name in tree if name not in names]
+        if unknown:
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(names)}")
+        return cls(**tree)
+
+
+class Tracker(Protocol):
+    """What an entry point's callable makes of a `Setup`; the callable raises for a set-up that it cannot use."""
+
+    def solve(self, picture: Picture) -> Answer:
+        """The attitude at mid-exposure, or why there is none."""
+        ...
+
+
+def check_answer(answer: Any) -> Answer:
+    """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
+    if not isinstance(answer, Answer):
+        raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
+    status = printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
+    if not status:
+        raise ValueError(f"status {answer.status!r}; allowed: text")
+    quaternion = None
+    if answer.cam_from_ref_xyzw is not None:
+        quaternion = normalize_quaternion(
+            finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
+        )
+    if (status == SOLVED) != (quaternion is not None):
+        raise ValueError(
+            f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw"
+        )
+    covariance = answer.covariance_rad2
+    if covariance is not None:
+        covariance = check_covariance(finite_array(covariance, "covariance_rad2", (3, 3)))
+    seconds = None if answer.seconds is None else float(finite_array(answer.seconds, "seconds", ()))
+    if seconds is not None and seconds < 0:
+        raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
+    return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)
+
+
+def normalize_quaternion(quaternion: Floats) -> Floats:
+    """Normalize a quaternion whose norm is within UNIT_TOLERANCE of 1. Raises ValueError for others."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > UNIT_TOLERANCE:
+        raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
+    return quaternion / norm
+
+
+def check_covariance(covariance: Floats) -> Floats:
+    """Check that a covariance is symmetric and positive definite within plausible limits. Raises ValueError."""
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
+        raise ValueError("covariance_rad2 is not symmetric")
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if eigenvalues[0] < MIN_RAD2 or eigenvalues[-1] > MAX_RAD2:
+        raise ValueError(
+            f"covariance_rad2 has eigenvalues {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g};"
+            f" allowed: {MIN_RAD2:g} to {MAX_RAD2:.3g}"
+        )
+    return (covariance + covariance.T) / 2
+
+
+def check_centroids(centroids: Any) -> Floats:
+    """(N, 2) centroids as finite numbers, not far out of the frame; empty for None. Raises ValueError."""
+    count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
+    if count > MAX_CENTROIDS:
+        raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
+    xy_px = finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
+    if (farthest := np.abs(xy_px).max(initial=0.0)) > MAX_CENTROID_PX:
+        raise ValueError(
+            f"centroids_px has {farthest:g}; allowed: up to {MAX_CENTROID_PX:g} px from the first pixel"
+        )
+    return xy_px
+
+
+def missing_extra(point: metadata.EntryPoint) -> str:
+    """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
+    plugin = EXTRAS.get(point.value)
+    return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
+
+
