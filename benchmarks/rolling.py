@@ -31,7 +31,7 @@ from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking import factory
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)

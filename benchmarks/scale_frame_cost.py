@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.scale_rates import CMOS
 from benchmarks.timing import figure
 from skysim.core.types import Floats
-from skysim.experiments import dataset_plan
+from skysim.experiments import dataset_run
 from skysim.experiments import dataset_run
 from skysim.experiments.dataset_shards import Storage
 
@@ -56,7 +56,7 @@ def cost_of(width_px: int, height_px: int, limit_mag: float) -> Cost:
         "camera.height_px": f"{height_px}",
         "light.limit_mag": f"{limit_mag}",
     }
-    made = dataset_plan.load(
+    made = dataset_run.load(
         "shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES
     )
     with tempfile.TemporaryDirectory() as folder:

@@ -24,12 +24,13 @@ from benchmarks import scale_coordination as coordination
 from benchmarks.timing import figure, verdict, versus
 from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
-from skysim.experiments import dataset_plan
+from skysim.experiments import dataset_run
 from skysim.experiments import dataset_run
 from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import (LabelledFrame, label_frame, labeller)
-from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study.execution import engines, runner, store, trials
+from skysim.experiments.study import study_file as study_loader
+from skysim.experiments.study.execution import (engines, store, trials)
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
 from skysim.simulation.flight import Flight
@@ -87,9 +88,9 @@ def measure() -> list[dict[str, Any]]:
 
 def small_plan(
     count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS
-) -> dataset_plan.DatasetPlan:
+) -> dataset_run.DatasetPlan:
     """Frames of 1024 x 1024 pixels."""
-    return dataset_plan.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
+    return dataset_run.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
 
 
 def frames() -> list[dict[str, Any]]:
@@ -144,7 +145,7 @@ def parts() -> list[dict[str, Any]]:
     return rows
 
 
-def parts_of(made: dataset_plan.DatasetPlan) -> dict[str, float]:
+def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
     """Milliseconds of CPU of a frame: render; label (detection, masks); encode (COCO, numbers); write (the tar)."""
     spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
     with tempfile.TemporaryFile() as file:

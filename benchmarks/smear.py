@@ -26,7 +26,7 @@ from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking.onboard_model import calibration
 
 FRAMES = 100

@@ -23,9 +23,9 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.core import files
-from skysim.results.files import (recording)
+from skysim.results.files import recording
 from skysim.results.files import run_export
-from skysim.results.files import frame_folder
+from skysim.results.files import recording
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 
@@ -85,7 +85,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     folder = tmp_path_factory.mktemp("flown")
     scene = loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"})
     for shot in open_flight(scene).shots(solves=False):
-        frame_folder.write_frame(folder, shot.frame, shot.truth, scene)
+        recording.write_frame(folder, shot.frame, shot.truth, scene)
     return recording.open_recording(folder)
 
 

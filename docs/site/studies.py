@@ -16,7 +16,7 @@ from skysim.core.types import Floats
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE, Store
-from skysim.experiments.study.loader import load
+from skysim.experiments.study.study_file import load
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import (
     POINTS,

@@ -33,8 +33,6 @@ from estimator.core.checks import (Floats, Ints)
 
 
 
-
-
 # What is measured of a motion on an air bearing, what is assumed of it, and what is to be found.
 
 
@@ -104,7 +102,7 @@ class BearingRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class Lab:
+class LabConstants:
     """What is known of the lab and of the wheels.
 
     gravity_m_s2, earth_lab_rad_s : along lab -z; (3,) the Earth's rate
@@ -244,14 +242,14 @@ def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
     return vector + quaternion[3] * twice + cross(u, twice)
 
 
-class Motion:
+class EquationsOfMotion:
     """The equations of motion of one record, for given parameters (P, B) of B motions.
 
     assumed : (P,) parameters with the inertia J0
     """
 
     def __init__(
-        self, record: BearingRecord, lab: Lab, parameters: Floats, assumed: Floats
+        self, record: BearingRecord, lab: LabConstants, parameters: Floats, assumed: Floats
     ) -> None:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
         self.inverse: Floats = np.asarray(
@@ -336,7 +334,7 @@ def difference_steps(
 
 
 def transition(
-    record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, prior: Prior
+    record: BearingRecord, lab: LabConstants, first: int, before: States, values: Floats, prior: Prior
 ) -> Transition:
     """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
 
@@ -356,7 +354,7 @@ def transition(
     parameters = np.repeat(values[:, None], columns, axis=1)
     parameters[:, 1 + STATE :] += np.diag(step)
     pick: Ints = np.repeat(np.arange(count), columns)
-    motion = Motion(record, lab, np.tile(parameters, count), prior.values)
+    motion = EquationsOfMotion(record, lab, np.tile(parameters, count), prior.values)
     t_s = record.t_s[first : first + count + 1]
     start = before.take(pick).moved(np.tile(change, count))
     end = motion.integrate(t_s[:-1][pick], t_s[1:][pick], start, lab.torque_correlation_s)
@@ -377,7 +375,7 @@ def torque_noise(
     before: States,
     values: Floats,
     assumed: Floats,
-    lab: Lab,
+    lab: LabConstants,
 ) -> Floats:
     """(K, 9, 9) covariance of the states after K intervals due to the random torque and to the wheels' speed noise.
 

@@ -24,14 +24,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial.transform import Rotation
-from estimator.calibration.mass_dynamics import (STATE, Motion, States, inverse_inertia, momentum_scale, transition, turn)
-from estimator.calibration.mass_dynamics import (BIAS, BearingRecord, Lab, MassEstimate, Prior, inertia_matrix)
+from estimator.calibration.mass_dynamics import (STATE, EquationsOfMotion, States, inverse_inertia, momentum_scale, transition, turn)
+from estimator.calibration.mass_dynamics import (BIAS, BearingRecord, LabConstants, MassEstimate, Prior, inertia_matrix)
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
 from estimator.filter.states import TrackerModel
 from collections.abc import Iterator
 from estimator.calibration.mass_dynamics import (STATE, transition)
-from estimator.calibration.mass_dynamics import (BIAS, MIN_ATTITUDES, BearingRecord, Lab, MassEstimate, Prior)
+from estimator.calibration.mass_dynamics import (BIAS, MIN_ATTITUDES, BearingRecord, LabConstants, MassEstimate, Prior)
 
 
 
@@ -61,7 +61,7 @@ class Reduced(NamedTuple):
     chi2: float
 
 
-def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
+def estimate_mass(records: Sequence[BearingRecord], lab: LabConstants, prior: Prior) -> MassEstimate:
     """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
     values = prior.values.copy()
     motions = [first_states(record, lab, values) for record in records]
@@ -93,7 +93,7 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
     )
 
 
-def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
+def estimate_with_noise(records: Sequence[BearingRecord], lab: LabConstants, prior: Prior) -> MassEstimate:
     """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
     A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
@@ -142,9 +142,9 @@ def considered(
     return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
 
 
-def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
+def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
     """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
-    motion = Motion(record, lab, values[:, None], values)
+    motion = EquationsOfMotion(record, lab, values[:, None], values)
     turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(
         record.t_s
     )[:, None]
@@ -157,7 +157,7 @@ def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
 
 
 def reduced(
-    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Reduced:
     """Linearize a record's residuals and eliminate its states."""
     count = len(record.t_s)
@@ -186,7 +186,7 @@ def reduced(
 
 
 def whitened_links(
-    record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Floats:
     """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
     residuals, in standard deviations.
@@ -214,7 +214,7 @@ def whitened_links(
 def add_measured(
     record: BearingRecord,
     states: States,
-    lab: Lab,
+    lab: LabConstants,
     values: Floats,
     to: tuple[Floats, Floats, Floats],
 ) -> float:
@@ -267,7 +267,7 @@ START = 20  # attitudes for the batch that begins the filter
 RATE_SIGMA_RAD_S = 0.01  # of the rate by the difference of the attitudes before and after
 
 
-def filter_mass(record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassEstimate]:
+def filter_mass(record: BearingRecord, lab: LabConstants, prior: Prior) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
 
     The parameters begin with the batch estimate from the first START attitudes, the state with the next three alone.
@@ -294,7 +294,7 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
 
 
 def filter_from(
-    begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Prior
+    begun: MassEstimate, record: BearingRecord, lab: LabConstants, prior: Prior
 ) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
     size = len(begun.values)
@@ -321,7 +321,7 @@ def filter_from(
         yield MassEstimate(values, covariance[STATE:, STATE:], chi2 / (3 * (n - 1)))
 
 
-def first_covariance(begun: MassEstimate, record: BearingRecord, lab: Lab) -> Floats:
+def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstants) -> Floats:
     """(9 + P, 9 + P) at the second attitude. H = R (J w + A (1 + e) h): its errors are those of rate and parameters."""
     values = begun.values
     P = begun.covariance

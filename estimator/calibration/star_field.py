@@ -36,8 +36,6 @@ from estimator.core.types import Attitude, Centroids
 
 
 
-
-
 # Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
 
 
@@ -207,7 +205,7 @@ def calibrate(
     )
 
 
-class Tracker(Protocol):
+class IdentifyingTracker(Protocol):
     """Interface of the identifying tracker: a star list and a solution for centroids. StarTracker has it."""
 
     stars: StarCatalog
@@ -217,7 +215,7 @@ class Tracker(Protocol):
 
 def self_calibrate(
     frames: Sequence[Centroids],
-    tracker: Callable[[Camera, float], Tracker],
+    tracker: Callable[[Camera, float], IdentifyingTracker],
     camera: Camera,
     focal_uncertainty: float = 0.05,
     exposure_s: float = 1.0,
@@ -521,7 +519,7 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
 
 
 def _identified(
-    frames: Sequence[Centroids], tracker: Tracker, exposure_s: float
+    frames: Sequence[Centroids], tracker: IdentifyingTracker, exposure_s: float
 ) -> list[StarFrame]:
     """The frames that the tracker solves, with their identified stars."""
     identified = []

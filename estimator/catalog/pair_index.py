@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from estimator.catalog import spatial_grid
-from estimator.catalog.spatial_grid import Cells
+from estimator.catalog import sky_index
+from estimator.catalog.sky_index import Cells
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
 from estimator.core.jit import jit
@@ -115,7 +115,7 @@ def build(
         group,
         max_angle_rad,
         magnitudes,
-        spatial_grid.build(vectors),
+        sky_index.build_grid(vectors),
     )
 
 
@@ -245,7 +245,7 @@ def build_pair_catalog(
     pair = np.ascontiguousarray(pair[np.argsort(bucket, kind="stable")])
     magnitude = np.ascontiguousarray(magnitude, dtype=float)
     return PairCatalog(
-        vectors, magnitude, pair, table, float(high), width_rad, spatial_grid.build(vectors)
+        vectors, magnitude, pair, table, float(high), width_rad, sky_index.build_grid(vectors)
     )
 
 

@@ -19,9 +19,9 @@ from estimator.core.checks import (Floats, Ints)
 from estimator.core.checks import ImageError
 from collections.abc import Callable
 from numpy.typing import NDArray
-from estimator.catalog import spatial_grid
+from estimator.catalog import sky_index
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.spatial_grid import Cells, within
+from estimator.catalog.sky_index import (Cells, within)
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
@@ -175,7 +175,7 @@ def thin(stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.
     return stars.take(
         order[
             _thin(
-                vectors, spatial_grid.build(vectors), n_bright, 2 * np.sin(min_separation_rad / 2)
+                vectors, sky_index.build_grid(vectors), n_bright, 2 * np.sin(min_separation_rad / 2)
             )
         ]
     )

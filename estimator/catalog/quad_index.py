@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.sky_index import SkyIndex
-from estimator.catalog.spatial_grid import cell_of
+from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit

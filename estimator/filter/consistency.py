@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from estimator.core.checks import Floats
 from estimator.filter.states import GyroModel
-from estimator.filter.propagate import MISSING, SATURATED
+from estimator.filter.states import (MISSING, SATURATED)
 import math
 from typing import NamedTuple
 from estimator.filter.states import JumpModel

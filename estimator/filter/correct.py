@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial.transform import Rotation
-
 from estimator.core.checks import Floats
-from estimator.filter.propagate import rotate_quaternion, transition
-from estimator.filter.states import (Layout, State, of_head)
+from estimator.filter.states import (rotate_quaternion, transition)
+from estimator.filter.states import (Layout, MekfState, of_head)
 
 
-class Solution(NamedTuple):
+
+class AttitudeFix(NamedTuple):
     """A star tracker's solution, at the time of a State.
 
     noise_rad2      : (3, 3) covariance of its small rotation error in body axes, without what solutions share
@@ -46,7 +45,7 @@ def wxyz_of(body_from_ref: Rotation) -> Floats:
     return body_from_ref.inv().as_quat(scalar_first=True).copy()
 
 
-def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
+def innovation(prior: MekfState, solution: AttitudeFix, layout: Layout) -> Innovation:
     """Residual of a solution against the state before it.
 
     The solution is truth exp(o + v) with the noise v and the offset o = mounting + L slow, where L L^T is the
@@ -75,7 +74,7 @@ def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
     return Innovation(residual, H, noise, float(residual @ np.linalg.solve(spread, residual)))
 
 
-def correct(prior: State, found: Innovation, layout: Layout) -> State:
+def correct(prior: MekfState, found: Innovation, layout: Layout) -> MekfState:
     """Schmidt's update (1966) in Joseph form; the attitude error is then multiplied into the quaternion.
 
     The gain is Kalman's with the rows of the considered states set to 0: their values and their covariance stay, and
@@ -110,8 +109,8 @@ def correct(prior: State, found: Innovation, layout: Layout) -> State:
 
 
 def adopt(
-    prior: State, solution: Solution, layout: Layout, bias_variance: Floats, support: int
-) -> State:
+    prior: MekfState, solution: AttitudeFix, layout: Layout, bias_variance: Floats, support: int
+) -> MekfState:
     """The state that a solution alone gives: its attitude and covariance, and the filter's other states.
 
     The error is then -(do + v), correlated with the offset's. The variance of the bias is increased, as a wrong bias
@@ -134,7 +133,7 @@ def adopt(
     )
 
 
-def offset_rows(solution: Solution, layout: Layout) -> Floats:
+def offset_rows(solution: AttitudeFix, layout: Layout) -> Floats:
     """(3, N) the offset of a solution from the states: its mounting, and L times the normalized slow error."""
     offsets = np.zeros((3, layout.size))
     offsets[:, layout.slices[of_head("systematic", solution.head)]] = root(solution.systematic_rad2)
@@ -157,3 +156,5 @@ def root(covariance: Floats) -> Floats:
         return np.zeros((3, 3))
     variances, axes = np.linalg.eigh(covariance)
     return (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
+
+

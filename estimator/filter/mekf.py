@@ -30,11 +30,11 @@ from estimator.core import checks
 from estimator.core.checks import Floats
 from estimator.core.types import FilterState
 from estimator.filter.consistency import (checked_covariances, checked_samples, not_negative)
-from estimator.filter.correct import Solution, adopt, correct, innovation, wxyz_of
+from estimator.filter.correct import (AttitudeFix, adopt, correct, innovation, wxyz_of)
 from estimator.filter.consistency import (CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad)
 from estimator.filter.states import (CONSIDERED, GyroModel, JumpModel, TrackerModel)
-from estimator.filter.propagate import inverse_response
-from estimator.filter.states import (State, build_layout, decorrelate, propagate_state, start_state)
+from estimator.filter.states import inverse_response
+from estimator.filter.states import (MekfState, build_layout, decorrelate, propagate_state, start_state)
 
 __all__ = ["AttitudeFilter", "GyroModel", "JumpModel", "TrackerModel", "Update"]
 
@@ -76,9 +76,9 @@ class _Segment(NamedTuple):
     The solution of the oldest segment is not applied again, and is None if it begins between two solutions.
     """
 
-    state: State
+    state: MekfState
     samples: Floats
-    solution: Solution | None
+    solution: AttitudeFix | None
 
 
 class AttitudeFilter:
@@ -179,7 +179,7 @@ class AttitudeFilter:
             _Segment(self._current, np.empty((0, 5)), None)
         ]  # rows of checked_samples
         self._refused: list[
-            tuple[State, Solution]
+            tuple[MekfState, AttitudeFix]
         ] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
@@ -309,14 +309,14 @@ class AttitudeFilter:
         total_rad2: ArrayLike,
         systematic_rad2: ArrayLike | None,
         head: int,
-    ) -> Solution:
+    ) -> AttitudeFix:
         """The solution with the filter's floor and systematic error added to its covariances, after checks."""
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
         unit = np.eye(3)
         common = systematic + self._tracker.systematic_rad**2 * unit
-        return Solution(body_from_ref, noise + self._floor_rad2 * unit, common, head)
+        return AttitudeFix(body_from_ref, noise + self._floor_rad2 * unit, common, head)
 
-    def _weigh(self, prior: State, solution: Solution, update: Update) -> Update:
+    def _weigh(self, prior: MekfState, solution: AttitudeFix, update: Update) -> Update:
         """The update by a solution outside the gate: refused, or a reset if the filter is probably wrong."""
         if self._refused and not self._agrees(prior, solution):
             self._refused = []
@@ -337,7 +337,7 @@ class AttitudeFilter:
             status = RESET if odds >= ENOUGH else DISPUTED
         return Update(status, update.residual_rad, update.distance, agreeing, odds)
 
-    def _agrees(self, prior: State, solution: Solution) -> bool:
+    def _agrees(self, prior: MekfState, solution: AttitudeFix) -> bool:
         """Whether a refused solution agrees with the one before, by the gyro alone: none was used in between."""
         state, earlier = self._refused[-1]
         later_from_earlier = prior.body_from_ref * state.body_from_ref.inv()
@@ -375,10 +375,10 @@ class AttitudeFilter:
             state = self._propagate_state(first.state, first.samples[:half])
             self._segments[0] = _Segment(state, first.samples[half:], None)
 
-    def _propagate_state(self, state: State, samples: Floats) -> State:
+    def _propagate_state(self, state: MekfState, samples: Floats) -> MekfState:
         return propagate_state(state, samples, self._gyro, self._tracker, self._layout)
 
-    def _prior(self, state: State, samples: Floats) -> State:
+    def _prior(self, state: MekfState, samples: Floats) -> MekfState:
         """The state at a solution, before it: propagated by the samples from the last solution that was used."""
         return decorrelate(self._propagate_state(state, samples), self._tracker, self._layout)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
-from estimator.catalog.spatial_grid import nearest
+from estimator.catalog.sky_index import nearest_in_grid
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -130,7 +130,7 @@ def match_nearest(
         z = R_cam_from_ref[0, 2] * u + R_cam_from_ref[1, 2] * v + R_cam_from_ref[2, 2] * w
         radius = tolerance + (stretch * np.arccos(min(max(w, -1.0), 1.0)) if stretch > 0 else 0.0)
         covered_sr += density * pi * radius**2
-        best = nearest(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
+        best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
         is_used = False
         for m in range(count):
             is_used = is_used or star[m] == best

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
-from estimator.catalog.spatial_grid import cell_of
+from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from estimator.catalog.pair_index import first_from
-from estimator.catalog.sky_index import MAG_SMOOTHING, MAG_STEP, SkyIndex, nearest
-from estimator.catalog.spatial_grid import cell_of, edge_cell
+from estimator.catalog.sky_index import (MAG_SMOOTHING, MAG_STEP, SkyIndex, nearest)
+from estimator.catalog.sky_index import (cell_of, edge_cell)
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit

@@ -15,8 +15,8 @@ from __future__ import annotations
 from math import log10, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.sky_index import SkyIndex, nearest
-from estimator.catalog.spatial_grid import cell_of
+from estimator.catalog.sky_index import (SkyIndex, nearest)
+from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit

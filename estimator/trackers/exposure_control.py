@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.core import checks
 from estimator.core.checks import Ints
 from estimator.core.checks import ImageError
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
+
+
 
 # The camera's own range and increment (table 1).
 CAMERA_SHORTEST_S = 10e-6
@@ -89,7 +89,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class NextExposure:
     """The next exposure time, and the flags of the frame that it is based on."""
 
     time_s: float
@@ -97,7 +97,7 @@ class Exposure:
     no_stars: bool = False
 
 
-def step(state: Exposure, observation: Observation, control: Control) -> Exposure:
+def step(state: NextExposure, observation: Observation, control: Control) -> NextExposure:
     """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
     saturated = (
         observation.mean_dn > control.mean_dn
@@ -107,7 +107,7 @@ def step(state: Exposure, observation: Observation, control: Control) -> Exposur
     direction = -1 if saturated else int(no_stars)
     target_s = INCREMENT_S * round((state.time_s + direction * control.step_s) / INCREMENT_S)
     time_s = min(max(target_s, control.shortest_s), control.longest_s)
-    return Exposure(time_s, saturated, no_stars)
+    return NextExposure(time_s, saturated, no_stars)
 
 
 def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:
@@ -158,3 +158,5 @@ def _measure(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -
                 saturated += image[y, x] >= saturation_dn
         overexposed += saturated > allowed
     return total / image.size, overexposed
+
+

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
-from estimator.catalog import (catalog, quad_index, sky_index)
+from estimator.catalog import (catalog, quad_index)
+from estimator.catalog import sky_index
 from estimator.catalog import pair_index
 from estimator.catalog.refraction import SiteAir
 from estimator.core import checks

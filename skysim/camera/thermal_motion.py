@@ -10,13 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import Optics, ScaledOptics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Mount, Sources
-from skysim.scene.sections.thermal import (
-    LinearTemperatureConfig,
-    SineTemperatureConfig,
-    SteadyTemperatureConfig,
-    TemperatureTableConfig,
-    ThermalConfig,
-)
+from skysim.scene.sections.surroundings import (LinearTemperatureConfig, SineTemperatureConfig, SteadyTemperatureConfig, TemperatureTableConfig, ThermalConfig)
 
 
 

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 
 
 
-
-
 # Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same
 # structure.
 
@@ -49,7 +47,7 @@ FOCAL_35MM_TAG = 41989
 MAX_ENTRIES = 1 << 16
 
 
-class Entry(NamedTuple):
+class TiffEntry(NamedTuple):
     """An entry of a directory: its tag, type and number of values, and where its value field begins."""
 
     tag: int
@@ -78,7 +76,7 @@ class Tiff:
         """The integer of this type of struct at an offset."""
         return int(struct.unpack_from(self.order + kind, self.data, at)[0])
 
-    def entries(self, at: int | None = None) -> Iterator[Entry]:
+    def entries(self, at: int | None = None) -> Iterator[TiffEntry]:
         """The entries of the directory at an offset, or of the first directory."""
         big = self.is_big
         if at is None:
@@ -89,9 +87,9 @@ class Tiff:
             begin = at + head + n * size
             tag = self.number("H", begin)
             kind = self.number("H", begin + 2)
-            yield Entry(tag, kind, self.number("Q" if big else "I", begin + 4), begin + value)
+            yield TiffEntry(tag, kind, self.number("Q" if big else "I", begin + 4), begin + value)
 
-    def value(self, entry: Entry) -> int | None:
+    def value(self, entry: TiffEntry) -> int | None:
         """The first value of an entry, if it is an integer in the entry itself; else None."""
         return (
             self.number(INTEGER_TYPES[entry.kind], entry.at)
@@ -99,7 +97,7 @@ class Tiff:
             else None
         )
 
-    def most_bits(self, entry: Entry) -> int:
+    def most_bits(self, entry: TiffEntry) -> int:
         """Bits of the first sample by a BITS_TAG, whose values are in the entry itself, or where it points to."""
         inside = entry.values * 2 <= (8 if self.is_big else 4)
         return self.number(

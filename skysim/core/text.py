@@ -167,7 +167,7 @@ def read_named_rows(
     return names, numbers
 
 
-class Segment(NamedTuple):
+class TextSegment(NamedTuple):
     """A segment: its metadata with their lines, and its data lines split into words."""
 
     metadata: dict[str, Line]

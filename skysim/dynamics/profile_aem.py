@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where
-from skysim.core.text import (Line, Segment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers)
+from skysim.core.text import (Line, TextSegment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers)
 from skysim.core.time import SCALES
 from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import (REFERENCES, frame_of, icrs_from)
@@ -45,10 +45,10 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     return joined
 
 
-def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
+def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
     """The version, and the segments of the message. Raises InputError for a line out of place."""
     version = ""
-    segments = list[Segment]()
+    segments = list[TextSegment]()
     section = ""
     for n, line in lines:
         if line.split(maxsplit=1)[0] == "COMMENT":
@@ -56,7 +56,7 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
         if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
             section = next_section(Where(path, n), section, line)
             if line == "META_START":
-                segments.append(Segment({}, []))
+                segments.append(TextSegment({}, []))
         elif section == "DATA_START":
             segments[-1].data.append((n, line.split()))
         elif section in ("", "META_START"):
@@ -88,7 +88,7 @@ def next_section(where: Where, section: str, keyword: str) -> str:
 
 
 def segment_samples(
-    path: Path, version: str, segment: Segment, start: datetime.datetime
+    path: Path, version: str, segment: TextSegment, start: datetime.datetime
 ) -> Samples:
     """The samples of one segment within its useable span. Raises InputError."""
     metadata = segment.metadata

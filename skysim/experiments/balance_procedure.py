@@ -20,9 +20,9 @@ from skysim.core.units import quantity
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments import balance_flight
-from skysim.experiments.balance_prior import (Assumptions, Uncertainty, draw_assumptions)
+from skysim.experiments.balance_flight import (Assumptions, Uncertainty, draw_assumptions)
 from skysim.experiments.balance_flight import BalanceFlight
-from skysim.experiments.configs import with_config
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 
 
@@ -32,7 +32,7 @@ MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BalancePlan:
     """How a vehicle is balanced.
 
     excite      : wheels or swing;  tilt_deg : of the excitation
@@ -128,7 +128,7 @@ Watch = Callable[[float, float], None]
 
 
 def balance(
-    scene: Scene, plan: Plan, uncertainty: Uncertainty, watch: Watch | None = None
+    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Watch | None = None
 ) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 
@@ -166,7 +166,7 @@ def assumed(scene: Scene, uncertainty: Uncertainty) -> Assumptions:
     return draw_assumptions(scene, multibody.build(at_zero.vehicle), uncertainty)
 
 
-def in_flight(scene: Scene, plan: Plan, number: int, position_m: Floats) -> Scene:
+def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) -> Scene:
     """The scene of one flight: trim masses in their places, excitation, frames over all of it, noise of its own."""
     scene = scene.model_copy(update={"seed": scene.seed + number})
     if scene.vehicle.trim:

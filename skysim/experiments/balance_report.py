@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from estimator.calibration.mass_dynamics import (INERTIA, MOMENT, MassEstimate, inertia_six)
 from skysim.core import files
 from skysim.core.types import Floats
-from skysim.experiments.balance_prior import Assumptions
+from skysim.experiments.balance_flight import Assumptions
 from skysim.experiments.balance_flight import BalanceFlight
-from skysim.experiments.balance_prior import largest_tilt_deg
-from skysim.experiments.balance_procedure import (Iteration, Plan, filtered)
+from skysim.experiments.balance_flight import largest_tilt_deg
+from skysim.experiments.balance_procedure import (Iteration, BalancePlan, filtered)
 from skysim.results.report import (
     Block,
     Cell,
@@ -33,7 +33,7 @@ INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
 
 
-def statistics(scene: str, plan: Plan, iterations: Sequence[Iteration]) -> dict[str, Any]:
+def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> dict[str, Any]:
     """All numbers of a balance, SI except where a unit is in the name."""
     last = iterations[-1]
     return {

@@ -17,7 +17,7 @@ from skysim.core.jit import jit
 from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
-from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.scene.scene import Scene
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.onboard_model import assumed_camera
@@ -100,7 +100,7 @@ def labeller(scene: Scene) -> Labeller:
     return Labeller(assumed_camera(scene), assumed_settings(scene), threshold_e)
 
 
-def label_frame(setup: Setup, seed: int, by: Labeller | None = None) -> LabelledFrame:
+def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> LabelledFrame:
     """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
 
     by : of the setup's scene, if there is one already

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+from skysim.core.units import ConfigModel
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
 import numpy as np
-
 from skysim.core.errors import InputError
 from skysim.core import files
 from skysim.core.types import Frame, FrameRow, Truth
-from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
-from skysim.simulation.lab import Lab, build_tracker
+from skysim.simulation.lab import (Lab, build_tracker)
 from skysim.tracking import factory
 from skysim.tracking.tracker_interface import (FAILED, SOLVED)
+
+
+
+
+
+# Copies of scenes with some keys replaced.
+
+
+Config = TypeVar("Config", bound=ConfigModel)
+
+
+def with_config(config: Config, section: str, **values: Any) -> Config:
+    """Copy a scene with values of a section replaced, without validation; `section` may be nested, as `light.led`."""
+    head, _, rest = section.partition(".")
+    inner = getattr(config, head)
+    changed = with_config(inner, rest, **values) if rest else inner.model_copy(update=values)
+    return config.model_copy(update={head: changed})
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,3 +155,5 @@ def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
         | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
         for score in scores
     ]
+
+

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Floats, SourceTruth
-from skysim.sources.false_lights import light_name
+from skysim.sources.satellites import light_name
 
 
 

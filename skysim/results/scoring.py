@@ -18,7 +18,7 @@ from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import (metrics)
 from skysim.results import annotate as stretch
 from skysim.results.annotate import (annotate, visible)
-from skysim.results.report.pages import embed
+from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot

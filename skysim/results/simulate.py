@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.results.run import Run, run_of
+from skysim.results.run import (Run, run_of)
 from skysim.results.scoring import Score, score
 from skysim.scene.scene import Scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Progress, open_flight
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking.factory import NO_PROGRAMS
 
 KNOTS = 9  # samples of the attitude in the exposure of `render_at`

@@ -18,8 +18,6 @@ from skysim.core.errors import InputError, printable
 
 
 
-
-
 # Parsers of the answers, from a typed text to a value of the file. Each raises InputError with what
 # is allowed.
 
@@ -122,7 +120,7 @@ WELL_E_UM2 = 900.0  # full well of a square micrometer: the least of the cameras
 TRANSFER = "1 us"  # time of a row of a charge-coupled device
 
 
-class Assumed(NamedTuple):
+class AssumedValue(NamedTuple):
     """A value that the data sheet does not state, and the reason for it."""
 
     value: Any
@@ -144,13 +142,13 @@ class Question(NamedTuple):
     ask: str
     where: str
     parse: Callable[[str], Any]
-    assume: Callable[[Values], Assumed | None] = lambda values: None
+    assume: Callable[[Values], AssumedValue | None] = lambda values: None
     consequence: str = ""
     skipped: Callable[[Values], str] = lambda values: ""
 
 
-def assumed(value: Any, why: str) -> Callable[[Values], Assumed]:
-    return lambda values: Assumed(value, why)
+def assumed(value: Any, why: str) -> Callable[[Values], AssumedValue]:
+    return lambda values: AssumedValue(value, why)
 
 
 def without_lens(values: Values) -> str:
@@ -161,32 +159,32 @@ def not_by_rows(values: Values) -> str:
     return "with a global shutter" if values.get("shutter", "global") == "global" else ""
 
 
-def row_time(values: Values) -> Assumed:
+def row_time(values: Values) -> AssumedValue:
     """Time from row to row of a shutter that is not global."""
     if values["shutter"] != "rolling":
-        return Assumed(TRANSFER, "a fast transfer")
-    return Assumed(f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second")
+        return AssumedValue(TRANSFER, "a fast transfer")
+    return AssumedValue(f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second")
 
 
-def full_well(values: Values) -> Assumed:
+def full_well(values: Values) -> AssumedValue:
     """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
     if "gain" in values:
-        return Assumed(
+        return AssumedValue(
             rounded(values["gain"] * range_dn(values)), "where the converter's range ends"
         )
     from skysim.core.units import in_si
 
     area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
-    return Assumed(
+    return AssumedValue(
         rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
     )
 
 
-def gain_of_well(values: Values) -> Assumed:
+def gain_of_well(values: Values) -> AssumedValue:
     """Electrons a digital number that map the full well to the end of the range, rounded up."""
     exact = max(values["full_well"], 1e-3) / range_dn(values)
     step = 10.0 ** (math.floor(math.log10(exact)) - 3)
-    return Assumed(rounded(step * math.ceil(exact / step)), "the range ends at the full well")
+    return AssumedValue(rounded(step * math.ceil(exact / step)), "the range ends at the full well")
 
 
 def range_dn(values: Values) -> float:
@@ -278,7 +276,7 @@ QUESTIONS: dict[str, Question] = {
         "Black level, digital numbers",
         "offset or black level; or the mean of a dark frame",
         number("DN|ADU", "32"),
-        lambda values: Assumed(2 ** max(values["bits"] - 7, 0), "1/128 of the range"),
+        lambda values: AssumedValue(2 ** max(values["bits"] - 7, 0), "1/128 of the range"),
         "digital numbers do not compare with those of a real frame",
     ),
     "full_well": Question(
@@ -342,7 +340,7 @@ SI = {
 COMMENT_COLUMN = 34
 
 
-class Line(NamedTuple):
+class SheetLine(NamedTuple):
     """One value of the file with its comment."""
 
     key: str
@@ -361,7 +359,7 @@ class Missing(NamedTuple):
 class Sheet(NamedTuple):
     """The values of a camera file, and what the data sheet does not state."""
 
-    lines: list[Line]
+    lines: list[SheetLine]
     missing: list[Missing]
 
 
@@ -407,26 +405,26 @@ def quoted(text: str) -> str:
     return repr(printable(text)[:40])
 
 
-def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[Line]:
+def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[SheetLine]:
     """The lines of the file in the order of the questions, with what is needed and not asked."""
     for name, question in QUESTIONS.items():
         if name not in values:
             continue
         if name == "blur":
-            yield Line("psf.kind", "gaussian", "assumed")
+            yield SheetLine("psf.kind", "gaussian", "assumed")
         if name == "quantum_efficiency":
             curve = CURVES.get(values["shutter"], "cmos")
-            yield Line("detector.quantum_efficiency.curve", curve, "assumed: the shape")
+            yield SheetLine("detector.quantum_efficiency.curve", curve, "assumed: the shape")
         several = values[name] if len(question.keys) > 1 else (values[name],)
         yield from (
-            Line(key, value, comments[name])
+            SheetLine(key, value, comments[name])
             for key, value in zip(question.keys, several, strict=True)
         )
         if name == "dark_current":
-            yield Line("detector.dark_temperature_c", 25, "assumed: room temperature")
+            yield SheetLine("detector.dark_temperature_c", 25, "assumed: room temperature")
 
 
-def tree_of(lines: list[Line]) -> dict[str, Any]:
+def tree_of(lines: list[SheetLine]) -> dict[str, Any]:
     """The section `camera` as nested mappings."""
     tree: dict[str, Any] = {}
     for line in lines:
@@ -496,7 +494,7 @@ def yaml_value(value: Any) -> str:
     )
 
 
-def yaml_lines(camera: list[Line]) -> list[str]:
+def yaml_lines(camera: list[SheetLine]) -> list[str]:
     """A section `camera` in YAML, with the comment of each value."""
     lines = ["camera:"]
     open_ = list[str]()

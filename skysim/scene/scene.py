@@ -25,8 +25,8 @@ from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import (DomeConfig, Glow, Light, StarsConfig)
 from skysim.scene.sections.light import FurtherLight
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
-from skysim.scene.sections.orbit import Orbit
-from skysim.scene.sections.thermal import Coefficient, ThermalConfig
+from skysim.scene.sections.surroundings import Orbit
+from skysim.scene.sections.surroundings import (Coefficient, ThermalConfig)
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 

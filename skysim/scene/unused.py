@@ -19,7 +19,7 @@ from skysim.core.errors import OVERRIDES, InputError
 from skysim.core.yaml_reader import (Files, parse_yaml, where_of)
 from skysim.core.units import ConfigModel
 from skysim.scene.scene import HEAD_SECTIONS, Scene
-from skysim.scene.sections.air import NEGLIGIBLE_PX
+from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
     CelestialConfig,

@@ -25,9 +25,9 @@ from skysim.dynamics import imu
 from skysim.scene.scene import Scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
-from skysim.simulation.motion import Motion, history_s
-from skysim.simulation.user_parts import NO_PARTS, UserParts, with_parts
+from skysim.simulation.lab import (Lab, StarCamera, build_lab, build_tracker)
+from skysim.simulation.motion import (Motion, history_s)
+from skysim.simulation.lab import (NO_PARTS, UserParts, with_parts)
 from skysim.tracking import factory
 from skysim.tracking import navigation
 from skysim.tracking.exposure_control import ExposureController

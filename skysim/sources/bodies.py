@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
 from skysim.sources.photometry import Band
-from skysim.sources.body_discs import (LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, Surface)
-from skysim.sources.body_magnitudes import (earthshine_fraction, magnitude)
-from skysim.sources.ephemeris import Observer
+from skysim.sources.body_discs import (LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, DiscSurface)
+from skysim.sources.body_discs import (earthshine_fraction, magnitude)
+from skysim.sources.ephemeris import ObserverPlace
 from skysim.sources.ephemeris import (Place, place)
 
 
@@ -138,8 +138,8 @@ class BodyLight:
         return {"sun": "the Sun", "moon": "the Moon"}.get(self.name, self.name.capitalize())
 
     @property
-    def surface(self) -> Surface:
-        return Surface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
+    def surface(self) -> DiscSurface:
+        return DiscSurface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
 
     def truth(self) -> BodyTruth:
         """What a frame's truth says of the body."""
@@ -169,7 +169,7 @@ class BodyLight:
         return directions @ self.place.direction > np.cos(self.radius_rad)
 
 
-def bodies_from(config: BodiesConfig, observer: Observer, band: Band) -> list[BodyLight]:
+def bodies_from(config: BodiesConfig, observer: ObserverPlace, band: Band) -> list[BodyLight]:
     """The chosen bodies as an observer sees them, the farthest first."""
     lights = [
         body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)

@@ -13,11 +13,9 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
-
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core import files
@@ -25,11 +23,13 @@ from skysim.core.yaml_reader import (excerpt, is_file, parse_yaml)
 from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 
+
+
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 SCHEMA = "schema: astropy-2.0"
 
 
-class Column(NamedTuple):
+class CatalogColumn(NamedTuple):
     """One column of numbers: name, ECSV unit and output format."""
 
     name: str
@@ -37,23 +37,23 @@ class Column(NamedTuple):
     format: str
 
 
-def star_columns(motion_format: str) -> tuple[Column, ...]:
+def star_columns(motion_format: str) -> tuple[CatalogColumn, ...]:
     """The columns of every catalog; the format of motions and parallaxes is that of their accuracy."""
     return (
-        Column("hip", "", "d"),
-        Column("ra_deg", "deg", ".7f"),
-        Column("dec_deg", "deg", ".7f"),
-        Column("pm_ra_mas_yr", "mas / yr", motion_format),  # mu_alpha cos(delta)
-        Column("pm_dec_mas_yr", "mas / yr", motion_format),
-        Column("parallax_mas", "mas", motion_format),
-        Column("v_mag", "mag", ".3f"),
-        Column("b_v", "mag", ".3f"),
-        Column("v_i", "mag", ".3f"),
+        CatalogColumn("hip", "", "d"),
+        CatalogColumn("ra_deg", "deg", ".7f"),
+        CatalogColumn("dec_deg", "deg", ".7f"),
+        CatalogColumn("pm_ra_mas_yr", "mas / yr", motion_format),  # mu_alpha cos(delta)
+        CatalogColumn("pm_dec_mas_yr", "mas / yr", motion_format),
+        CatalogColumn("parallax_mas", "mas", motion_format),
+        CatalogColumn("v_mag", "mag", ".3f"),
+        CatalogColumn("b_v", "mag", ".3f"),
+        CatalogColumn("v_i", "mag", ".3f"),
     )
 
 
 NUMBERS = tuple(column.name for column in star_columns(""))
-SCATTER = Column("scatter_mag", "mag", ".3g")  # optional
+SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Catalog:
 
 def write(
     path: Path,
-    columns: Iterable[Column],
+    columns: Iterable[CatalogColumn],
     rows: list[dict[str, Any]],
     meta: dict[str, Any],
     extra: tuple[str, ...] = (),
@@ -250,3 +250,5 @@ def require_catalog(key: str, name: str) -> Path:
         problem, names = unknown_name("catalog", name, allowed)
         raise InputError(key, problem, f"{names}, or an .ecsv file of a catalog build")
     return path
+
+

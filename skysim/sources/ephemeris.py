@@ -23,7 +23,7 @@ from skysim.core.constants import AU_KM, DAY_S, SPEED_OF_LIGHT_KM_S
 EPHEMERIS = DATA / "ephemeris" / "de423.npz"
 
 
-class Series(NamedTuple):
+class ChebyshevSeries(NamedTuple):
     """One body: intervals of `days` from the file's first day, (count, 3, intervals) coefficients in units of km."""
 
     days: float
@@ -36,7 +36,7 @@ class Ephemeris(NamedTuple):
 
     first_jd: float
     earth_moon_ratio: float
-    series: dict[str, Series]
+    series: dict[str, ChebyshevSeries]
 
     def position_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km, ICRS axes: from the solar system's barycenter, the Moon's from the Earth.
@@ -66,7 +66,7 @@ def load_ephemeris() -> Ephemeris:
     with np.load(EPHEMERIS, allow_pickle=False) as arrays:
         names = [name.removesuffix("_days") for name in arrays.files if name.endswith("_days")]
         series = {
-            name: Series(
+            name: ChebyshevSeries(
                 float(arrays[f"{name}_days"]), float(arrays[f"{name}_unit_km"]), arrays[name]
             )
             for name in names
@@ -86,7 +86,7 @@ class GcrsState(NamedTuple):
     velocity_m_s: Floats
 
 
-class Observer(NamedTuple):
+class ObserverPlace(NamedTuple):
     """Barycentric position in km and velocity in km/s, ICRS axes (3,); from_earth: the same from the Earth's center."""
 
     tt_jd: float
@@ -95,7 +95,7 @@ class Observer(NamedTuple):
     from_earth: GcrsState
 
 
-def observe_from(time: datetime.datetime, site: SiteConfig) -> Observer:
+def observe_from(time: datetime.datetime, site: SiteConfig) -> ObserverPlace:
     """The observer at a time: at the site if it has a longitude, else at the Earth's center.
 
     A site's place is that of WGS 84, turned by UT1 and by precession and nutation of IAU 2006/2000A (`erfa.pvtob`,
@@ -105,7 +105,7 @@ def observe_from(time: datetime.datetime, site: SiteConfig) -> Observer:
     return observe_at(time, site_in_gcrs(time, tt_jd(time), site))
 
 
-def observe_at(time: datetime.datetime, from_earth: GcrsState) -> Observer:
+def observe_at(time: datetime.datetime, from_earth: GcrsState) -> ObserverPlace:
     """The observer at a time in this state from the Earth's center.
 
     The Earth's position is the ephemeris's, its velocity `erfa.epv00`'s (5 mm/s), as for the stars.
@@ -113,7 +113,7 @@ def observe_at(time: datetime.datetime, from_earth: GcrsState) -> Observer:
     tt = tt_jd(time)
     velocity_km_s = erfa.epv00(tt, 0.0)[1]["v"] * (AU_KM / DAY_S)
     position_km = load_ephemeris().position_km("earth", tt) + from_earth.position_m / 1e3
-    return Observer(tt, position_km, velocity_km_s + from_earth.velocity_m_s / 1e3, from_earth)
+    return ObserverPlace(tt, position_km, velocity_km_s + from_earth.velocity_m_s / 1e3, from_earth)
 
 
 def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsState:
@@ -162,7 +162,7 @@ class Place(NamedTuple):
         return float(np.linalg.norm(self.from_sun_km))
 
 
-def place(name: str, observer: Observer) -> Place:
+def place(name: str, observer: ObserverPlace) -> Place:
     """Apparent place of a body: light time, the Sun's deflection of light, aberration.
 
     The body is where it was when the light left it (the equation of light time, iterated to 1 km); the Sun

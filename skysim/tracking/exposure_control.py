@@ -7,7 +7,7 @@ import numpy as np
 from estimator.core.checks import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
-from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
+from estimator.trackers.exposure_control import (Control, NextExposure, Observation, observe, step)
 from estimator.trackers.pipeline import Settings
 from skysim.core.types import Frame
 from skysim.scene.scene import Scene
@@ -28,7 +28,7 @@ class ExposureController:
     def update(self, frame: Frame) -> None:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
-            state = Exposure(frame.exposure_s)
+            state = NextExposure(frame.exposure_s)
             self.exposure_s = step(
                 state, observe_frame(self.settings, self.control, frame), self.control
             ).time_s

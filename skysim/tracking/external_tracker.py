@@ -15,7 +15,7 @@ from skysim.core.plugins import ProgramError, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.sections.light import StarsConfig
-from skysim.tracking import process
+from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (FAILED, OWN, TRACKERS, Answer, Leds, Picture, Setup, Stars)
 import time
 from collections.abc import Callable
@@ -31,7 +31,7 @@ from skysim.tracking.tracker_interface import (FAILED, OWN, SOLVED, Answer, chec
 class ExternalTracker:
     """A tracker in its own process. Every failure there becomes the status of a frame."""
 
-    def __init__(self, program: process.TrackerProgram) -> None:
+    def __init__(self, program: tracker_interface.TrackerProgram) -> None:
         self.program = program
 
     @classmethod
@@ -49,13 +49,13 @@ class ExternalTracker:
         TRACKERS.check_name(name, commands)
         setup = build_setup(scene, camera, settings, lights)
         if name in commands:
-            arguments, image_format = process.split_command(name, commands[name])
+            arguments, image_format = tracker_interface.split_command(name, commands[name])
             return cls(
-                process.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s)
+                tracker_interface.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s)
             )
         host, environment = host_command("skysim.tracking.tracker_host", name)
         return cls(
-            process.TrackerProgram(name, host, None, setup, config.time_limit_s, environment)
+            tracker_interface.TrackerProgram(name, host, None, setup, config.time_limit_s, environment)
         )
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:

@@ -33,7 +33,7 @@ from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.types import Floats
-from skysim.sources.orbit.camera_orbit import (CameraOrbit, build_orbit, state_at)
+from skysim.sources.camera_orbit import (CameraOrbit, build_orbit, state_at)
 
 
 

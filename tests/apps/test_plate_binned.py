@@ -43,7 +43,7 @@ def test_a_picture_out_of_focus_is_solved_binned_and_says_so(
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
     alone, _ = plate_solver.solve_array(blurred, solver, None)
     assert not alone.attitude.solved
-    outcome = plate_solver.solve_picture(images.Picture(blurred), solver, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(blurred), solver, None)
     found = plate_solver.outcome_fields(outcome, None)
     assert found["status"] == "solved"
     assert math.degrees((outcome.report.attitude.cam_from_ref * truth.inv()).magnitude()) < 0.1
@@ -91,12 +91,12 @@ def test_a_binned_picture_needs_more_evidence(
 
     monkeypatch.setattr(plate_picture, "solve_array", never)
     plate_solver.solve_picture(
-        images.Picture(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
+        images.ViewedImage(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
     )
     assert tries[0] == 1
     assert set(tries[1:]) == {1000}
     tries.clear()
-    fits = images.Picture(blurred, row_order_known=False)
+    fits = images.ViewedImage(blurred, row_order_known=False)
     plate_solver.solve_picture(fits, plate_solver.make_solver(None, None), None)
     assert tries[:2] == [2, 2]
     assert set(tries[2:]) == {2000}

@@ -103,7 +103,7 @@ make_solver = cache(plate_solver.make_solver)  # it keeps its trackers
 
 def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None) -> str:
     """What the refusal of a picture says; "" for a solution."""
-    picture = images.Picture(image)
+    picture = images.ViewedImage(image)
     outcome = plate_solver.solve_picture(
         picture, make_solver(fov_deg, None, catalog=catalog_name), None
     )

@@ -12,8 +12,8 @@ from skysim.core.types import Floats
 from skysim.scene.loader import load
 from skysim.scene.sections.light import SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.air import AirGlow, Atmosphere
+from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lights.atmosphere import (AirGlow, AirEffects)
 from skysim.simulation.lights.light import find_light
 from skysim.sources.air import Sky
 
@@ -96,7 +96,7 @@ def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
 
 def sky_of(lab: Lab) -> Sky:
     """The air at the scene's start."""
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     assert atmosphere is not None
     return atmosphere.air.at(lab.scene.start_time)
 

@@ -21,7 +21,7 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import build_lab
 from skysim.simulation.lights.light import beam_of
-from skysim.sources.orbit.satellites import as_sources, moving_light
+from skysim.sources.satellites import (as_sources, moving_light)
 from skysim.sources.photometry import (
     Band,
     black_body_v0,

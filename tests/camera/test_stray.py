@@ -22,7 +22,7 @@ from skysim.simulation.lab import build_lab
 from skysim.sources.dome.interreflection import ReflectingDome
 from skysim.sources.dome.interreflection import (diffuse_light, spiral)
 from skysim.sources.dome.surface import Ellipsoid
-from skysim.sources.false_lights import GHOST, MIRRORED
+from skysim.sources.satellites import (GHOST, MIRRORED)
 from skysim.sources.photometry import Band
 
 CAMERA = {

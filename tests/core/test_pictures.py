@@ -22,7 +22,7 @@ from skysim.core import encoded
 from skysim.core import encoded
 from skysim.core import images
 from skysim.core import encoded
-from skysim.core import fits as fits_images
+from skysim.core import images as fits_images
 
 RNG = np.random.default_rng(4)
 GRAY = np.kron(

@@ -13,7 +13,7 @@ import pytest
 
 from skysim.apps.cli import main
 from skysim.core.files import ROOT
-from skysim.results.files import frame_folder
+from skysim.results.files import recording
 from skysim.results.files.run_export import EXPORTS
 
 PAGE = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.long
 def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    told = set(frame_folder.EXPORT_FILES) - {"imu.parquet"} | {frame_folder.ZARR}
+    told = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
     assert told <= left
     assert {f"frame_000{n}.tif" for n in range(3)} <= left
     assert not [name for name in left if name.startswith(".")]
@@ -68,8 +68,8 @@ def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> No
 def test_a_new_run_takes_the_exports_of_the_old_one_away(tmp_path: Path) -> None:
     """They would speak of other frames."""
     mine = tmp_path / "notes.aem"
-    for name in (*frame_folder.EXPORT_FILES, "frame_0003.tif", mine.name):
+    for name in (*recording.EXPORT_FILES, "frame_0003.tif", mine.name):
         (tmp_path / name).write_bytes(b"")
-    (tmp_path / frame_folder.ZARR).mkdir()
-    frame_folder.remove_results(tmp_path)
+    (tmp_path / recording.ZARR).mkdir()
+    recording.remove_results(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]

@@ -21,7 +21,8 @@ from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.multibody import scene_picture
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
-from skysim.sources import catalog, dome
+from skysim.sources import (dome)
+from skysim.sources import catalog
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
 from skysim.sources.photometry import Band

@@ -16,20 +16,20 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.experiments import balance_prior
+from skysim.experiments import balance_flight
 from skysim.experiments import balance_report
 from skysim.experiments import balance_flight
-from skysim.experiments import balance_prior
+from skysim.experiments import balance_flight
 from skysim.experiments import balance_procedure
-from skysim.experiments.balance_procedure import Plan
-from skysim.experiments.configs import with_config
+from skysim.experiments.balance_procedure import BalancePlan
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 
 SIGMA_RAD = 5e-5
-UNCERTAINTY = balance_prior.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
-BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
+UNCERTAINTY = balance_flight.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
+BALANCE = BalancePlan("wheels", 8.0, 5e-5, 4, True)
 
 
 def noisy_truth(
@@ -177,7 +177,7 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
     def refusal(sigmas: Floats) -> str:
         estimate = MassEstimate(prior.values, np.diag(sigmas**2), 1.0)
         with pytest.raises(InputError) as refused:
-            balance_prior.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+            balance_flight.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
         return str(refused.value)
 
     gained = 0.04**-2 - 0.1**-2
@@ -201,7 +201,7 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
     )
     known[8] = 1e-6
     estimate = MassEstimate(prior.values, np.diag(known**2), 1.0)
-    balance_prior.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+    balance_flight.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_wrong_uncertainties_are_refused(
     texts: tuple[str, str, str, str, float], message: str
 ) -> None:
     with pytest.raises(InputError) as refused:
-        balance_prior.parse_uncertainty(*texts)
+        balance_flight.parse_uncertainty(*texts)
     assert str(refused.value).startswith(message)
 
 

@@ -18,7 +18,7 @@ from estimator.catalog import (catalog)
 from estimator.catalog import published_catalogs
 from estimator.core.checks import ImageError
 from skysim.apps.cli.commands import validate
-from skysim.apps.stream import packet
+from skysim.apps.stream import sinks
 from skysim.camera.psf import otf
 from skysim.core import units
 from skysim.core.errors import InputError
@@ -31,19 +31,20 @@ from skysim.dynamics.profile_samples import check_samples
 from skysim.dynamics.reference_curves import fit_spline
 from skysim.experiments.characterize.frame_files import read_settings
 from skysim.experiments.dome_survey import survey_images
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import store
 from skysim.results.files import recording
-from skysim.results.files.prices import read_prices
-from skysim.results.report.as_text import print_table
-from skysim.results.report.blocks import Column, Table
-from skysim.scene import loader, opencv_calibration
+from skysim.results.files.parts import read_prices
+from skysim.results.report import print_table
+from skysim.results.report_blocks import (Column, Table)
+from skysim.scene import (loader)
+from skysim.scene import opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome.layouts import listed
 from skysim.sources.dome import point_cloud
-from skysim.sources.orbit.elements import gcrs_states, read_elements
-from skysim.sources.orbit.oem import read_oem
+from skysim.sources.orbit_elements import (gcrs_states, read_elements)
+from skysim.sources.orbit_elements import read_oem
 from skysim.tracking import dome_map_file
 from skysim.tracking import tracker_interface
 
@@ -227,7 +228,7 @@ def torques(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
-    rejects(lambda: packet.unpack(BytesIO(data)), InputError)
+    rejects(lambda: sinks.unpack(BytesIO(data)), InputError)
 
 
 def quantities(data: bytes) -> None:

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.camera import Camera
 from skysim.core.constants import SPEED_OF_LIGHT_KM_S
 from skysim.core.types import Frame, Truth
-from skysim.results.files import frame_folder as frame_files
+from skysim.results.files import recording as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import engines, runner, store
+from skysim.experiments.study.execution import (engines, store)
+from skysim.experiments.study.execution import runner
 
 STRAYS = """
 schema: 1

@@ -26,10 +26,10 @@ from skysim.core import files
 from skysim.core.types import Floats
 from skysim.results import (scoring)
 from skysim.results import annotate
-from skysim.results.files import (recording)
-from skysim.results.files import aem_file
+from skysim.results.files import recording
 from skysim.results.files import run_export
-from skysim.results.files import frame_folder
+from skysim.results.files import run_export
+from skysim.results.files import recording
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks import check
@@ -55,7 +55,7 @@ def sky_flight(folder: Path) -> Flight:
     scene = flight.lab.scene
     rows = []
     for shot in flight.shots():
-        frame_folder.write_frame(folder, shot.frame, shot.truth, scene)
+        recording.write_frame(folder, shot.frame, shot.truth, scene)
         rows.append(scoring.score(shot).row)
     files.write_table(folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene)))
     return flight
@@ -71,7 +71,7 @@ def dome_flight(folder: Path) -> Flight:
     small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
     flight = open_flight(loader.load("afit_simsat", told | small))
     for shot in flight.shots(solves=False):
-        frame_folder.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
+        recording.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
     return flight
 
 
@@ -118,8 +118,8 @@ def matrix_b_from_a(q: Floats) -> Floats:
 def test_the_standard_s_own_examples() -> None:
     """Annex F2.2: B is A turned by 90 deg about Z. F5.4: by 90, 10 and 45 deg about Z, X and Z, one after the other."""
     turns = Rotation.from_euler("ZXZ", [[90, 0, 0], [90, 10, 45]], degrees=True)
-    text = aem_file.message(
-        "x", [], (aem_file.ICRF, aem_file.BODY), [START, START + SECOND], turns
+    text = run_export.message(
+        "x", [], (run_export.ICRF, run_export.BODY), [START, START + SECOND], turns
     )
     rows = [[float(word) for word in line.split()[1:]] for line in text.splitlines()[-3:-1]]
     np.testing.assert_allclose(rows[0], [0, 0, 0.7071, 0.7071], rtol=0, atol=5e-5)
@@ -197,7 +197,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
     """Printable ASCII, 254 characters a line, times that ascend, quaternions that do not jump."""
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
-    text = aem_file.message("ünïcode", ["″" * 400], (aem_file.LAB, aem_file.BODY), utc, spin)
+    text = run_export.message("ünïcode", ["″" * 400], (run_export.LAB, run_export.BODY), utc, spin)
     assert all(
         line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines()
     )
@@ -207,7 +207,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
     assert (np.sum(rows[1:] * rows[:-1], axis=1) > 0.9).all()
     for epochs in ([], [START, START]):
         with pytest.raises(InputError):
-            aem_file.message("x", [], (aem_file.LAB, aem_file.BODY), epochs, spin[: len(epochs)])
+            run_export.message("x", [], (run_export.LAB, run_export.BODY), epochs, spin[: len(epochs)])
 
 
 # Tables
@@ -271,7 +271,7 @@ def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> No
     np.testing.assert_array_equal(cv2.imread(str(written[1]), cv2.IMREAD_UNCHANGED), image)
     np.testing.assert_array_equal(skimage.io.imread(written[1]), image)
     np.testing.assert_array_equal(
-        zarr.open_group(tmp_path / frame_folder.ZARR, mode="r")["frames"][1], image
+        zarr.open_group(tmp_path / recording.ZARR, mode="r")["frames"][1], image
     )
 
 
@@ -279,13 +279,13 @@ def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> No
 def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) -> None:
     flight, run = stars
     run_export.export(run, ["zarr"], tmp_path, quiet)
-    group = zarr.open_group(tmp_path / frame_folder.ZARR, mode="r")
+    group = zarr.open_group(tmp_path / recording.ZARR, mode="r")
     assert group.metadata.zarr_format == 3
     assert group["frames"].chunks == (1, 493, 659)
     images = [fits.getdata(f"{stem}.fits") for stem in run.stems]
     assert group["frames"].dtype == np.uint16
     np.testing.assert_array_equal(group["frames"][:], images)
-    opened = xarray.open_zarr(tmp_path / frame_folder.ZARR, consolidated=False)
+    opened = xarray.open_zarr(tmp_path / recording.ZARR, consolidated=False)
     assert opened["frames"].dims == ("frame", "y", "x")
     assert opened["mid_utc"].values[0] == np.datetime64("2012-06-22T21:00:00.120000")
     lab_from_body = flight.trajectory().attitude_at(opened["t_mid_s"].values)

@@ -11,7 +11,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.results.files.parts import (COLUMNS, PartsList, build_design, parts_list, to_csv)
-from skysim.results.files.prices import (UNITS, find_prices, read_prices)
+from skysim.results.files.parts import (UNITS, find_prices, read_prices)
 from skysim.scene import loader
 from skysim.scene.sections.layouts import StringConfig
 from skysim.sources.dome.layouts.string import wind

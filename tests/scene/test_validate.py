@@ -19,7 +19,7 @@ from skysim.apps.cli.commands.validate import check_file
 from skysim.core.errors import InputError
 from skysim.core import yaml_reader
 from skysim.core.files import (DATA, ROOT, SCENES)
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.scene import opencv_calibration
 from skysim.scene.loader import load, load_camera
 
@@ -96,7 +96,7 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
         InputError,
         match=r"^schema: version 0 is no longer supported; allowed: 1 \(.*study\.yaml, line 2\)$",
     ):
-        loader.load(study)
+        study_file.load(study)
 
 
 def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Pa
             read()
     path.write_text("title: T\nscene: shefex2\n")
     with pytest.raises(InputError, match=f"^{re.escape(says)}$"):
-        loader.load(path)
+        study_file.load(path)
     for kind in SHIPPED:
         assert faults(kind, {"title": "T"}) == ["'schema' is a required property"]
     path.write_text("camera: {preset: ec655, focal_length: 16 mm, f_number: 1.4}\n")  # no scene

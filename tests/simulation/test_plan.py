@@ -16,15 +16,17 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import (attitudes, check, detection, facts, sampling)
+from skysim.simulation.checks import (check, detection, facts)
+from skysim.simulation.checks import attitudes
+from skysim.simulation.checks import sampling
 from skysim.simulation.checks import check as plan
 from skysim.simulation.checks.facts import Fact
-from skysim.simulation.checks.sampling import Samples
+from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import depth
+from skysim.simulation.checks import sky_warnings
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lab import (Lab, build_lab, build_tracker)
 from skysim.tracking.factory import solve_frame
 
 SPHERE = "{kind: sphere, apex: 1.2 m, radius: 1.2 m}"
@@ -56,11 +58,11 @@ def afit() -> plan.Check:
     return check(lab_of("afit_simsat"))
 
 
-def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
+def samples_of(lab: Lab) -> tuple[detection.Context, CheckedSamples]:
     context = detection.context_of(lab)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
-    return context, Samples(sampling.sampled(frames, context), sampling.sampled(reach, context))
+    return context, CheckedSamples(sampling.sampled(frames, context), sampling.sampled(reach, context))
 
 
 # Attitudes
@@ -150,7 +152,7 @@ def test_the_least_lights_are_where_it_says() -> None:
     roll, pitch, yaw = (
         float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw")
     )  # type: ignore[index]
-    there = attitudes.Attitudes(
+    there = attitudes.CheckedAttitudes(
         Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True),
         np.zeros((1, 3)),
         np.full(1, np.nan),
@@ -637,7 +639,7 @@ def test_fields_whose_leds_have_names_are_not_alike() -> None:
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     lab = lab_of("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = depth.detection_limit_mag(*samples_of(lab))
+    limit = sky_warnings.detection_limit_mag(*samples_of(lab))
     tracker = build_tracker(lab.camera)
     rng = np.random.default_rng(3)
     found = []

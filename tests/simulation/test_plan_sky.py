@@ -10,17 +10,18 @@ import pytest
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, findings
+from skysim.simulation.checks import (findings)
+from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks import dome_warnings
 from skysim.simulation.checks.check import check
-from skysim.simulation.checks.sampling import Samples, sampled
+from skysim.simulation.checks.sampling import (CheckedSamples, sampled)
 from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import depth
+from skysim.simulation.checks import sky_warnings
 from skysim.simulation.checks import sky_warnings
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import build_lab, build_tracker
-from skysim.sources.false_lights import MIRRORED
+from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.sources.satellites import MIRRORED
 from skysim.tracking.factory import solve_frame
 
 BAFFLE = "{angle_deg: [20, 50, 90, 120], pst: [1e-3, 1e-7, 1e-9, 1e-12]}"
@@ -44,12 +45,12 @@ SHINY = {
 DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
 
-def plan_of(scene: str, **keys: str) -> tuple[Context, Samples]:
+def plan_of(scene: str, **keys: str) -> tuple[Context, CheckedSamples]:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
     lab = build_lab(loader.load(scene, (SPACE if scene == "shefex2" else {}) | overrides))
     context = context_of(lab)
     frames = sampled(attitudes.of_frames(lab), context)
-    return context, Samples(frames, frames)
+    return context, CheckedSamples(frames, frames)
 
 
 def pointing(ra_deg: float, dec_deg: float) -> str:
@@ -60,7 +61,7 @@ def pointing(ra_deg: float, dec_deg: float) -> str:
 def test_stray_light_that_costs_stars_is_warned_of() -> None:
     """The loss is that of the limit with and without the baffle; the cure leaves half a magnitude."""
     keys = {"motion__start": pointing(90.0, -18.0), "light__bodies": "{}"}
-    plain = depth.snr_limit_mag(*plan_of("shefex2", **keys))
+    plain = sky_warnings.snr_limit_mag(*plan_of("shefex2", **keys))
     lit = plan_of("shefex2", **keys, camera__baffle=BAFFLE)
     (line,) = sky_warnings.stray_light(*lit)
     lost = re.match(
@@ -70,10 +71,10 @@ def test_stray_light_that_costs_stars_is_warned_of() -> None:
     )
     assert lost
     assert float(lost[1]) == pytest.approx(lit[0].camera.stray_e, rel=1e-2)
-    assert float(lost[2]) == pytest.approx(plain - depth.snr_limit_mag(*lit), abs=0.15)
+    assert float(lost[2]) == pytest.approx(plain - sky_warnings.snr_limit_mag(*lit), abs=0.15)
     better = f"{{angle_deg: [20, 50, 90, 120], pst: {[float(lost[3]) * one for one in (1e-3, 1e-7, 1e-9, 1e-12)]}}}"
     cured = plan_of("shefex2", **keys, camera__baffle=better)
-    assert 0.4 < plain - depth.snr_limit_mag(*cured) < 0.55
+    assert 0.4 < plain - sky_warnings.snr_limit_mag(*cured) < 0.55
     assert len(list(sky_warnings.stray_light(*plan_of("shefex2", **keys)))) == 0
 
 

@@ -14,9 +14,10 @@ from astropy.time import Time
 from astropy.utils import iers
 
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirConfig, HorizonConfig
+from skysim.scene.sections.surroundings import (AirConfig, HorizonConfig)
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources import catalog, stars
+from skysim.sources import (stars)
+from skysim.sources import catalog
 from skysim.sources import air as starlight
 from skysim.sources.air import (Air, horizon_rad, mean_wavelength_m)
 from skysim.sources.refraction import (Atmosphere, Refraction, Weather, refraction_rad)

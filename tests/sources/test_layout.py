@@ -17,7 +17,8 @@ from skysim.core.types import Sources
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig
-from skysim.sources import catalog, dome
+from skysim.sources import (dome)
+from skysim.sources import catalog
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.layouts import (boards)
 from skysim.sources.dome.layouts import spreads

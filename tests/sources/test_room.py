@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.analysis import search
-from skysim.experiments.study.execution import engines, runner, store
+from skysim.experiments.study.execution import (engines, store)
+from skysim.experiments.study.execution import runner
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import (DomeConfig, RoomConfig)

@@ -19,7 +19,7 @@ from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 from skysim.sources import bodies
 from skysim.sources import body_discs
 from skysim.sources import ephemeris
-from skysim.sources import body_magnitudes
+from skysim.sources import body_discs
 from skysim.sources import ephemeris
 from skysim.sources import ephemeris
 from skysim.sources.bodies import (BODIES, bodies_from)
@@ -155,8 +155,8 @@ def lit(
 ) -> ephemeris.Place:
     """A body seen at a phase angle, Sun and observer at a latitude above its equator."""
     pole = np.array([0.0, 0.0, 1.0])
-    if name in body_magnitudes.POLES_DEG:
-        ra, dec = np.radians(body_magnitudes.POLES_DEG[name])
+    if name in body_discs.POLES_DEG:
+        ra, dec = np.radians(body_discs.POLES_DEG[name])
         pole = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.cross(pole, [1.0, 0.0, 0.0])
     east /= np.linalg.norm(east)
@@ -178,7 +178,7 @@ def test_magnitudes_are_the_authors_own(
 ) -> None:
     at = lit(name, sun_au, observer_au, phase_deg)
     assert np.degrees(at.phase_rad) == pytest.approx(phase_deg, abs=1e-9)
-    assert body_magnitudes.magnitude(name, at, J2000_JD) == pytest.approx(v_mag, abs=6e-4)
+    assert body_discs.magnitude(name, at, J2000_JD) == pytest.approx(v_mag, abs=6e-4)
 
 
 def test_uranus_and_neptune_are_the_authors_own() -> None:
@@ -188,16 +188,16 @@ def test_uranus_and_neptune_are_the_authors_own() -> None:
         (20.285, 18.321003215845, 17.3229728525108, 5.381),
         (0.995, 20.096361095266, 21.0888470145276, 6.025),
     ):
-        flattened = (1 - body_magnitudes.URANUS_FLATTENING) ** 2
+        flattened = (1 - body_discs.URANUS_FLATTENING) ** 2
         planetocentric = np.degrees(np.arctan(np.tan(np.radians(latitude_deg)) * flattened))
         at = lit("uranus", sun_au, observer_au, 0.05, planetocentric)
-        assert body_magnitudes.magnitude("uranus", at, J2000_JD) == pytest.approx(v_mag, abs=1e-3)
+        assert body_discs.magnitude("uranus", at, J2000_JD) == pytest.approx(v_mag, abs=1e-3)
     for years, sun_au, observer_au, phase_deg, v_mag in (
         (-29.1, 30.322109867761, 31.3091610098214, 0.0549, 7.997),
         (-9.68, 30.207767693725, 29.8172370857530, 1.7741, 7.827),
     ):
         at = lit("neptune", sun_au, observer_au, phase_deg)
-        assert body_magnitudes.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
+        assert body_discs.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
             v_mag, abs=1e-3
         )
 
@@ -205,30 +205,30 @@ def test_uranus_and_neptune_are_the_authors_own() -> None:
 def test_open_rings_make_saturn_brighter() -> None:
     """Edge on -8.914, at 26.7 degrees -8.914 - (1.825 + 0.378) sin 26.7 at opposition; unlit rings give none."""
     unit = [
-        body_magnitudes.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
+        body_discs.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
         for b in (0.0, 26.7)
     ]
     assert unit == pytest.approx([-8.914, -8.914 - 2.203 * np.sin(np.radians(26.7))], abs=1e-6)
     at = lit("saturn", 1.0, 1.0, 0.0, 5.0)
     from_below = ephemeris.lit_place(-at.direction, at.from_sun_km, -at.to_body_km)
-    assert body_magnitudes.saturn(0.0, from_below, J2000_JD) == pytest.approx(-8.914)
+    assert body_discs.saturn(0.0, from_below, J2000_JD) == pytest.approx(-8.914)
 
 
 def test_moon_and_sun_at_their_mean_distances() -> None:
-    assert body_magnitudes.moon_magnitude(384400.0, 1.0, 0.0) == pytest.approx(-12.73)
-    assert body_magnitudes.moon_magnitude(384400.0, 1.0, 90.0) == pytest.approx(-10.13, abs=0.01)
+    assert body_discs.moon_magnitude(384400.0, 1.0, 0.0) == pytest.approx(-12.73)
+    assert body_discs.moon_magnitude(384400.0, 1.0, 90.0) == pytest.approx(-10.13, abs=0.01)
     sun = lit("sun", 1.0, 1.0, 0.0)
-    assert body_magnitudes.magnitude("sun", sun, J2000_JD) == pytest.approx(-26.74)
+    assert body_discs.magnitude("sun", sun, J2000_JD) == pytest.approx(-26.74)
 
 
 def test_earthshine_is_as_dim_as_is_measured() -> None:
     """The earthlit disc of a thin crescent is some 10 mag fainter than the full Moon; that of a full one is dark."""
-    thin = lit("moon", 1.0, body_magnitudes.MOON_KM / ephemeris.AU_KM, 150.0)
-    sunlit = body_magnitudes.magnitude("moon", thin, J2000_JD)
-    earthlit = sunlit - 2.5 * np.log10(body_magnitudes.earthshine_fraction(thin))
+    thin = lit("moon", 1.0, body_discs.MOON_KM / ephemeris.AU_KM, 150.0)
+    sunlit = body_discs.magnitude("moon", thin, J2000_JD)
+    earthlit = sunlit - 2.5 * np.log10(body_discs.earthshine_fraction(thin))
     assert -3.5 < earthlit < -1.5
-    full = lit("moon", 1.0, body_magnitudes.MOON_KM / ephemeris.AU_KM, 0.0)
-    assert body_magnitudes.earthshine_fraction(full) < 1e-5  # the Earth is new
+    full = lit("moon", 1.0, body_discs.MOON_KM / ephemeris.AU_KM, 0.0)
+    assert body_discs.earthshine_fraction(full) < 1e-5  # the Earth is new
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 40.0, 90.0, 140.0])
@@ -242,30 +242,30 @@ def test_a_lambert_sphere_has_lambert_s_phase_and_center(phase_deg: float) -> No
     assert light.sum() / full.sum() == pytest.approx(
         (np.sin(a) + (np.pi - a) * np.cos(a)) / np.pi, abs=1e-3
     )
-    xy, share = body_discs.disc_elements(body_discs.Surface(body_discs.LAMBERT, a))
+    xy, share = body_discs.disc_elements(body_discs.DiscSurface(body_discs.LAMBERT, a))
     assert share.sum() == pytest.approx(1.0)
     assert share @ xy == pytest.approx([(light * x).sum() / light.sum(), 0.0], abs=2e-3)
 
 
-def lattice(surface: body_discs.Surface, across: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lattice(surface: body_discs.DiscSurface, across: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     axis = (np.arange(across) + 0.5) * (2 / across) - 1
     x, y = np.meshgrid(axis, axis)
     return x, y, body_discs.light_map(surface, axis)
 
 
 def test_the_full_moon_is_uniform_and_the_half_moon_ends_at_the_terminator() -> None:
-    x, y, share = lattice(body_discs.Surface(body_discs.LOMMEL_SEELIGER, 0.0))
+    x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, 0.0))
     inside = np.hypot(x, y) < 0.98
     assert np.ptp(share[inside]) < 1e-9 * share.max()
     for phase_deg in (60.0, 90.0, 120.0):
-        x, y, share = lattice(body_discs.Surface(body_discs.LOMMEL_SEELIGER, np.radians(phase_deg)))
+        x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.radians(phase_deg)))
         terminator = -np.cos(np.radians(phase_deg)) * np.sqrt(np.maximum(1 - y**2, 0))
         assert (share[x < terminator - 0.01] == 0).all()
         assert (share[(x > terminator + 0.01) & (np.hypot(x, y) < 0.99)] > 0).all()
 
 
 def test_earthshine_lights_the_whole_disc() -> None:
-    x, y, share = lattice(body_discs.Surface(body_discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
+    x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
     dark = (x < -0.02) & (np.hypot(x, y) < 0.98)
     assert np.ptp(share[dark]) < 1e-9 * share[dark].max()
     assert share[dark].sum() == pytest.approx(
@@ -275,7 +275,7 @@ def test_earthshine_lights_the_whole_disc() -> None:
 
 def test_the_sun_s_limb_is_dark() -> None:
     """Its mean brightness is 0.30 + 2/3 0.93 - 1/2 0.23 of the center's."""
-    _, _, share = lattice(body_discs.Surface(body_discs.LIMB_DARKENED, 0.0))
+    _, _, share = lattice(body_discs.DiscSurface(body_discs.LIMB_DARKENED, 0.0))
     mean = share.sum() / (np.pi / 4 * 200**2)
     assert mean / share[100, 100] == pytest.approx(0.30 + 0.62 - 0.115, rel=1e-3)
 

@@ -16,7 +16,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lab import (Lab, build_lab, build_tracker)
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Surface
 from skysim.sources.dome import survey_errors

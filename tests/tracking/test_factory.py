@@ -20,7 +20,7 @@ from skysim.scene import loader
 from skysim.simulation.checks import check
 from skysim.simulation.checks import dome_warnings
 from skysim.simulation.flight import Flight, simulate_motion
-from skysim.simulation.lab import build_lab, build_tracker
+from skysim.simulation.lab import (build_lab, build_tracker)
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import (Navigation, build_filter)

@@ -26,8 +26,10 @@ from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
-from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study.execution import runner, setups, store
+from skysim.experiments.study import study_file as study_loader
+from skysim.experiments.study.execution import (store)
+from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import setups
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
@@ -35,7 +37,7 @@ from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
 from skysim.tracking import tracker_interface
-from skysim.tracking import process
+from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (Answer, Leds, Picture, Setup, Stars, check_answer)
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
@@ -106,9 +108,9 @@ READY = "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('
 FRAMES = READY + "for line in g:\n    h = json.loads(line); p = g.read(h['bytes'])\n    "
 
 
-def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> process.TrackerProgram:
+def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> tracker_interface.TrackerProgram:
     parts = [sys.executable, "-c", text, "{folder}"]
-    return process.TrackerProgram("mine", parts, kind, SETUP, limit_s)
+    return tracker_interface.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
 
 def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
@@ -259,7 +261,7 @@ def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
 )
 def test_a_program_s_name_and_command_are_checked(told: str) -> None:
     with pytest.raises(InputError, match=r"^programs"):
-        process.program_commands([told])
+        tracker_interface.program_commands([told])
 
 
 # --- runs ---------------------------------------------------------------------------------------------------
@@ -391,7 +393,7 @@ def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         FRAMES + 'print(\'{"frame": 0, "status": "cloudy"}\', flush=True)'
     )
-    commands = process.program_commands(
+    commands = tracker_interface.program_commands(
         [f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"]
     )
     with pytest.raises(InputError, match="needs frames; allowed: own"):
@@ -522,7 +524,7 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         (lost / str(n)).write_text("".join(rows))
     (lost / str(len(POINTED))).write_text("attitude_known 0\n")
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
-    runs = process.TrackerProgram("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
+    runs = tracker_interface.TrackerProgram("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
     answers = [
         check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
         for n in range(len(POINTED) + 1)

@@ -23,10 +23,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
@@ -42,6 +40,8 @@ from estimator.identification.direct_match import (
     triple,
 )
 from estimator.identification.solver_options import Options
+
+
 
 MAG_GATE_SIGMA = (
     3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
@@ -65,7 +65,7 @@ class MagnitudeMatch(StarMatch):
     variance_mag2: float = float("nan")
 
 
-class SearchOptions(NamedTuple):
+class FialhoOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
     tolerance_rad, stretch : tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
@@ -92,7 +92,7 @@ class SearchOptions(NamedTuple):
 
 def search_options(
     tolerance_rad: float, settings: Options, min_fraction: float, optimized: bool, retries: bool
-) -> SearchOptions:
+) -> FialhoOptions:
     """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive.
 
     retries : try other observed triangles if the first fails
@@ -108,7 +108,7 @@ def search_options(
     if settings.boresight_ref is not None:
         x, y, z = settings.boresight_ref
         chord2 = 4 * np.sin(min(settings.within_rad, np.pi) / 2) ** 2
-    return SearchOptions(
+    return FialhoOptions(
         tolerance_rad,
         settings.stretch,
         MAG_GATE_SIGMA * settings.epsilon_mag,
@@ -206,7 +206,7 @@ def _identify(
 
 @jit
 def search(
-    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: FialhoOptions
 ) -> DirectMatch:
     """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
@@ -268,7 +268,7 @@ def triplets(
     magnitudes: Floats,
     index: PairIndex,
     corners: NDArray,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted."""
@@ -288,7 +288,7 @@ def _direct_match(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: int,
 ) -> DirectMatch:
     """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
@@ -302,7 +302,7 @@ def _direct_match(
 
 
 @jit
-def _candidate(index: PairIndex, star: int, magnitude: float, options: SearchOptions) -> bool:
+def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOptions) -> bool:
     """Whether a star is within the magnitude gate and near enough to the prior boresight."""
     if (
         abs(index.magnitude[star] - magnitude) > options.gate_mag
@@ -320,7 +320,7 @@ def _test_neighbors(
     corners: NDArray,
     sides: Floats,
     tolerance: Floats,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
@@ -365,7 +365,7 @@ def _test_neighbors(
 
 
 @jit
-def _all_candidates(index: PairIndex, magnitude: float, options: SearchOptions) -> NDArray:
+def _all_candidates(index: PairIndex, magnitude: float, options: FialhoOptions) -> NDArray:
     """Candidates for one star, from the whole catalog."""
     out = np.empty(len(index.vectors), np.int64)
     count = 0
@@ -384,7 +384,7 @@ def _test_lists(
     corners: NDArray,
     sides: Floats,
     tolerance: Floats,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """The basic assembly: three lists, each from the whole catalog, and every triplet of them."""
@@ -413,3 +413,5 @@ def _test_lists(
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
                     return match
     return no_match()
+
+

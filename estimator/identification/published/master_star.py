@@ -11,10 +11,8 @@ from __future__ import annotations
 
 from math import sqrt
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
@@ -31,7 +29,8 @@ from estimator.identification.direct_match import (
 from estimator.identification.solver_options import Options
 
 
-class SearchOptions(NamedTuple):
+
+class MasterStarOptions(NamedTuple):
     """Search parameters: tolerances as in `Options`, magnitude gate, number of masters, limit of angles compared."""
 
     tolerance_rad: float
@@ -61,7 +60,7 @@ def master_star(
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    parameters = SearchOptions(
+    parameters = MasterStarOptions(
         tolerance_rad,
         settings.stretch,
         3 * settings.epsilon_mag,
@@ -74,7 +73,7 @@ def master_star(
 
 @jit
 def search(
-    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: MasterStarOptions
 ) -> DirectMatch:
     """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
@@ -116,7 +115,7 @@ def _count_angles(
     index: PairIndex,
     master: int,
     candidate: int,
-    options: SearchOptions,
+    options: MasterStarOptions,
     tried: NDArray,
 ) -> int:
     """Number of the master's angles that the candidate has to any of its neighbors."""
@@ -140,7 +139,7 @@ def _best_match(
     index: PairIndex,
     master: int,
     candidate: int,
-    options: SearchOptions,
+    options: MasterStarOptions,
     tried: NDArray,
     best: DirectMatch,
     rival: Floats,
@@ -171,3 +170,5 @@ def _best_match(
             if match.log10_chance < best.log10_chance:
                 best = match
     return best
+
+

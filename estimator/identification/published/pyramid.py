@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from math import sqrt
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.catalog.pair_index import (PairIndex, first_neighbor, pair_range)
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
@@ -30,7 +28,8 @@ from estimator.identification.direct_match import (
 from estimator.identification.solver_options import Options
 
 
-class SearchOptions(NamedTuple):
+
+class PyramidOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
     tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex : as in `Options`
@@ -68,7 +67,7 @@ def pyramid(
         raise ImageError(f"pyramid: tolerance {tolerance_rad} rad; allowed: more than 0")
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    parameters = SearchOptions(
+    parameters = PyramidOptions(
         tolerance_rad,
         settings.stretch,
         settings.focal_unknown,
@@ -82,7 +81,7 @@ def pyramid(
 
 
 @jit
-def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
+def _search(rays: Floats, index: PairIndex, options: PyramidOptions) -> DirectMatch:
     """Try the triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
     for dj in range(1, options.base - 1):
@@ -100,7 +99,7 @@ def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMat
 
 @jit
 def _triangle(
-    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+    rays: Floats, index: PairIndex, corners: NDArray, options: PyramidOptions, tried: NDArray
 ) -> DirectMatch:
     """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
     i, j, k = corners
@@ -164,7 +163,7 @@ def _pyramid(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: PyramidOptions,
     stretch: float,
     tried: NDArray,
 ) -> DirectMatch:
@@ -213,7 +212,7 @@ def _match_with_penalty(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: PyramidOptions,
     stretch: float,
     hypotheses: int,
 ) -> DirectMatch:
@@ -230,7 +229,7 @@ def _match_with_penalty(
 
 @jit
 def _count_in_field(
-    index: PairIndex, center: int, R_cam_from_ref: Floats, options: SearchOptions
+    index: PairIndex, center: int, R_cam_from_ref: Floats, options: PyramidOptions
 ) -> int:
     """Number of catalog stars in the field at an attitude; `center` is a star whose neighbors are tested."""
     count = 0
@@ -244,3 +243,5 @@ def _count_in_field(
         )
         count += z > 0 and inside
     return count
+
+

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.spatial_grid import Cells, within
+from estimator.catalog.sky_index import (Cells, within)
 from estimator.core.checks import (Floats, Ints)
 from estimator.core.jit import jit
 from estimator.identification.direct_match import angle

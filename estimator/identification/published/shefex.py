@@ -7,10 +7,8 @@ wide gate for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 0.0
 from __future__ import annotations
 
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.catalog.pair_index import (PairIndex, first_neighbor, pair_range)
 from estimator.core.checks import Floats
 from estimator.core.checks import ImageError
@@ -27,12 +25,14 @@ from estimator.identification.direct_match import (
 )
 from estimator.identification.solver_options import Options
 
+
+
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
 # Least angle between base stars, and from them, in tolerances: smaller angles carry little information.
 MIN_SIDE_TOLERANCES = 6.0
 
 
-class SearchOptions(NamedTuple):
+class ShefexOptions(NamedTuple):
     """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
     accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
@@ -83,7 +83,7 @@ def shefex(
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
-    parameters = SearchOptions(
+    parameters = ShefexOptions(
         error, tolerance_rad, settings.max_triangles, settings.max_checks, base
     )
     tried = np.zeros(3, np.int64)
@@ -91,7 +91,7 @@ def shefex(
 
 
 @jit
-def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArray) -> DirectMatch:
+def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArray) -> DirectMatch:
     """Compiled search. Adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
     for i in range(options.base - 2):
         for j in range(i + 1, options.base - 1):
@@ -107,7 +107,7 @@ def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArra
 
 @jit
 def _triangle(
-    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+    rays: Floats, index: PairIndex, corners: NDArray, options: ShefexOptions, tried: NDArray
 ) -> DirectMatch:
     """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
     i, j, k = corners
@@ -153,7 +153,7 @@ def _triangle(
 
 
 @jit
-def _angle_gates(rays: Floats, corners: NDArray, options: SearchOptions) -> Floats:
+def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floats:
     """(N, 10) gates of each observed star's three angles to the base: lower ends, upper ends, cosines, and the area.
 
     The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
@@ -177,7 +177,7 @@ def _match_others(
     corners: NDArray,
     stars: NDArray,
     gates: Floats,
-    options: SearchOptions,
+    options: ShefexOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """Identify the other stars by their angles to the base triangle, then keep those near their predicted positions.
@@ -288,3 +288,5 @@ def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floa
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)
     return least
+
+

@@ -123,9 +123,9 @@ def load(
 
 def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dict[str, str]:
     """The commands of --program by name. Raises InputError for a name that is not among those used."""
-    from skysim.tracking import process
+    from skysim.tracking import tracker_interface
 
-    programs = process.program_commands(options)
+    programs = tracker_interface.program_commands(options)
     used = set(names)
     for name in programs:
         if name not in used:

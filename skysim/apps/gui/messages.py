@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, overload
-
 import numpy as np
 from numpy.typing import NDArray
-
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 from skysim.results import annotate
+
+
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
@@ -58,7 +58,7 @@ NO_PIXELS = Pixels(b"", {}, ALL_PIXELS, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class LightRow:
     """A true light on the frame: HIP or LED number, pixel, electrons, V magnitude (NaN of an LED)."""
 
     id: int
@@ -69,7 +69,7 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lights(Sequence[Light]):
+class LightColumns(Sequence[LightRow]):
     """The true lights of a frame as columns, since objects for hundreds of stars take longer to send than the pixels.
 
     id, electrons, magnitude : (N,) and xy_px : (N, 2), see `Light`
@@ -84,17 +84,17 @@ class Lights(Sequence[Light]):
         return len(self.id)
 
     @overload
-    def __getitem__(self, n: int) -> Light: ...
+    def __getitem__(self, n: int) -> LightRow: ...
     @overload
-    def __getitem__(self, n: slice) -> Lights: ...
-    def __getitem__(self, n: int | slice) -> Light | Lights:
+    def __getitem__(self, n: slice) -> LightColumns: ...
+    def __getitem__(self, n: int | slice) -> LightRow | LightColumns:
         if isinstance(n, slice):
-            return Lights(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
+            return LightColumns(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
         x, y = self.xy_px[n].tolist()
-        return Light(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
+        return LightRow(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
 
 
-NO_LIGHTS = Lights(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
+NO_LIGHTS = LightColumns(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class FrameView:
     body_wxyz: tuple[float, ...]
     exposure_s: float
     statistics: annotate.FrameStatistics
-    lights: Lights
+    lights: LightColumns
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0
@@ -259,7 +259,7 @@ class MotionLog:
     curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
 
-class FrameRow(NamedTuple):
+class FlightRow(NamedTuple):
     """One frame of a flight in numbers; NaN where it was not solved, or the scene has no filter.
 
     t_s : begin of its exposure;  cross, roll : the tracker's error and standard error, arcsec
@@ -290,7 +290,7 @@ class FlightStep:
     is_done: bool
     t_s: float
     duration_s: float
-    rows: tuple[FrameRow, ...] = ()
+    rows: tuple[FlightRow, ...] = ()
     log: MotionLog | None = None
     residuals: tuple[tuple[float, int, float], ...] = ()
 
@@ -357,3 +357,5 @@ class SurveyFound(NamedTuple):
     ids: NDArray[np.int64]
     known: Floats
     plan: SurveyPlan
+
+

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import ctypes
+import gc
+import time
+from skysim.apps.gui.views.overlay import FRAMES
 import hmac
 import re
 import secrets
@@ -12,7 +17,6 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any
 from urllib.parse import quote
-
 import nicegui
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
@@ -26,15 +30,73 @@ from starlette.responses import (
     StreamingResponse,
 )
 from starlette.routing import Route, Router
-
-from skysim.apps.gui import memory
 from skysim.apps.gui.page.tab import Tab
 from skysim.apps.gui.page.photo_panel import LIMIT_BYTES
-from skysim.apps.gui.views.served import FRAMES, display_of
+from skysim.apps.gui.views.overlay import (FRAMES, display_of)
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
+
+
+
+
+
+# Garbage collection of the server, while no page gets a frame.
+
+
+THRESHOLDS = (
+    2_000,
+    10,
+    1_000,
+)  # new objects until a collection, and collections until one of older objects
+QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
+PATIENCE_S = 60.0  # after which they are collected although frames follow one another
+
+
+def freeze() -> None:
+    """Take what was imported out of the garbage collector's sight, and let it look at new objects alone.
+
+    A collection of all pages takes half a second with 20 of them, in which no key is answered. Only `ClosedPages`
+    makes one.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*THRESHOLDS)
+
+
+def release_memory() -> None:
+    """Collect closed pages, and return their memory to the system; glibc's allocator would keep it."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:
+        trim(0)
+
+
+class ClosedPages:
+    """Collects closed pages, many at once if many were closed, while no page gets a frame, or PATIENCE_S later."""
+
+    def __init__(self) -> None:
+        self.waiting: asyncio.Task[None] | None = None
+
+    def collect_soon(self) -> None:
+        """Collect when the pages are quiet."""
+        if self.waiting is None:
+            self.waiting = asyncio.create_task(self.collect())
+
+    async def collect(self) -> None:
+        end_s = time.monotonic() + PATIENCE_S
+        await asyncio.sleep(QUIET_S)
+        while (now_s := time.monotonic()) < end_s and now_s - last_frame_s() < QUIET_S:
+            await asyncio.sleep(QUIET_S)
+        self.waiting = None  # a page that is closed from now on needs another collection
+        await asyncio.to_thread(release_memory)
+
+
+def last_frame_s() -> float:
+    """When a page got a frame last, by `time.monotonic`; minus infinity before the first."""
+    return max((frames.added_s for frames in FRAMES.values()), default=-float("inf"))
+
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 # Only this server's own code runs in the page, and no other site may frame it. NiceGUI needs inline code and `eval`.
@@ -262,7 +324,7 @@ def stop_studies() -> None:
         process.stop(signal.SIGTERM)
 
 
-async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
+async def close(tab: Tab, closed_pages: ClosedPages) -> None:
     """Release all that a tab held."""
     await tab.close()
     closed_pages.collect_soon()
@@ -271,9 +333,9 @@ async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, and prepare the workers of tabs."""
     pool = Workers(workers)
-    closed_pages = memory.ClosedPages()
+    closed_pages = ClosedPages()
     app.on_startup(be_patient)
-    app.on_startup(memory.freeze)
+    app.on_startup(freeze)
     app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
     app.on_shutdown(stop_studies)
 
@@ -347,3 +409,5 @@ def serve(
         if host in LOOPBACK
         else partial(GZipMiddleware, compresslevel=1),
     )
+
+

@@ -11,8 +11,8 @@ from skysim.apps.plate_solver.picture import pictures_in as pictures_in
 from skysim.apps.plate_solver.picture import solve as solve
 from skysim.apps.plate_solver.picture import solve_file as solve_file
 from skysim.apps.plate_solver.picture import solve_picture as solve_picture
-from skysim.apps.plate_solver.solution import PlateSolution as PlateSolution
-from skysim.apps.plate_solver.solution import solution_fields as solution_fields
+from skysim.apps.plate_solver.solver import PlateSolution as PlateSolution
+from skysim.apps.plate_solver.solver import solution_fields as solution_fields
 from skysim.apps.plate_solver.solver import FIELD_SEARCH as FIELD_SEARCH
 from skysim.apps.plate_solver.solver import Solver as Solver
 from skysim.apps.plate_solver.solver import best_attitude as best_attitude

@@ -9,28 +9,21 @@ from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
-from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
-from skysim.apps.plate_solver.solver import (
-    FOV_LIMITS_DEG,
-    Solver,
-    kept_solver,
-    make_solver,
-    solve_array,
-    validated_date,
-)
+from skysim.apps.plate_solver.solver import (PlateSolution, annotated_image, solution_fields)
+from skysim.apps.plate_solver.solver import (FOV_LIMITS_DEG, Solver, kept_solver, make_solver, solve_array, validated_date)
 from skysim.core.errors import InputError, printable
 from skysim.core import files
 from skysim.core import images
+
+
 
 ANNOTATED = ".annotated.png"
 # The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's
@@ -41,7 +34,7 @@ FOCAL_35MM_UNCERTAINTY = 0.10
 TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
-class Hypothesis(NamedTuple):
+class Reading(NamedTuple):
     """One reading of a picture: the pixels as they would be viewed, the solver for its field, and what it assumes."""
 
     pixels: NDArray
@@ -49,13 +42,13 @@ class Hypothesis(NamedTuple):
     assumption: str = ""
 
 
-class Outcome(NamedTuple):
+class SolvedReading(NamedTuple):
     """The hypothesis that was solved, or else the first one, with its report and tracker; all hypotheses."""
 
-    hypothesis: Hypothesis
+    hypothesis: Reading
     report: Report
     tracker: StarTracker
-    tried: list[Hypothesis]
+    tried: list[Reading]
 
 
 def solve(
@@ -172,7 +165,7 @@ def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[s
     return result
 
 
-def load_picture(path: Path, solver: Solver) -> images.Picture:
+def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
     """The picture as it is viewed, in monochrome. Raises InputError or ImageError if it cannot be solved."""
     picture = images.read_picture(path)
     check_image(path, picture.pixels, solver)
@@ -205,8 +198,8 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
 
 
 def solve_picture(
-    picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None
-) -> Outcome:
+    picture: images.ViewedImage, solver: Solver, date_utc: datetime.datetime | None
+) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
     # those of a reading serve all fields of view
@@ -215,14 +208,14 @@ def solve_picture(
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading))
-        outcomes.append(Outcome(hypothesis, *solved, tried))
+        outcomes.append(SolvedReading(hypothesis, *solved, tried))
         centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
             return outcomes[-1]
     return solve_again(outcomes, date_utc) or outcomes[0]
 
 
-def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> Outcome | None:
+def solve_again(refused: list[SolvedReading], date_utc: datetime.datetime | None) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     if refused[0].hypothesis.solver.camera:
         return None  # a frame of a camera that is known, with its own saturation
@@ -238,13 +231,13 @@ def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> O
                 )
                 if report.attitude.solved:
                     notes = [one.assumption] * bool(one.assumption) + [retry.note]
-                    return Outcome(
+                    return SolvedReading(
                         one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried
                     )
     return None
 
 
-def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
+def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     """What a picture may show, the likeliest first: its field by EXIF, or an unknown one; both row orders, if unknown.
 
     A field or a camera of the user's takes precedence over EXIF.
@@ -263,13 +256,13 @@ def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
         readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
     count = len(solvers) * len(readings)
     return [
-        Hypothesis(pixels, replace(one, hypotheses=count), text)
+        Reading(pixels, replace(one, hypotheses=count), text)
         for one in solvers
         for pixels, text in readings
     ]
 
 
-def outcome_fields(outcome: Outcome, date_utc: datetime.datetime | None) -> dict[str, Any]:
+def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -> dict[str, Any]:
     """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
     report = outcome.report
     (pixels, solver, assumption) = outcome.hypothesis
@@ -290,3 +283,5 @@ def outcome_fields(outcome: Outcome, date_utc: datetime.datetime | None) -> dict
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
     return seen | {"hint": diagnosis.likely_cause(refusal)}
+
+

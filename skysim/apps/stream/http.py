@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from skysim.apps.stream.packet import Packet
+from skysim.apps.stream.sinks import Packet
 from skysim.apps.stream.sinks import encode_png
 from skysim.core.errors import InputError
 from skysim.core import files

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 import numpy as np
-from skysim.apps.stream.packet import Packet, build_packet
+from skysim.apps.stream.sinks import (Packet, build_packet)
 from skysim.apps.stream.sinks import Sink
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window

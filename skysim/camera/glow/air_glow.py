@@ -9,7 +9,7 @@ import numpy as np
 from skysim.camera.glow.background import (NANOLAMBERT_V0, ViewingGeometry, angular_separation_deg, moonlight_through_nl, scattering)
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirGlowConfig
+from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.sources.air import Sky
 from skysim.sources.air import air_mass
 from skysim.sources.photometry import sky_radiance_e_s_m2_sr

@@ -13,7 +13,7 @@ from skysim.core.types import Floats
 from skysim.scene.sections import (layouts, leds)
 from skysim.scene.sections import light
 from skysim.sources.dome.display import (black_transmission, panel_strength_e_s_sr, panel_surface)
-from skysim.sources.dome.projector import white_wall_per_m2
+from skysim.sources.dome.display import white_wall_per_m2
 from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2

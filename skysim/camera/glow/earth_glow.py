@@ -10,8 +10,8 @@ from skysim.camera.glow.background import (pixel_directions, viewing_geometry)
 from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
-from skysim.scene.sections.orbit import EarthConfig
-from skysim.sources.orbit.earth import TO_SPHERE
+from skysim.scene.sections.surroundings import EarthConfig
+from skysim.sources.camera_orbit import TO_SPHERE
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 from collections.abc import Sequence
 from skysim.camera.glow.background import (angular_separation_deg, transmittance)

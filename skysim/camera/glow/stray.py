@@ -17,7 +17,7 @@ from functools import lru_cache
 from skysim.camera.optics import Optics, ScaledOptics
 from skysim.core.types import SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig
-from skysim.sources.false_lights import GHOST
+from skysim.sources.satellites import GHOST
 from typing import Any
 import numpy as np
 from numpy.typing import NDArray

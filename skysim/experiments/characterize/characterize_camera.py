@@ -9,13 +9,13 @@ from typing import Any
 from skysim.core.errors import printable
 from skysim.experiments.characterize.night_sky import (LENS, Night, lens_estimates)
 from skysim.experiments.characterize.photon_transfer import Estimate
-from skysim.experiments.characterize.sensor_fit import Sensor
-from skysim.scene.camera_sheet import (Line, yaml_lines)
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
+from skysim.scene.camera_sheet import (SheetLine, yaml_lines)
 from skysim.scene.sections.camera import CameraConfig
 import numpy as np
 from skysim.core.errors import InputError
 from skysim.core import files
-from skysim.experiments.characterize import input_checks
+from skysim.experiments.characterize import frame_files
 from skysim.experiments.characterize.characterize_report import characterize_report
 from skysim.experiments.characterize.frame_files import read_stack
 from skysim.experiments.characterize import night_sky
@@ -39,7 +39,7 @@ AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
 
 
 def preset_text(
-    camera: Mapping[str, Any], config: CameraConfig, sensor: Sensor, night: Night | None, name: str
+    camera: Mapping[str, Any], config: CameraConfig, sensor: MeasuredSensor, night: Night | None, name: str
 ) -> str:
     """The file: YAML with the source of each value. camera : raw section of the camera that was measured"""
     head = [
@@ -50,7 +50,7 @@ def preset_text(
     return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
 
 
-def measured(sensor: Sensor) -> dict[str, tuple[Any, str]]:
+def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
     """Value and comment by key of the section camera."""
     found: dict[str, tuple[Any, str]] = {}
     for key, one in sensor.estimates.items():
@@ -100,7 +100,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> Iterator[Line]:
+def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> Iterator[SheetLine]:
     """The lines of the section with the values that were found in place of the camera's own, sections last."""
     tree = copy.deepcopy(dict(camera))
     if "psf.kind" in found:
@@ -113,11 +113,11 @@ def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> It
 
 def section_lines(
     section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
-) -> Iterator[Line]:
+) -> Iterator[SheetLine]:
     """The lines of a section and, after its values, of the sections in it."""
     for key, value in section.items():
         if not isinstance(value, dict):
-            yield Line(prefix + key, value, sources.get(prefix + key, "of the camera's file"))
+            yield SheetLine(prefix + key, value, sources.get(prefix + key, "of the camera's file"))
     for key, value in section.items():
         if isinstance(value, dict):
             yield from section_lines(value, f"{prefix}{key}.", sources)
@@ -159,20 +159,20 @@ def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
     return camera, loader.camera_tree(path, tree, files, {})["camera"]
 
 
-def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> Sensor:
+def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> MeasuredSensor:
     """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
     darks = read_stack(darks_folder, shape, bits)
-    input_checks.check_darks(darks)
+    frame_files.check_darks(darks)
     flats = read_stack(flats_folder, shape, bits)
     usable = sensor_fit.usable_pixels(darks.levels)
     shortest = min(darks.levels, key=lambda one: one.exposure_s)
-    input_checks.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
+    frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
     return sensor_fit.characterize(darks.levels, flats.levels)
 
 
-def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found: Sensor) -> Night:
+def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor) -> Night:
     """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
     if "focal_length" not in raw:
         raise InputError(
@@ -187,7 +187,7 @@ def write_results(
     folder: Path,
     config: CameraConfig,
     raw: dict[str, Any],
-    found: Sensor,
+    found: MeasuredSensor,
     night: Night | None,
     name: str,
 ) -> tuple[dict[str, Any], Report]:

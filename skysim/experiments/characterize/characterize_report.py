@@ -10,14 +10,14 @@ from skysim.experiments.characterize.night_sky import Night
 from skysim.experiments.characterize.night_sky import ImageSize
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, LIGHT, model)
-from skysim.experiments.characterize.sensor_fit import Sensor
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.results.plots import INK, png
 from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
 from skysim.scene.sections.camera import CameraConfig
 
 
 def characterize_report(
-    statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None
+    statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
 ) -> Report:
     """The report of a characterized camera. statistics : as in `characterize.json`"""
     figures = [
@@ -99,7 +99,7 @@ SIZE_TEXT = (
 )
 
 
-def draw_transfer(axes: Any, found: Sensor) -> None:
+def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     """Variance against mean, and the linearity."""
     transfer = found.transfer
     (curve, line) = axes

@@ -31,8 +31,6 @@ from scipy.optimize import least_squares
 
 
 
-
-
 # A measured number with its interval.
 
 
@@ -218,7 +216,7 @@ COLLAPSED = 0.5  # a level beyond the turnover whose variance is below this frac
 GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the parameters
 
 
-class Point(NamedTuple):
+class TransferPoint(NamedTuple):
     """A level as the fit sees it. dark : index of its temperature;  lit : 1 for a flat, 0 for a dark."""
 
     exposure_s: float
@@ -241,7 +239,7 @@ class Transfer(NamedTuple):
     covariance: Floats
     flicker: float
     misfit: float
-    points: list[Point]
+    points: list[TransferPoint]
 
     @property
     def gain_e_dn(self) -> Estimate:
@@ -275,7 +273,7 @@ def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
     return np.asarray(2 * signal_dn / (1 + root))
 
 
-def model(points: Sequence[Point], values: Floats) -> tuple[Floats, Floats]:
+def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floats]:
     """Means and variances of the levels."""
     t_s = np.array([one.exposure_s for one in points])
     lit = np.array([one.lit for one in points])
@@ -286,7 +284,7 @@ def model(points: Sequence[Point], values: Floats) -> tuple[Floats, Floats]:
     return mean, slope**2 * (values[GAIN] * x + values[READ]) + ROUNDING_DN2
 
 
-def fit(points: Sequence[Point], flicker: float) -> Transfer:
+def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     """Fit levels of darks and flats. flicker : relative, from `lamp_flicker`"""
     kept = list(points)
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
@@ -313,7 +311,7 @@ def fit(points: Sequence[Point], flicker: float) -> Transfer:
     return Transfer(found.x * scale, covariance, flicker, misfit, kept)
 
 
-def start_values(points: Sequence[Point]) -> Floats:
+def start_values(points: Sequence[TransferPoint]) -> Floats:
     """Slope of the variance against the mean over all levels, and rates from the longest exposures."""
     mean, variance = (
         np.array([getattr(one.moments, name) for one in points])
@@ -332,13 +330,13 @@ def start_values(points: Sequence[Point]) -> Floats:
     return np.array([gain, 0.0, max(variance[darkest] - ROUNDING_DN2, 0.01), black, light, *rates])
 
 
-def unsaturated(points: Sequence[Point], black_dn: float) -> list[bool]:
+def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
     """Which flats are up to FIT_RANGE of the greatest signal."""
     top = max(one.moments.mean_dn for one in points) - black_dn
     return [one.moments.mean_dn - black_dn <= FIT_RANGE * top for one in points]
 
 
-def saturated(points: Sequence[Point]) -> list[bool]:
+def saturated(points: Sequence[TransferPoint]) -> list[bool]:
     """Which flats are beyond the turnover of the variance, with a variance that has collapsed."""
     variance = np.array([one.moments.variance_dn2 for one in points])
     brighter = (
@@ -348,7 +346,7 @@ def saturated(points: Sequence[Point]) -> list[bool]:
 
 
 def lamp_flicker(
-    points: Sequence[Point], difference_dn2: Sequence[float], black_dn: float, pixels: int
+    points: Sequence[TransferPoint], difference_dn2: Sequence[float], black_dn: float, pixels: int
 ) -> float:
     """Relative flicker from frame to frame: of the means' differences in pairs, what their noise does not explain.
 

@@ -13,7 +13,7 @@ from skysim.experiments.characterize import photon_transfer
 from skysim.experiments.characterize.fixed_pattern import (DarkCurrent, RateNoise)
 from skysim.experiments.characterize.photon_transfer import (Estimate, propagate)
 from skysim.experiments.characterize.photon_transfer import (Level, Mask)
-from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, READ, ROUNDING_DN2, Point, Transfer)
+from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, READ, ROUNDING_DN2, TransferPoint, Transfer)
 from skysim.experiments.characterize.fixed_pattern import Planes
 
 
@@ -22,7 +22,7 @@ HOT_SIGMAS = 20.0  # above the median dark: pixels left out of the photon transf
 HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a particle hit it
 
 
-class Sensor(NamedTuple):
+class MeasuredSensor(NamedTuple):
     """What the frames tell.
 
     estimates : by key of `camera.detector`, in its units
@@ -37,12 +37,12 @@ class Sensor(NamedTuple):
     transfer: Transfer
     dark: DarkCurrent | None
     dark_temperature_c: float | None
-    flats: list[Point]
+    flats: list[TransferPoint]
     linearity_error: float
     saturation_dn: float
 
 
-def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> Sensor:
+def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
     """Every parameter from levels of darks and flats, which `checks` has found to be usable.
 
     The dark current is stated at the darks' temperature that is nearest to that of the flats.
@@ -53,10 +53,10 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> Sensor:
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
     dark_points = [
-        Point(one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable))
+        TransferPoint(one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable))
         for one in darks
     ]
-    flat_points = [Point(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
+    flat_points = [TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
     black_dn = min(point.moments.mean_dn for point in dark_points)
     below = photon_transfer.unsaturated(flat_points, black_dn)
     fitted = [one for one, is_below in zip(flats, below, strict=True) if is_below]
@@ -89,7 +89,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> Sensor:
     estimates["offset_dn"] = Estimate.normal(black.value, math.hypot(black.sigma, scatter_dn))
     error = linearity_error(flat_points, transfer)
     saturation_dn = max(one.moments.mean_dn for one in flat_points)
-    return Sensor(
+    return MeasuredSensor(
         estimates, remarks, transfer, dark, temperatures[own], flat_points, error, saturation_dn
     )
 
@@ -145,7 +145,7 @@ def best_temperature(
 
 
 def full_well(
-    estimates: dict[str, Estimate], remarks: list[str], transfer: Transfer, flats: Sequence[Point]
+    estimates: dict[str, Estimate], remarks: list[str], transfer: Transfer, flats: Sequence[TransferPoint]
 ) -> None:
     """Full well and nonlinearity: electrons where the signal stays though the exposure grows, and what is missing
     there; c x of the fit."""
@@ -291,7 +291,7 @@ def doubling(
     estimates["dark_doubling_c"] = Estimate.normal(value, value / slope * math.sqrt(normal[1, 1]))
 
 
-def linearity_error(flats: Sequence[Point], transfer: Transfer) -> float:
+def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float:
     """Mean relative deviation of the signal from a line through the levels at 5 to 95 % of the saturation.
 
     The line is fitted with relative weights (EMVA 1288, release 4.0 Linear: the linearity error LE).

@@ -6,28 +6,26 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 import numpy as np
-from skysim.experiments.datasheet.components import Components
-from skysim.experiments.datasheet.statement import NAMES, Statement
-from skysim.experiments.datasheet.components import GROUPS
+from skysim.experiments.datasheet.variance_components import Components
+from skysim.experiments.datasheet.statement import (NAMES, Statement)
+from skysim.experiments.datasheet.variance_components import GROUPS
 from skysim.results.plots import INK
 import shlex
 from pathlib import Path
 from skysim.core.files import (make_folder, to_json, write_bytes, write_text)
 from skysim.experiments.datasheet import statement as statements
-from skysim.experiments.datasheet.datasheet_run import Sheet
+from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.statement import Statement
 from skysim.results.plots import png
 from skysim.results.report import Block, Column, Figure, Report, Section, Table, Text, Verdict
-from skysim.results.report.blocks import figure_files
-
-
+from skysim.results.report_blocks import figure_files
 
 
 
 # Figures of a datasheet.
 
 
-class Drawing(NamedTuple):
+class DatasheetFigure(NamedTuple):
     """A figure: its function, size in inches and caption."""
 
     draw: Callable[[Any, Statement], None]
@@ -134,25 +132,25 @@ def draw_magnitudes(fig: Any, statement: Statement) -> None:
 
 
 FIGURES = {
-    "terms": Drawing(
+    "terms": DatasheetFigure(
         draw_terms,
         (9, 2.6),
         "The terms of the error, with 95 % intervals over the fields (ensemble).",
     ),
-    "causes": Drawing(
+    "causes": DatasheetFigure(
         draw_causes,
         (9, 3.4),
         "What each change of the scene leaves of the error's mean square (ensemble).",
     ),
-    "sky": Drawing(
+    "sky": DatasheetFigure(
         draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."
     ),
-    "rates": Drawing(
+    "rates": DatasheetFigure(
         draw_rates,
         (9, 3),
         "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
     ),
-    "magnitudes": Drawing(
+    "magnitudes": DatasheetFigure(
         draw_magnitudes,
         (9, 3),
         "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
@@ -167,7 +165,7 @@ STANDARD = (
 PRINTED = 3  # sections on a terminal: the terms, their causes and the probabilities
 
 
-def command(sheet: Sheet, quick: bool) -> str:
+def command(sheet: MeasuredFrames, quick: bool) -> str:
     """The shell command that repeats the datasheet."""
     options = ["--quick"] * quick
     for key, value in sheet.overrides.items():
@@ -204,7 +202,7 @@ def verdict(statement: Statement) -> Verdict:
     )
 
 
-def section_blocks(section: statements.Section, statement: Statement) -> list[Block]:
+def section_blocks(section: statements.StatementSection, statement: Statement) -> list[Block]:
     """A section's texts, figures and table."""
     texts = [Text(text) for text in section.texts]
     figures = [

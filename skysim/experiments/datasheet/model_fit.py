@@ -6,18 +6,23 @@ import math
 from typing import Any
 import numpy as np
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.components import (components, effects, mean_known)
+from skysim.experiments.datasheet.variance_components import (components, effects, mean_known)
 from skysim.experiments.datasheet.error_model import AXES
-from skysim.experiments.datasheet.datasheet_run import Sheet
-from skysim.experiments.datasheet.components import (GROUPS, term_errors)
-from skysim.experiments.study.execution import setups, trials
+from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.variance_components import (GROUPS, term_errors)
+from skysim.experiments.study.execution import (trials)
+from skysim.experiments.study.execution import setups
 from dataclasses import replace
 from typing import NamedTuple
 from scipy import stats
 from skysim.core.random_streams import random_stream
-from skysim.experiments.datasheet.components import mean_known
+from skysim.experiments.datasheet.variance_components import mean_known
 from skysim.experiments.datasheet.error_model import ErrorModel
-from skysim.experiments.datasheet.components import term_errors
+from skysim.experiments.datasheet.variance_components import term_errors
+from importlib.util import find_spec
+from pathlib import Path
+from skysim.core.errors import InputError
+from skysim.core.files import (make_folder, to_json, write_text)
 
 
 
@@ -27,7 +32,7 @@ LEAST_NOISE = (
 )
 
 
-def constants(sheet: Sheet) -> dict[str, Any]:
+def constants(sheet: MeasuredFrames) -> dict[str, Any]:
     """The constants of `errors.ErrorModel` for the scene of a datasheet."""
     errors, _ = term_errors(sheet)
     found = [components(one) for one in errors]
@@ -78,7 +83,7 @@ def log_scale(first: Floats, second: Floats) -> float:
     return math.sqrt(math.log(max(ratio, 1.0)))
 
 
-def field_variances(sheet: Sheet, axes: slice) -> tuple[Floats, Floats]:
+def field_variances(sheet: MeasuredFrames, axes: slice) -> tuple[Floats, Floats]:
     """Two estimates of the noise variance in each field: of the terms' frames, and of the sequence at rest."""
     errors, solved = term_errors(sheet)
     terms = np.var(errors[axes], axis=-1, ddof=1).mean(axis=(0, 2, 3, 4))
@@ -87,13 +92,13 @@ def field_variances(sheet: Sheet, axes: slice) -> tuple[Floats, Floats]:
     return terms[known], np.var(rest[:, :, known], axis=1, ddof=1).mean(axis=0)
 
 
-def sequences(sheet: Sheet, rate_deg_s: float) -> tuple[list[int], Floats]:
+def sequences(sheet: MeasuredFrames, rate_deg_s: float) -> tuple[list[int], Floats]:
     """Steps and (3, steps, fields) errors of the sequences at one rate."""
     rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
     return [sheet.cells[row].levels["step"] for row in rows], sheet.errors(rows)
 
 
-def errors_by_rate(sheet: Sheet) -> dict[float, Floats]:
+def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
     """(3, frames, fields) errors by rate, from rest on: of the sequences, and of the faster pairs of frames."""
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
@@ -101,7 +106,7 @@ def errors_by_rate(sheet: Sheet) -> dict[float, Floats]:
     return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
 
 
-def along_square(sheet: Sheet, rate_deg_s: float, mean: list[float], errors: Floats) -> float:
+def along_square(sheet: MeasuredFrames, rate_deg_s: float, mean: list[float], errors: Floats) -> float:
     """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
 
     errors : (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is negative
@@ -115,7 +120,7 @@ def along_square(sheet: Sheet, rate_deg_s: float, mean: list[float], errors: Flo
     return max(float(mean_known(about**2) - mean_known(other**2)), 0.0)
 
 
-def axes_rad(sheet: Sheet, rate_deg_s: float) -> Floats:
+def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
     rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows(
         "rate", rate_deg_s=rate_deg_s
@@ -128,7 +133,7 @@ def axes_rad(sheet: Sheet, rate_deg_s: float) -> Floats:
     return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
 
 
-def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats, Floats]:
+def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Floats]:
     """Angles in degrees between frames of the sequences, the products of their errors, and the mean square at the rate.
 
     (M,) each, the mean over the fields and the axes across the boresight, without the mean error; arcsec^2
@@ -149,7 +154,7 @@ def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats, Floats]:
     return np.array(angles), np.array(products), np.array(squares)
 
 
-def field_angle_deg(sheet: Sheet, field: Floats, pixel: Floats, mean: list[float]) -> float:
+def field_angle_deg(sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]) -> float:
     """The correlation angle of the field term: that with the least squares of the lagged products.
 
     They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest, each in
@@ -200,14 +205,14 @@ class Agreement(NamedTuple):
     expected_correlation: float
 
 
-def some_fields(sheet: Sheet, fields: slice) -> Sheet:
+def some_fields(sheet: MeasuredFrames, fields: slice) -> MeasuredFrames:
     """The sheet of some of its fields."""
     columns = {name: values[:, fields] for name, values in sheet.columns.items()}
     count = len(range(sheet.size.fields)[fields])
     return replace(sheet, columns=columns, size=replace(sheet.size, fields=count))
 
 
-def agreements(sheet: Sheet) -> list[Agreement]:
+def agreements(sheet: MeasuredFrames) -> list[Agreement]:
     """The agreement of each half of the fields with the other, at the rates of the sequences, from rest on."""
     even = some_fields(sheet, slice(0, None, 2))
     odd = some_fields(sheet, slice(1, None, 2))
@@ -219,13 +224,13 @@ def agreements(sheet: Sheet) -> list[Agreement]:
     ]
 
 
-def of_one_unit(sheet: Sheet) -> ErrorModel:
+def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
     """The model of a sheet for the first of its units."""
     unit_mean = term_errors(sheet)[0][:, :, 0].mean(axis=(1, 2, 3, 4))
     return ErrorModel(constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]})
 
 
-def agreement(model: ErrorModel, sheet: Sheet, rate_deg_s: float, fitted: str) -> Agreement:
+def agreement(model: ErrorModel, sheet: MeasuredFrames, rate_deg_s: float, fitted: str) -> Agreement:
     """The agreement with the sequences at one rate."""
     steps, errors = sequences(sheet, rate_deg_s)
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
@@ -263,5 +268,49 @@ def at_rest(model: ErrorModel) -> Floats:
     rates = len(model.noise)
     rest = {"noise": [model.noise[0].tolist()] * rates, "along": [model.along[0]] * rates}
     return turning(ErrorModel(model.constants | rest), 1.0)
+
+
+
+
+# Write a measurement model: a Python module that needs NumPy alone, its constants as JSON, a co-
+# simulation unit.
+
+
+MODULE = "tracker_error.py"
+CONSTANTS = "tracker_error.json"
+HERE = Path(__file__).parent
+
+
+def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
+    """Write the module and its constants to a folder; return their paths."""
+    paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
+    write_text(paths[0], (HERE / "errors.py").read_text(encoding="utf-8"))
+    write_text(paths[1], to_json(constants))
+    return paths
+
+
+def require_fmu_builder() -> None:
+    """Raise InputError if the package that builds the units is not installed."""
+    if find_spec("pythonfmu3") is None:
+        raise InputError(
+            "datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'"
+        )
+
+
+def write_fmu(folder: Path) -> Path:
+    """Build the co-simulation unit (FMI 3) from a folder of `write_model`; return its path.
+
+    It runs in a Python with NumPy on the machine of the importer.
+    """
+    require_fmu_builder()
+    from pythonfmu3.builder import FmuBuilder
+
+    script = folder / "fmu_slave.py"
+    write_text(script, (HERE / "fmu_slave.py").read_text(encoding="utf-8"))
+    return Path(
+        FmuBuilder.build_FMU(
+            script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]
+        )
+    )
 
 

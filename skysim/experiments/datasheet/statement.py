@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
-
 import numpy as np
-
 from skysim.experiments.datasheet import (performance)
-from skysim.experiments.datasheet import components
+from skysim.experiments.datasheet import variance_components
 from skysim.experiments.datasheet.cells import TRACKED
-from skysim.experiments.datasheet.components import (Bounded, Components)
+from skysim.experiments.datasheet.variance_components import (Bounded, Components)
 from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
-from skysim.experiments.datasheet.datasheet_run import Sheet
+from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.results.metrics import Summary
+
+
 
 NAMES = {
     "bias": "bias",
@@ -28,7 +28,7 @@ ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
 
 
-class Section(NamedTuple):
+class StatementSection(NamedTuple):
     """A section of the statement: what the numbers are, their table, and names of figures (see `figures`)."""
 
     title: str
@@ -41,8 +41,8 @@ class Section(NamedTuple):
 class Statement(NamedTuple):
     """All numbers of a datasheet, and the sheet they are from."""
 
-    sheet: Sheet
-    terms: dict[str, components.TermTable]
+    sheet: MeasuredFrames
+    terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
     causes: list[dict[str, Any]]
@@ -59,16 +59,16 @@ class Statement(NamedTuple):
     times_s: list[float]
 
 
-def state(sheet: Sheet) -> Statement:
+def state(sheet: MeasuredFrames) -> Statement:
     """The statement of a measured sheet, with times of this machine. Raises InputError where too few are solved."""
-    _, solved = components.term_errors(sheet)
+    _, solved = variance_components.term_errors(sheet)
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
         sheet,
-        components.term_tables(sheet),
+        variance_components.term_tables(sheet),
         int(solved.sum()),
-        components.mean_errors(sheet),
-        components.causes(sheet),
+        variance_components.mean_errors(sheet),
+        variance_components.causes(sheet),
         found,
         performance.claims(found),
         performance.quantiles(sheet),
@@ -164,7 +164,7 @@ def arcsec(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
-def sections(statement: Statement) -> list[Section]:
+def sections(statement: Statement) -> list[StatementSection]:
     """All sections, in order."""
     made = [
         term_section(statement),
@@ -179,7 +179,7 @@ def sections(statement: Statement) -> list[Section]:
     return [*made, disturbance_section(statement)]
 
 
-def term_section(statement: Statement) -> Section:
+def term_section(statement: Statement) -> StatementSection:
     """The terms, and their sum beside the total measured at once."""
     sheet = statement.sheet
     tables = statement.terms
@@ -201,7 +201,7 @@ def term_section(statement: Statement) -> Section:
         for table in tables.values():
             share = table.squares[name].value / table.squares["total"].value
             row += [size(table.squares[name]), f"{100 * share:.1f}"]
-        rows.append([*row, components.TERMS.get(name, "of the terms of this scene")])
+        rows.append([*row, variance_components.TERMS.get(name, "of the terms of this scene")])
     ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
     x, y, roll = (bounded(one, 2) for one in statement.bias)
     texts = [
@@ -217,7 +217,7 @@ def term_section(statement: Statement) -> Section:
     ]
     if sheet.designer.units > 1:
         texts.insert(2, unit_text(sheet.designer.units))
-    return Section(
+    return StatementSection(
         "Error terms",
         texts,
         ["term", "across ″", "%", "about ″", "%", "what it is"],
@@ -239,7 +239,7 @@ def unit_text(units: int) -> str:
     )
 
 
-def lowering_section(statement: Statement) -> Section:
+def lowering_section(statement: Statement) -> StatementSection:
     """Which term dominates, and what is left of the mean square after each change of the scene."""
     texts = [
         f"{name.capitalize()} the boresight {NAMES[table.dominant]} dominates:"
@@ -253,11 +253,11 @@ def lowering_section(statement: Statement) -> Section:
     rows = [
         [
             one["cause"],
-            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in components.GROUPS),
+            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in variance_components.GROUPS),
         ]
         for one in statement.causes
     ]
-    return Section(
+    return StatementSection(
         "What dominates, and what would lower it",
         texts,
         ["change", "across %", "about %"],
@@ -266,7 +266,7 @@ def lowering_section(statement: Statement) -> Section:
     )
 
 
-def probability_section(statement: Statement) -> Section:
+def probability_section(statement: Statement) -> StatementSection:
     """Probabilities of right, refused and false attitudes, and what may be claimed."""
     counts = statement.counts
     where = "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
@@ -310,10 +310,10 @@ def probability_section(statement: Statement) -> Section:
         "runs needed without failure",
         "more runs, if none fails",
     ]
-    return Section("Right, refused and false attitudes", texts, headers, rows, ["sky"])
+    return StatementSection("Right, refused and false attitudes", texts, headers, rows, ["sky"])
 
 
-def quantile_section(statement: Statement) -> Section:
+def quantile_section(statement: Statement) -> StatementSection:
     """Quantiles of the errors."""
     texts = [
         "Errors that a frame stays below with the probability at the left, over independent frames"
@@ -321,10 +321,10 @@ def quantile_section(statement: Statement) -> Section:
         consistency_text(statement.consistency),
     ]
     rows = [
-        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in components.GROUPS)]
+        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in variance_components.GROUPS)]
         for one in statement.quantiles
     ]
-    return Section(
+    return StatementSection(
         "Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows
     )
 
@@ -358,7 +358,7 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
     """Cells of a pair of frames: noise-equivalent angle and error."""
-    return [arcsec(row[f"{kind}_{name}"]) for name in components.GROUPS for kind in ("nea", "rms")]
+    return [arcsec(row[f"{kind}_{name}"]) for name in variance_components.GROUPS for kind in ("nea", "rms")]
 
 
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
@@ -376,7 +376,7 @@ def bracket_text(what: str, limit: Limit, unit: str) -> str:
     return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
 
 
-def rate_section(statement: Statement) -> Section:
+def rate_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle, error and acquisition by rate."""
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
@@ -391,10 +391,10 @@ def rate_section(statement: Statement) -> Section:
         for row in statement.rates
     ]
     headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
-    return Section("By rate", texts, headers, rows, ["rates"])
+    return StatementSection("By rate", texts, headers, rows, ["rates"])
 
 
-def precision_text(sheet: Sheet) -> str:
+def precision_text(sheet: MeasuredFrames) -> str:
     """How well rms and NEA of F fields are known: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
 
     For two Gaussian values a field and axis, with a scatter of the fields' variances that doubles the error's square.
@@ -403,7 +403,7 @@ def precision_text(sheet: Sheet) -> str:
     return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."
 
 
-def acceleration_section(statement: Statement) -> Section:
+def acceleration_section(statement: Statement) -> StatementSection:
     """Error and acquisition by acceleration."""
     texts = [
         "Two frames of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
@@ -426,10 +426,10 @@ def acceleration_section(statement: Statement) -> Section:
         for row in statement.accelerations
     ]
     headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *FIELD_HEADERS]
-    return Section("By acceleration", texts, headers, rows)
+    return StatementSection("By acceleration", texts, headers, rows)
 
 
-def tracking_section(statement: Statement) -> Section:
+def tracking_section(statement: Statement) -> StatementSection:
     """Error and outcomes in tracking mode."""
     rates = statement.tracked_rates
     accelerations = statement.tracked_accelerations
@@ -450,7 +450,7 @@ def tracking_section(statement: Statement) -> Section:
         ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
         for row in accelerations
     ]
-    return Section(
+    return StatementSection(
         "In tracking mode",
         texts,
         ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS],
@@ -458,7 +458,7 @@ def tracking_section(statement: Statement) -> Section:
     )
 
 
-def magnitude_section(statement: Statement) -> Section:
+def magnitude_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle by the limit of the catalog."""
     texts = [
         "The faintest stars of the tracker's catalog, at rest: two frames of each attitude that differ in their noise"
@@ -473,7 +473,7 @@ def magnitude_section(statement: Statement) -> Section:
         ]
         for row in statement.magnitudes
     ]
-    return Section(
+    return StatementSection(
         "By magnitude limit",
         texts,
         ["limit V", *PAIR_HEADERS, *FIELD_HEADERS],
@@ -482,7 +482,7 @@ def magnitude_section(statement: Statement) -> Section:
     )
 
 
-def disturbance_section(statement: Statement) -> Section:
+def disturbance_section(statement: Statement) -> StatementSection:
     """Outcomes and errors under disturbances."""
     texts = [
         f"One frame in each field with a disturbance beyond what the scene has ({ENSEMBLE}); the Moon's frames have"
@@ -498,9 +498,11 @@ def disturbance_section(statement: Statement) -> Section:
         ]
         for row in statement.disturbances
     ]
-    return Section(
+    return StatementSection(
         "Under disturbances",
         texts,
         ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"],
         rows,
     )
+
+

@@ -24,15 +24,9 @@ from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
+from skysim.experiments.dome_survey.survey_frames import (Correspondences, match_by_imu, match_by_survey)
 from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, assumed)
-from skysim.experiments.dome_survey.survey_run import (
-    SurveyRun,
-    identified,
-    led_sigma_m,
-    light_table,
-    stray_lights,
-)
+from skysim.experiments.dome_survey.survey_findings import (SurveyRun, identified, led_sigma_m, light_table, stray_lights)
 from skysim.tracking.dome_map_file import DomeMap
 
 MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude

@@ -15,7 +15,7 @@ from estimator.identification.led_codes import LedCode
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
 from skysim.core.units import quantities_within
-from skysim.experiments.configs import with_config
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig

@@ -13,7 +13,7 @@ from estimator.trackers.pipeline import Settings
 from skysim.core.errors import InputError
 from skysim.core import files
 from skysim.core.types import Floats
-from skysim.experiments.configs import with_config
+from skysim.experiments.tracker_comparison import with_config
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_images import (ATTITUDES, FRAME, SurveyImage, frames_with_attitude, write_attitudes)
@@ -21,10 +21,10 @@ from skysim.experiments.dome_survey.survey_frames import (SurveyFrame, centroid_
 from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, calibration_prior, image_sizes, survey_model, with_survey_errors)
 from skysim.experiments.dome_survey.survey_findings import (accuracy_statistics, find_faults, predicted)
 from skysim.experiments.dome_survey.survey_report import led_errors
-from skysim.experiments.dome_survey.survey_run import SurveyRun
-from skysim.results.files import frame_folder as frame_files
+from skysim.experiments.dome_survey.survey_findings import SurveyRun
+from skysim.results.files import recording as frame_files
 from skysim.scene.scene import Scene
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 
 
 
@@ -33,7 +33,7 @@ RANDOM = "random"
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class HeldAttitudes:
     """Attitudes to hold, one frame at each.
 
     shown : (F, N) LEDs that each shows;  margin_px : from the edge, where an image would be incomplete
@@ -57,7 +57,7 @@ class Plan:
 
 def plan_survey(
     scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
-) -> tuple[Lab, CalibrationPrior, Plan]:
+) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
     """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     lab = build_lab(with_survey_errors(scene, uncertainty))
     before = calibration_prior(lab)
@@ -71,7 +71,7 @@ def make_plan(
     count: int,
     tilt_deg: float,
     kind: str,
-) -> Plan:
+) -> HeldAttitudes:
     """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
     random = survey_frames.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
     model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
@@ -81,10 +81,10 @@ def make_plan(
         if kind == RANDOM
         else survey_frames.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
     )
-    return Plan(held, model.visible(held.inv(), margin_px), model, margin_px)
+    return HeldAttitudes(held, model.visible(held.inv(), margin_px), model, margin_px)
 
 
-def write_plan(path: Path, plan: Plan) -> None:
+def write_plan(path: Path, plan: HeldAttitudes) -> None:
     """Write the attitudes as CSV, with the names of the images to take, so that it serves as their attitudes too."""
     names = [FRAME.format(n) for n in range(len(plan.shown))]
     write_attitudes(path, names, plan.lab_from_body, plan.shown.sum(axis=1))
@@ -148,7 +148,7 @@ def survey_images(
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class SimulatedErrors:
     """Errors of one simulated survey: mean squares of LED coordinates (m2) and of the lever's (m2), of the focal length
     (px2); LEDs measured, and faults reported although the dome has none."""
 
@@ -160,8 +160,8 @@ class Errors:
 
 
 def repeat_survey(
-    lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int
-) -> Iterator[Errors | InputError]:
+    lab: Lab, uncertainty: SurveyUncertainty, plan: HeldAttitudes, repeats: int
+) -> Iterator[SimulatedErrors | InputError]:
     """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
 
     Of a survey that does not determine the dome, why.
@@ -185,11 +185,11 @@ def in_survey(lab: Lab, n: int) -> Lab:
     )
 
 
-def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Errors:
+def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> SimulatedErrors:
     """The errors of one survey against the truth."""
     survey = run.survey
     lever_m = survey.lever.camera_body_m - lab.camera.mount.camera_body_m
-    return Errors(
+    return SimulatedErrors(
         float(np.mean(led_errors(survey, prior, lab).after_m ** 2)),
         float(np.mean(lever_m**2)),
         (survey.camera.focal_px - lab.scene.camera.focal_px) ** 2,
@@ -198,7 +198,7 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Errors:
     )
 
 
-def comparison(plan: Plan, errors: list[Errors]) -> list[dict[str, Any]]:
+def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[str, Any]]:
     """Rows of the errors predicted, those simulated (rms over all surveys), their ratio and its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
     rows = (

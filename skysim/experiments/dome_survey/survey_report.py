@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_findings import (accuracy_statistics, fault_lines)
-from skysim.experiments.dome_survey.survey_run import SurveyRun, residuals_px
+from skysim.experiments.dome_survey.survey_findings import (SurveyRun, residuals_px)
 from skysim.results.plots import INK, png
 from skysim.results.report import (
     Block,
@@ -35,7 +35,7 @@ from skysim.core.types import Floats, Frame, Mount, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.experiments.dome_survey.survey_findings import (Coverage, DomeFaults, rows_of)
-from skysim.experiments.dome_survey.survey_run import SurveyRun
+from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.results import metrics
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab

@@ -14,8 +14,8 @@ from skysim.camera.render import Poses, in_view, project
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.experiments.configs import with_config
-from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.tracker_comparison import with_config
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import exact, extremum
@@ -23,7 +23,7 @@ from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.sources import dome
 from skysim.sources.photometry import Band
 from skysim.tracking import onboard_model
@@ -161,7 +161,7 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
         for offset_m in OFFSETS_M
     ]
     caption = "Largest angular discrepancy of a fiber against the camera's offset, with the offset unknown and known."
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, np.array(worst))),))
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, np.array(worst))),))
 
 
 def draw(fig: Any, worst_arcsec: Floats) -> None:

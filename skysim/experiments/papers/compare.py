@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
-from skysim.experiments.papers.published import Experiment, Row
+from skysim.experiments.papers.published import (Experiment, PublishedRow)
 from skysim.results.metrics import Summary
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -67,7 +67,7 @@ def with_cause(
     return RowResult(statistic(ours), note, Cause(cause, statistic(theirs)))
 
 
-class Drawing(NamedTuple):
+class FigureDrawing(NamedTuple):
     """A figure of our data: draw(figure) draws into an empty matplotlib figure of that size."""
 
     caption: str
@@ -80,14 +80,14 @@ class ExperimentResult:
     """Results of an experiment: one for every published row, by key, and figures."""
 
     results: Mapping[str, RowResult]
-    drawings: tuple[Drawing, ...] = ()
+    drawings: tuple[FigureDrawing, ...] = ()
 
 
 class Comparison(NamedTuple):
     """One row of the table: published number, ours and the verdict."""
 
     id: str
-    row: Row
+    row: PublishedRow
     result: RowResult
     verdict: Verdict
 
@@ -136,7 +136,7 @@ class Reproduction:
     id: str
     published: Experiment
     comparisons: tuple[Comparison, ...]
-    drawings: tuple[Drawing, ...]
+    drawings: tuple[FigureDrawing, ...]
     seconds: float = field(compare=False)
 
     @property
@@ -169,7 +169,7 @@ def compare(
     return Reproduction(id, published, comparisons, experiment.drawings, seconds)
 
 
-def verdict(row: Row, result: RowResult) -> Verdict:
+def verdict(row: PublishedRow, result: RowResult) -> Verdict:
     """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
     if intervals_overlap(row, result.ours):
         return "agrees"
@@ -178,14 +178,14 @@ def verdict(row: Row, result: RowResult) -> Verdict:
     )
 
 
-def intervals_overlap(row: Row, ours: Summary) -> bool:
+def intervals_overlap(row: PublishedRow, ours: Summary) -> bool:
     """Return True if our interval (the number itself if it has none) and the row's band overlap."""
     low, high = row.band
     our_low, our_high = (ours.value if math.isnan(end) else end for end in (ours.low, ours.high))
     return our_low <= high and our_high >= low
 
 
-def format_with_source(row: Row) -> str:
+def format_with_source(row: PublishedRow) -> str:
     """Format the published number with its source; `derived` if the paper does not print it."""
     source = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
     return f"{format_published(row)} ({source})" if source else format_published(row)
@@ -198,7 +198,7 @@ def format_summary(summary: Summary) -> str:
     return f"{summary.value:.4g} ({summary.low:.4g}..{summary.high:.4g})"
 
 
-def format_published(row: Row) -> str:
+def format_published(row: PublishedRow) -> str:
     """Format the published number or its bounds, with the tolerance."""
     if row.published is not None:
         text = f"{row.published:.6g}"

@@ -22,14 +22,14 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights
-from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, with_cause)
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, with_cause)
 from skysim.experiments.papers.compare import bootstrap_interval
 from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.light import (DomeConfig, FlatSurfaceConfig)
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking import onboard_model
 from skysim.tracking import factory
 
@@ -55,7 +55,7 @@ class OnboardModel(NamedTuple):
     pairs: PairIndex
 
 
-class Solution(NamedTuple):
+class PanelSolution(NamedTuple):
     """Number of matched stars and body_from_lab; 0 and None if no match is significant against chance."""
 
     matched: int
@@ -115,20 +115,20 @@ def directions(lab: Lab, panel: LedMap, rays: Floats, body_from_lab: Rotation) -
     return point_m / np.linalg.norm(point_m, axis=1, keepdims=True)
 
 
-def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> PanelSolution:
     """Solve once: distances from the assumed attitude, master-star identification within 500 arcsec, QUEST."""
     observed = directions(model.lab, model.panel, rays, assumed)
     # master_star takes the error of a direction; an angle's is sqrt(2) times that.
     match = master_star(observed, model.pairs, SEPARATION_RAD / np.sqrt(2))
     if match is None:
-        return Solution(0, None)
+        return PanelSolution(0, None)
     sigma_rad = np.full(len(match.observed), SEPARATION_RAD)
-    return Solution(
+    return PanelSolution(
         len(sigma_rad), quest(observed[match.observed], model.vectors[match.star], sigma_rad)
     )
 
 
-def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
+def solve_iteratively(model: OnboardModel, rays: Floats, assumed: Rotation) -> PanelSolution:
     """Solve UPDATES times, each time with the last solution as the assumed attitude."""
     for _ in range(UPDATES):
         solution = solve(model, rays, assumed)
@@ -146,8 +146,8 @@ def initial_error(error_deg: float) -> Rotation:
 class SolutionSeries(NamedTuple):
     """Solutions of all trials by initial error in degrees, and the iterated solutions."""
 
-    solutions: dict[float, list[Solution]]
-    iterated: list[Solution]
+    solutions: dict[float, list[PanelSolution]]
+    iterated: list[PanelSolution]
 
     def matched(self) -> Summary:
         """Mean number of matched stars over the five trials."""
@@ -175,7 +175,7 @@ def solve_series(
     options: ExperimentOptions,
 ) -> SolutionSeries:
     """Solve frames from the level vehicle, each from every initial error, and iterated from ITERATED_DEG."""
-    solutions: dict[float, list[Solution]] = {error: [] for error in errors_deg}
+    solutions: dict[float, list[PanelSolution]] = {error: [] for error in errors_deg}
     iterated_solutions = []
     for n in range(frames):
         rays = rays_body(model.lab, seed + n)
@@ -216,7 +216,7 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
 
 
 def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:

@@ -7,18 +7,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.configs import with_config
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.tracker_comparison import with_config
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_interval
 from skysim.experiments.papers.published import experiments
-from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_centroid_trials
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.tracker import SurveyErrorsConfig
-from skysim.simulation.lab import build_lab, build_tracker
+from skysim.simulation.lab import (build_lab, build_tracker)
 
 
 
@@ -53,7 +53,7 @@ class AttitudeErrors(NamedTuple):
         return bootstrap_interval(self.error_arcsec[:, 2], rms)
 
 
-def build_setup(lights: int) -> Setup:
+def build_setup(lights: int) -> TrialSetup:
     """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disk, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
     scene = loader.load(
@@ -63,17 +63,17 @@ def build_setup(lights: int) -> Setup:
     trial = CentroidTrial(
         kind="centroids", noise_px=NOISE_PX, lights=lights, tilt_deg=(0, MAX_TILT_DEG)
     )
-    return Setup(lab, build_tracker(lab.camera), trial, "")
+    return TrialSetup(lab, build_tracker(lab.camera), trial, "")
 
 
-def solve_random_attitudes(setup: Setup, seeds: Sequence[int]) -> AttitudeErrors:
+def solve_random_attitudes(setup: TrialSetup, seeds: Sequence[int]) -> AttitudeErrors:
     """Errors of lost-in-space solutions from simulated centroids at random attitudes."""
     solutions = run_centroid_trials(setup, seeds)
     errors = np.array([[one.x_arcsec, one.y_arcsec, one.roll_arcsec] for one in solutions])
     return AttitudeErrors(errors[np.isfinite(errors[:, 0])])
 
 
-def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
+def with_surveyed_map(setup: TrialSetup, sigmas: dict[str, str], seed: int) -> TrialSetup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     rotation_deg = random_stream(seed, 2).normal(0, LEVEL_SIGMA_DEG, 3)
     survey_errors = SurveyErrorsConfig.model_validate(
@@ -84,7 +84,7 @@ def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
 
 
 def mean_absolute_error_deg(
-    setup: Setup, sigmas: dict[str, str], seeds: list[list[int]]
+    setup: TrialSetup, sigmas: dict[str, str], seeds: list[list[int]]
 ) -> Summary:
     """Mean error angle in degrees. The attitudes of one survey share its errors, so the interval is over surveys.
 
@@ -127,7 +127,7 @@ def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
     caption = (
         "Noise-equivalent angle by the number of lights in the field; dashed the published bounds."
     )
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, errors_by_lights)),))
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, errors_by_lights)),))
 
 
 def draw(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:

@@ -18,15 +18,15 @@ from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.time import J2000_JD, tt_days, utc_days
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import (bootstrap_interval, sample_std, symmetric_interval)
-from skysim.experiments.papers.published import experiments, published_values
+from skysim.experiments.papers.published import (experiments, published_values)
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lab import (Lab, build_lab, build_tracker)
 from skysim.sources import stars
 from skysim.tracking import factory
 
@@ -221,13 +221,13 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
     return float(np.degrees(np.arccos(itrs_from_icrs(LOCAL_TIMES[0]).apply(boresight) @ up)))
 
 
-def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> tuple[Drawing, ...]:
+def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> tuple[FigureDrawing, ...]:
     return (
-        Drawing(
+        FigureDrawing(
             "Right ascension of the fixed camera against time: Table 2 and ours.",
             lambda fig: draw_rate(fig, calibrated),
         ),
-        Drawing(
+        FigureDrawing(
             "Errors about their mean: of Table 2 about the sidereal rate, and ours with and without the causes.",
             lambda fig: draw_errors(fig, calibrated, uncalibrated),
             (7.4, 4.6),

@@ -15,20 +15,13 @@ from estimator.catalog.pair_index import PairIndex
 from estimator.core.checks import Ints
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.identification.solver_options import Options
-from estimator.identification.published.fialho import (
-    MIN_FRACTION_BASIC,
-    MIN_FRACTION_FALSE_STARS,
-    VERSIONS,
-    SearchOptions,
-    search,
-    search_options,
-)
+from estimator.identification.published.fialho import (MIN_FRACTION_BASIC, MIN_FRACTION_FALSE_STARS, VERSIONS, FialhoOptions, search, search_options)
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
 from skysim.core.files import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import (bootstrap_interval, percent, sample_std)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import WRONG_RAD, Summary, proportion
@@ -57,7 +50,7 @@ def catalog(limit_mag: float) -> PairIndex:
     return pair_index.build(stars.vectors, float(DIAGONAL_RAD), magnitude=stars.magnitude)
 
 
-def version(name: str) -> SearchOptions:
+def version(name: str) -> FialhoOptions:
     """Parameters of one of the paper's versions, as in estimator.identification.published.fialho."""
     options = Options(epsilon_mag=SIGMA_MAG)
     falls_back = name in ("fialho_3", "fialho_4")
@@ -67,7 +60,7 @@ def version(name: str) -> SearchOptions:
 
 @jit
 def simulate(
-    index: PairIndex, parameters: SearchOptions, runs: int, seed: int
+    index: PairIndex, parameters: FialhoOptions, runs: int, seed: int
 ) -> tuple[Floats, Floats, Ints]:
     """True and estimated R_cam_from_icrs (runs, 3, 3), the latter NaN if unsolved; (runs,) number of stars in view.
 
@@ -141,7 +134,7 @@ def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
     return directions[:count][order], magnitudes[:count][order]
 
 
-class Errors(NamedTuple):
+class RunErrors(NamedTuple):
     """(N,) errors of the solved runs in arcsec, as the paper defines them (eqs. 7-9), and the rotation angle.
 
     attitude : |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
@@ -156,7 +149,7 @@ class Errors(NamedTuple):
     axis: Floats
 
 
-def errors(true: Floats, estimated: Floats) -> Errors:
+def errors(true: Floats, estimated: Floats) -> RunErrors:
     """Errors of (N, 3, 3) attitude matrices.
 
     The rotation angle is 2 arcsin(|M_est - M_true| / sqrt(8)). Our image axes differ from those of eq. 5 by a constant
@@ -167,7 +160,7 @@ def errors(true: Floats, estimated: Floats) -> Errors:
     phi = [np.arctan2(R[:, 0, 2], R[:, 1, 2]) for R in (true, estimated)]
     roll = np.abs(np.mod(phi[1] - phi[0] + np.pi, 2 * np.pi) - np.pi)
     axis = np.linalg.norm(estimated[:, 2] - true[:, 2], axis=1)
-    return Errors(*(error / ARCSEC_RAD for error in (norm, angle, roll, axis)))
+    return RunErrors(*(error / ARCSEC_RAD for error in (norm, angle, roll, axis)))
 
 
 # Table 1.
@@ -179,16 +172,16 @@ class VersionRuns(NamedTuple):
     runs: int
     solved: int
     wrong: int
-    right: Errors
+    right: RunErrors
 
 
-def run_version(index: PairIndex, parameters: SearchOptions, runs: int, seed: int) -> VersionRuns:
+def run_version(index: PairIndex, parameters: FialhoOptions, runs: int, seed: int) -> VersionRuns:
     """Simulate and count. As in the paper, a wrong solution counts as solved."""
     true, estimated, _ = simulate(index, parameters, runs, seed)
     is_solved = np.isfinite(estimated[:, 0, 0])
     all_errors = errors(true[is_solved], estimated[is_solved])
     is_wrong = all_errors.angle > WRONG_RAD / ARCSEC_RAD
-    right = Errors(*(values[~is_wrong] for values in all_errors))
+    right = RunErrors(*(values[~is_wrong] for values in all_errors))
     return VersionRuns(runs, int(is_solved.sum()), int(is_wrong.sum()), right)
 
 
@@ -244,21 +237,21 @@ def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
     }
 
 
-def drawings(by_version: dict[str, VersionRuns]) -> tuple[Drawing, ...]:
+def drawings(by_version: dict[str, VersionRuns]) -> tuple[FigureDrawing, ...]:
     second = by_version["fialho_2"].right
     return (
-        Drawing(
+        FigureDrawing(
             "Histogram of the attitude error of alg_ide_mf1_2, which PTASE writes into its log file.",
             lambda fig: draw_histogram(fig, second),
         ),
-        Drawing(
+        FigureDrawing(
             "Every simulation of a thousand runs: the paper's five, and ours of all versions.",
             lambda fig: draw_simulations(fig, by_version),
         ),
     )
 
 
-def draw_histogram(fig: Any, right: Errors) -> None:
+def draw_histogram(fig: Any, right: RunErrors) -> None:
     """Histogram of the Frobenius norm, with our mean and the published one."""
     axes = fig.subplots()
     bins = np.arange(0, 25.5, 0.5)

@@ -5,20 +5,20 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Self
-
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
-
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import (explain, read_yaml)
 from skysim.core.files import DATA
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
 
+
+
 FOLDER = DATA / "published"
 
 
-class Row(ConfigModel):
+class PublishedRow(ConfigModel):
     """One published number.
 
     quantity : its description, with the unit in parentheses
@@ -69,7 +69,7 @@ class Experiment(ConfigModel):
     assumed: tuple[str, ...] = ()
     fitted: tuple[str, ...] = ()
     data: dict[str, tuple[tuple[Number, ...], ...]] = Field(default_factory=dict)
-    rows: Annotated[dict[str, Row], Field(min_length=1)]
+    rows: Annotated[dict[str, PublishedRow], Field(min_length=1)]
     paper: str = ""
 
 
@@ -106,3 +106,5 @@ def read(path: Path) -> Paper:
         return Paper.model_validate(tree)
     except ValidationError as error:
         raise explain(error, Paper, tree, [(path, text)], {}) from error
+
+

@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable
 
 from skysim.core.errors import InputError
-from skysim.experiments.papers.afit import (bump, led_tests, test1, test2)
+from skysim.experiments.papers.afit import (led_tests, test1)
+from skysim.experiments.papers.afit import test3_attitude
+from skysim.experiments.papers.afit import test2
 from skysim.experiments.papers.afit import test3_attitude
 from skysim.experiments.papers.afit import afit_surface
 from skysim.experiments.papers.afit import test3
@@ -18,7 +20,7 @@ from skysim.experiments.papers import ptase_ground
 from skysim.experiments.papers import ptase_monte_carlo
 from skysim.experiments.papers.published import experiments
 from skysim.experiments.papers.shefex import shefex_camera
-from skysim.experiments.papers.shefex import shefex_catalog
+from skysim.experiments.papers.shefex import shefex_setup
 from skysim.experiments.papers.shefex import shefex_identification
 from skysim.experiments.papers.shefex import shefex_nights
 
@@ -31,7 +33,7 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "afit-table-3-5": test2.tables_3_to_5,
     "afit-table-6-9": test3.tables_6_to_9,
     "afit-table-10-15": test3_attitude.tables_10_to_15,
-    "afit-bump": bump.bump,
+    "afit-bump": test3_attitude.bump,
     "nps": nps.initial_error_trials,
     "apl": apl.discrepancies_and_counts,
     "oled": oled.noise_and_absolute_error,
@@ -39,7 +41,7 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "ptase-table-2": ptase_ground.table_2,
     "shefex-fig-2": shefex_camera.exposure_control,
     "shefex-fig-3": shefex_camera.scan_times,
-    "shefex-figs-4-5": shefex_catalog.catalog_statistics,
+    "shefex-figs-4-5": shefex_setup.catalog_statistics,
     "shefex-figs-7-10": shefex_identification.figs_7_to_10,
     "shefex-nights": shefex_nights.night_results,
 }

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skysim.core.yaml_reader import override_texts
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.execution import runner, store
+from skysim.experiments.study.execution import (store)
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import study_report
 from skysim.results.report import Report
@@ -69,7 +70,7 @@ def run_study(
     A script that uses several processes needs the usual `if __name__ == "__main__":`. Raises InputError.
     """
     texts = override_texts(overrides)
-    plan = loader.load(str(name), texts)
+    plan = study_file.load(str(name), texts)
     folder = Path(out) if out is not None else Path("out") / Path(name).stem
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
     path = folder / store.STORE

@@ -28,7 +28,7 @@ from skysim.core.files import STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.experiments.study.factors import (Design, Point, points)
 from skysim.experiments.study.factors import (Factor, Settings, Value)
-from skysim.results.files.prices import (Prices, find_prices, read_prices)
+from skysim.results.files.parts import (Prices, find_prices, read_prices)
 from skysim.scene.loader import find as find_scene
 from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene

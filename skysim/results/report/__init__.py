@@ -3,16 +3,16 @@
 `blocks` are what a report is made of, `document` is the report, and `as_html`, `as_markdown` and `as_text` write it.
 """
 
-from skysim.results.report.blocks import Block as Block
-from skysim.results.report.blocks import Cell as Cell
-from skysim.results.report.blocks import Code as Code
-from skysim.results.report.blocks import Column as Column
-from skysim.results.report.blocks import Facts as Facts
-from skysim.results.report.blocks import Figure as Figure
-from skysim.results.report.blocks import Items as Items
-from skysim.results.report.blocks import Section as Section
-from skysim.results.report.blocks import Table as Table
-from skysim.results.report.blocks import Text as Text
-from skysim.results.report.blocks import Tone as Tone
-from skysim.results.report.blocks import Verdict as Verdict
-from skysim.results.report.document import Report as Report
+from skysim.results.report_blocks import Block as Block
+from skysim.results.report_blocks import Cell as Cell
+from skysim.results.report_blocks import Code as Code
+from skysim.results.report_blocks import Column as Column
+from skysim.results.report_blocks import Facts as Facts
+from skysim.results.report_blocks import Figure as Figure
+from skysim.results.report_blocks import Items as Items
+from skysim.results.report_blocks import Section as Section
+from skysim.results.report_blocks import Table as Table
+from skysim.results.report_blocks import Text as Text
+from skysim.results.report_blocks import Tone as Tone
+from skysim.results.report_blocks import Verdict as Verdict
+from skysim.results.report import Report as Report

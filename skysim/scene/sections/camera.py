@@ -29,7 +29,7 @@ from skysim.core.units import (
     check_table,
     quantity,
 )
-from skysim.scene.opencv_calibration import Calibration
+from skysim.scene.opencv_calibration import OpencvCalibration
 
 FocusText = Annotated[
     str, Field(description='a length such as "33 in", or infinity')
@@ -453,9 +453,9 @@ class CameraConfig(ConfigModel):
         """The principal point; the chip's center by default."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
-    def calibration(self) -> Calibration:
+    def calibration(self) -> OpencvCalibration:
         """The result of a perfect calibration of this camera."""
-        return Calibration(
+        return OpencvCalibration(
             self.width_px, self.height_px, self.focal_px, self.center_px, self.distortion
         )
 

@@ -24,10 +24,10 @@ from skysim.core.units import (
     SemiAxis,
     check_table,
 )
-from skysim.scene.sections.air import AirConfig
+from skysim.scene.sections.surroundings import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.scene.sections.orbit import SatellitesConfig
+from skysim.scene.sections.surroundings import SatellitesConfig
 from typing import Annotated, Any, get_args
 from pydantic import (
     AfterValidator,

@@ -12,14 +12,14 @@ from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import (DomeConfig, StarsConfig)
 from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks import dome_warnings
 from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
-from skysim.simulation.checks.sampling import Samples, sampled
+from skysim.simulation.checks.sampling import (CheckedSamples, sampled)
 from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import depth
+from skysim.simulation.checks import sky_warnings
 from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
@@ -36,8 +36,8 @@ OWN_KEYS = (
 LEAST_ALIKE = 0.3
 MAP_WORK = 60_000
 SKY_FINDINGS = (
-    depth.sky_too_shallow,
-    depth.tracker_too_shallow,
+    sky_warnings.sky_too_shallow,
+    sky_warnings.tracker_too_shallow,
     sky_warnings.floor_too_small,
     sky_warnings.refraction,
 )
@@ -84,7 +84,7 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     samples = samples_of(context, frames, tilt_deg)
     facts = [
         fact
-        for build in (*FACTS, depth.faintest_star, sky_warnings.fact)
+        for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
         if (fact := build(context, samples)) is not None
     ]
     findings = [
@@ -120,10 +120,10 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     return dome_warnings.compared(context, samples, LEAST_ALIKE, MAP_WORK)
 
 
-def samples_of(context: Context, frames: Attitudes, tilt_deg: float | None) -> Samples:
+def samples_of(context: Context, frames: CheckedAttitudes, tilt_deg: float | None) -> CheckedSamples:
     """What the camera sees at the frames and within reach."""
     reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
-    return Samples(sampled(frames, context), sampled(reach, context))
+    return CheckedSamples(sampled(frames, context), sampled(reach, context))
 
 
 def broken_assumptions(lab: Lab) -> list[str]:

@@ -17,12 +17,12 @@ from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
-from skysim.simulation.checks.sampling import Samples
+from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.sources.dome.layouts.ambiguity import (Ambiguity, field_ambiguity)
 from skysim.simulation.checks.detection import Context, threshold_e
 from skysim.simulation.checks.facts import short
 from skysim.simulation.lights.light import find_light
-from skysim.simulation.lights.wall import IMAGES, Mirror
+from skysim.simulation.lights.room import (IMAGES, Mirror)
 
 
 
@@ -143,7 +143,7 @@ class Lookalike(NamedTuple):
     coincidence_m: float
 
 
-def of(context: Context, samples: Samples) -> Lookalike | None:
+def of(context: Context, samples: CheckedSamples) -> Lookalike | None:
     """The fields of a dome, each about an LED within the greatest tilt; None for few or coded LEDs, or stars."""
     if why_not_compared(context, samples):
         return None
@@ -155,7 +155,7 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
     )
 
 
-def why_not_compared(context: Context, samples: Samples) -> str:
+def why_not_compared(context: Context, samples: CheckedSamples) -> str:
     """Why fields are not compared; empty if they are."""
     if not isinstance(context.lab.scene.light, DomeConfig):
         return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
@@ -168,7 +168,7 @@ def why_not_compared(context: Context, samples: Samples) -> str:
 
 
 def compared(
-    context: Context, samples: Samples, least: float, most_work: int
+    context: Context, samples: CheckedSamples, least: float, most_work: int
 ) -> tuple[Ambiguity, float]:
     """The most similar other field of each field within the greatest tilt, and what coincides, m.
 
@@ -230,7 +230,7 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
 # Whether the tracker detects images of LEDs in the dome's wall.
 
 
-def mirror_images(context: Context, samples: Samples) -> str:
+def mirror_images(context: Context, samples: CheckedSamples) -> str:
     """Warn where images of LEDs in the wall are bright enough to be taken for LEDs: false lights."""
     lab = context.lab
     frames = samples.frames

@@ -47,7 +47,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
 from skysim.sources.dome import survey_errors
@@ -364,7 +364,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     )
 
 
-def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expected:
+def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
     """The expected errors at some attitudes with the lights that the tracker uses there."""
     cross, roll = (
         {name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2)

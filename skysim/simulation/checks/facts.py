@@ -14,10 +14,11 @@ from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import (DomeConfig, StarsConfig)
-from skysim.simulation.checks import attitudes, beliefs
+from skysim.simulation.checks import (beliefs)
+from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
-from skysim.simulation.checks.sampling import Sampled, Samples
+from skysim.simulation.checks.sampling import (Sampled, CheckedSamples)
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
 
@@ -41,7 +42,7 @@ class Fact(NamedTuple):
     values: dict[str, Any]
 
 
-def field_of_view(context: Context, samples: Samples) -> Fact:
+def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
     """Angles between the centers of opposite edges and corners of the chip, without distortion."""
     lens = context.camera.optics.camera.calibration()
     return Fact(
@@ -51,7 +52,7 @@ def field_of_view(context: Context, samples: Samples) -> Fact:
     )
 
 
-def lights_in_field(context: Context, samples: Samples) -> Fact:
+def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -90,7 +91,7 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
     return Fact("lights in the field", lines, values)
 
 
-def other_lights(context: Context, samples: Samples) -> Fact | None:
+def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
     """Lights at the frames that the tracker detects and does not know, by their names; None if there are none."""
     others = samples.frames.others
     most = {
@@ -110,13 +111,13 @@ def other_lights(context: Context, samples: Samples) -> Fact | None:
     return Fact("other lights", lines, values)
 
 
-def reached(context: Context, samples: Samples) -> str:
+def reached(context: Context, samples: CheckedSamples) -> str:
     """What directions the motion could reach, in words."""
     tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
-def spot(context: Context, samples: Samples) -> Fact:
+def spot(context: Context, samples: CheckedSamples) -> Fact:
     """Width of the median image without motion, and what it is made of."""
     sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
     sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
@@ -134,12 +135,12 @@ def spot(context: Context, samples: Samples) -> Fact:
     return Fact("image size", [text], values)
 
 
-def fill(context: Context, samples: Samples) -> Floats:
+def fill(context: Context, samples: CheckedSamples) -> Floats:
     """Peaks of all lights at the frames over the full well, or over the converter's range if that is less."""
     return samples.frames.joined("peak_e") / full_scale_e(context.lab.scene.camera.detector)
 
 
-def peak(context: Context, samples: Samples) -> Fact:
+def peak(context: Context, samples: CheckedSamples) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
     ratio = fill(context, samples)
     full_e = full_scale_e(context.lab.scene.camera.detector)
@@ -157,7 +158,7 @@ def peak(context: Context, samples: Samples) -> Fact:
     return Fact("peak", [text + full_text], values)
 
 
-def smear(context: Context, samples: Samples) -> Fact:
+def smear(context: Context, samples: CheckedSamples) -> Fact:
     """Path of the images during an exposure at the rates of the frames."""
     frames = samples.frames
     rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
@@ -208,7 +209,7 @@ class CapMargin(NamedTuple):
 
 
 def cap_margin(
-    context: Context, samples: Samples, tilt_deg: float | None = None
+    context: Context, samples: CheckedSamples, tilt_deg: float | None = None
 ) -> CapMargin | None:
     """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
@@ -261,7 +262,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     return needed_deg
 
 
-def cap(context: Context, samples: Samples) -> Fact | None:
+def cap(context: Context, samples: CheckedSamples) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
     found = cap_margin(context, samples)
     vehicle = context.lab.scene.vehicle
@@ -284,7 +285,7 @@ def cap(context: Context, samples: Samples) -> Fact | None:
     return Fact("LED cap", lines, values)
 
 
-def room(context: Context, samples: Samples) -> Fact | None:
+def room(context: Context, samples: CheckedSamples) -> Fact | None:
     """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
     light = context.lab.scene.light
     surface = context.surface
@@ -311,7 +312,7 @@ def room(context: Context, samples: Samples) -> Fact | None:
     return Fact("room", [text], values)
 
 
-def depth_of_focus(context: Context, samples: Samples) -> Fact:
+def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
     """Distances at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
     spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
@@ -334,7 +335,7 @@ def depth_of_focus(context: Context, samples: Samples) -> Fact:
     return Fact("depth of focus", [text], values)
 
 
-def tracker_beliefs(context: Context, samples: Samples) -> Fact:
+def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
     """What the tracker believes, and what of it is uncertain or wrong."""
     believed = context.beliefs
     values = {
@@ -351,7 +352,7 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
     return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.lab.scene), values)
 
 
-def expected_error(context: Context, samples: Samples) -> Fact:
+def expected_error(context: Context, samples: CheckedSamples) -> Fact:
     """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -420,7 +421,7 @@ def cause_text(sampled: Sampled, angle: str) -> str:
     return ", ".join(parts)
 
 
-FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
+FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
     other_lights,

@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from typing import NamedTuple
-
 import numpy as np
-
 from skysim.core.types import Floats
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
 from skysim.simulation.checks.views import VISIBLE, View, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import (Beam, Exposure, beam_of)
+
 
 
 class Sampled(NamedTuple):
@@ -30,7 +29,7 @@ class Sampled(NamedTuple):
     others : the lights that it detects and does not know, by their names
     """
 
-    attitudes: Attitudes
+    attitudes: CheckedAttitudes
     exposures: list[Exposure]
     beams: list[Beam]
     known: list[View]
@@ -53,14 +52,14 @@ class Sampled(NamedTuple):
         return np.concatenate([getattr(view, name) for view in self.seen])
 
 
-class Samples(NamedTuple):
+class CheckedSamples(NamedTuple):
     """The two sets of attitudes: those of the frames, and all that the motion could reach."""
 
     frames: Sampled
     reach: Sampled
 
 
-def sampled(at: Attitudes, context: Context) -> Sampled:
+def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     """What the camera sees at some attitudes, and the expected errors there."""
     camera = context.lab.camera
     rows = zip(at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True)
@@ -111,3 +110,5 @@ def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, 
             seen = view(lit, exposure, context.camera, beam.before(lit))
             found[lit.name] = usable(seen.take(seen.behind == VISIBLE), context)
     return {name: seen for name, seen in found.items() if len(seen)}
+
+

@@ -8,8 +8,8 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context
 from skysim.simulation.checks.facts import short
-from skysim.simulation.checks.sampling import Samples
-from skysim.simulation.lights.air import Atmosphere
+from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.light import find_light
 from skysim.tracking.tracker_interface import OWN
 from collections.abc import Iterator
@@ -22,18 +22,22 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, covariance, gains, star_places
 from skysim.simulation.checks.facts import Fact, short
-from skysim.simulation.checks.sampling import Sampled, Samples
+from skysim.simulation.checks.sampling import (Sampled, CheckedSamples)
 from skysim.camera.glow.background import angular_separation_deg
 from skysim.simulation.lights.lens import stray_e_s
-from skysim.sources.orbit.earth import limb_elevation_rad
+from skysim.sources.camera_orbit import limb_elevation_rad
 from skysim.sources.ephemeris import place
+from skysim.simulation.checks.detection import BINOMIAL_VARIANCE_PX2, Context, threshold_e
+from skysim.simulation.checks.facts import Fact
+from skysim.simulation.checks.findings import few_lights
+from skysim.sources.photometry import SUN, star_flux_e_s_m2
 
 
 
 MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
 
 
-def refraction(context: Context, samples: Samples) -> str:
+def refraction(context: Context, samples: CheckedSamples) -> str:
     """Warn where stars are raised by more than the expected error and the tracker does not undo it: the lowest frame.
 
     The attitude errs by the refraction at the boresight, and the field's height is shortened by the difference of the
@@ -41,7 +45,7 @@ def refraction(context: Context, samples: Samples) -> str:
     """
     lab = context.lab
     at = samples.frames.attitudes
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
     boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
@@ -78,7 +82,7 @@ def refraction(context: Context, samples: Samples) -> str:
 NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray light would matter
 
 
-def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
+def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
     """A line for each body: the frame at which it is nearest to the boresight, if it is in the field or near it."""
     lab = context.lab
     at = samples.frames.attitudes
@@ -160,14 +164,14 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     return float(np.median(found)) if found else math.nan
 
 
-def claimed(context: Context, samples: Samples) -> float:
+def claimed(context: Context, samples: CheckedSamples) -> float:
     """The expected NEES over the whole sky with the tracker's floor; NaN under other lights."""
     if not isinstance(context.lab.scene.light, StarsConfig):
         return math.nan
     return expected_nees(samples.reach, context, context.settings.centroid_sigma_px)
 
 
-def fact(context: Context, samples: Samples) -> Fact | None:
+def fact(context: Context, samples: CheckedSamples) -> Fact | None:
     """The expected NEES in words."""
     nees = claimed(context, samples)
     if math.isnan(nees):
@@ -177,7 +181,7 @@ def fact(context: Context, samples: Samples) -> Fact | None:
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
 
-def floor_too_small(context: Context, samples: Samples) -> str:
+def floor_too_small(context: Context, samples: CheckedSamples) -> str:
     """Warn where the tracker will claim errors that are too small, because its floor of the centroids' error is."""
     nees = claimed(context, samples)
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
@@ -208,7 +212,7 @@ MAX_LOSS_MAG = 0.5  # of the faintest star
 STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
 
 
-def stray_light(context: Context, samples: Samples) -> Iterator[str]:
+def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
     """Warn where stray light makes the noise of a pixel so large that fainter stars are lost.
 
     With n0 the noise without it and s electrons of it the noise is sqrt(n0^2 + s), and the faintest star brighter by
@@ -236,7 +240,7 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
     )
 
 
-def exclusion(context: Context, samples: Samples) -> Iterator[str]:
+def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
     """Warn where a frame's boresight is within an exclusion angle of the orbit's tracker: the frame nearest to it."""
     lab = context.lab
     at = samples.frames.attitudes
@@ -268,5 +272,148 @@ def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     )
     limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
     return np.array([sun, limb_deg, moon])
+
+
+
+
+# How deep the camera sees, and whether the simulated sky and the tracker's catalog are as deep.
+
+
+# by which the camera may see fainter stars than a catalog, a limit
+CATALOG_MARGIN_MAG = 0.3
+LIMIT_MARGIN_MAG = 0.5
+MIN_KNOWN = (
+    0.2  # share of the stars detected that the tracker should know: among more others it needs luck
+)
+DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
+SNR = 5.0
+
+
+def faintest_star(context: Context, samples: CheckedSamples) -> Fact | None:
+    """V of the faintest star that the tracker detects, and of that with a signal-to-noise ratio of 5."""
+    scene = context.lab.scene
+    believed = context.beliefs
+    if not isinstance(scene.light, StarsConfig):
+        return None
+    rate_deg_s = float(
+        np.degrees(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1)).min()
+    )
+    limit_mag = detection_limit_mag(context, samples)
+    snr_mag = snr_limit_mag(context, samples)
+    sky = context.lab.camera.sources.magnitude
+    known = known_share(context, limit_mag)
+    lines = [
+        f"the tracker detects V {limit_mag:.1f} (like the Sun) in {1e3 * scene.exposure.time_s:.4g} ms at"
+        f" {rate_deg_s:.3g} deg/s; signal to noise {SNR:g} at V {snr_mag:.1f}",
+        f"the sky ends at V {np.nanmax(sky, initial=-math.inf):.1f}; the tracker knows stars to V"
+        f" {believed.faintest_mag:.1f}, {100 * known:.0f} % of those that it detects",
+    ]
+    values = {
+        "detected_v_mag": limit_mag,
+        "snr_5_v_mag": snr_mag,
+        "known": known,
+        "rate_deg_s": rate_deg_s,
+    }
+    return Fact("faintest star", lines, values)
+
+
+def known_share(context: Context, limit_mag: float) -> float:
+    """Share of the sky's stars brighter than a limit that are also brighter than the tracker's faintest one."""
+    sky = context.lab.camera.sources.magnitude
+    seen = sky < limit_mag
+    return float((sky[seen] <= context.beliefs.faintest_mag).mean()) if seen.any() else 1.0
+
+
+def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
+    """Warn where the camera detects fainter stars than the simulated sky holds."""
+    light = context.lab.scene.light
+    sky = context.lab.camera.sources.magnitude
+    if not isinstance(light, StarsConfig) or not len(sky):
+        return ""
+    limit_mag = detection_limit_mag(context, samples)
+    faintest_mag = float(np.nanmax(sky))
+    text = f"the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f}; change it to"
+    if light.limit_mag is not None:
+        said = few_lights(context, samples).startswith(
+            "light.limit_mag"
+        )  # which asks for a deeper one already
+        deeper = limit_mag > light.limit_mag + LIMIT_MARGIN_MAG and not said
+        return (
+            f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
+            if deeper
+            else ""
+        )
+    if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
+        return ""
+    wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
+    return (
+        f"light.catalog: {text} a file of `skysim catalog build --source gaia --limit {wanted:g}`"
+    )
+
+
+def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
+    """Warn where most of the stars that the tracker detects are fainter than those that it knows."""
+    if not isinstance(context.lab.scene.light, StarsConfig):
+        return ""
+    limit_mag = detection_limit_mag(context, samples)
+    faintest_mag = context.beliefs.faintest_mag
+    known = known_share(context, limit_mag)
+    if known >= MIN_KNOWN or limit_mag <= faintest_mag + LIMIT_MARGIN_MAG:
+        return ""
+    return (
+        f"tracker.limit_mag: the camera detects stars to V {limit_mag:.1f}, but the tracker knows them to V"
+        f" {faintest_mag:.1f} only, {100 * known:.0f} % of them; change it to {math.floor(2 * limit_mag) / 2:g}, with a"
+        f" tracker.catalog of `skysim catalog build --limit {math.floor(2 * limit_mag) / 2:g}`"
+    )
+
+
+def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
+    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
+
+    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
+    `detection.detected_area_px`.
+    """
+    camera = context.camera
+    blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
+    peak_e = threshold_e(context) * math.exp(
+        context.settings.min_area_px / (2 * math.pi * blur2_px2)
+    )
+    none = np.zeros(1)
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[0]
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
+    return 2.5 * math.log10(
+        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
+    )
+
+
+def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
+    """V of a star like the Sun with a signal-to-noise ratio of 5 over the noise-equivalent area, at the slowest frame.
+
+    S / sqrt(S + A n^2) = 5, n the noise of a pixel, gives S = (25 + sqrt(25^2 + 100 A n^2)) / 2. A Gaussian of
+    deviation s has the area A = 4 pi s^2, moved by L much more than s it has 2 sqrt(pi) s L; between them the
+    hypotenuse.
+    """
+    camera = context.camera
+    area_px = (
+        2
+        * math.sqrt(math.pi)
+        * camera.lens_px
+        * math.hypot(2 * math.sqrt(math.pi) * camera.lens_px, least_streak_px(samples))
+    )
+    signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
+    return 2.5 * math.log10(
+        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s / signal_e
+    )
+
+
+def least_streak_px(samples: CheckedSamples) -> float:
+    """Path of the images at the slowest frame."""
+    return float(
+        min(
+            (np.median(view.streak_length_px) for view in samples.frames.known if len(view)),
+            default=0.0,
+        )
+    )
 
 

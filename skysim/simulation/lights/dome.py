@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
-
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
 from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Sources
 from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
-from skysim.scene.sections.thermal import ThermalConfig
+from skysim.scene.sections.surroundings import ThermalConfig
 from skysim.simulation.lights.light import (EdgedGlow, Exposure, KnownLight, Lit)
 from skysim.sources.dome.led import warm_up_factor
 from skysim.sources.dome.codes import (Clocks, build_clocks)
 from skysim.sources.dome.codes import (LedCodes, build_codes)
+from collections.abc import Callable
+from typing import Any
+from skysim.simulation.lights.light import KnownLight
+from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.starlight import stars_of
+from skysim.sources import dome
+from skysim.sources.dome import display
+from skysim.sources.dome.led import Emitter
+
+
 
 MAX_RUNS = 4  # whose timing is kept
 
@@ -100,3 +109,38 @@ def black_pixels(
     return EdgedGlow(
         lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share
     )
+
+
+
+
+# The scene's own light, which a tracker can know: stars, LEDs of a dome, or stars on a collimated
+# display.
+
+
+def of_dome(config: DomeConfig, plan: LightPlan) -> KnownLight:
+    """The LEDs of a dome. Raises InputError for LEDs off the surface, and for a dome that does not fit its room."""
+    return LedDome(
+        dome.sources(config, plan.band), Emitter.from_config(config.led), config, plan.scene.thermal
+    )
+
+
+def of_display(config: CollimatedDisplayConfig, plan: LightPlan) -> KnownLight:
+    """The stars on a display at the scene's start."""
+    assert plan.catalog is not None
+    shown = display.display_sources(config, plan.catalog, plan.scene.start_time, plan.band)
+    return CollimatedDisplay(shown, Emitter(), config)
+
+
+# By the kind of the section `light`.
+KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
+    "dome": of_dome,
+    "stars": stars_of,
+    "collimated_display": of_display,
+}
+
+
+def known_light(plan: LightPlan) -> KnownLight:
+    """The light of the section `light`; that of the plan, if it has been made."""
+    return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)
+
+

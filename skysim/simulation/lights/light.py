@@ -24,11 +24,11 @@ from skysim.camera.render import OcclusionTest, Poses, Window, poses
 from skysim.core.types import Floats, Mount, SatelliteTruth, Sources, Trajectory
 from skysim.scene.sections.camera import GlareConfig
 from skysim.sources.dome.led import Emitter
-from skysim.sources.orbit.satellites import View
-from skysim.sources.orbit.camera_orbit import Viewpoint
+from skysim.sources.satellites import ExposureView
+from skysim.sources.camera_orbit import Viewpoint
 from skysim.sources.photometry import Band
 from skysim.sources.bodies import BodyLight
-from skysim.sources.ephemeris import Observer
+from skysim.sources.ephemeris import ObserverPlace
 from dataclasses import dataclass
 from skysim.core.types import Mount
 from skysim.dynamics.multibody.model import VehicleModel
@@ -79,7 +79,7 @@ class Exposure:
         return self.viewpoint.time_at(self.t_s)
 
     @cached_property
-    def observer(self) -> Observer:
+    def observer(self) -> ObserverPlace:
         """The camera among the bodies of the solar system at mid-exposure."""
         return self.viewpoint.observer_at(self.t_s)
 
@@ -99,11 +99,11 @@ class Exposure:
         return self.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
 
     @cached_property
-    def view(self) -> View:
+    def view(self) -> ExposureView:
         """What the camera can see from the first row's opening to the last row's end."""
         duration_s = self.window.close_s(self.optics.camera.height_px) - self.window.open_s
         turn_rad = float(np.linalg.norm(self.trajectory.rate_at(self.t_s))) * duration_s
-        return View(self.boresight, self.optics.field_rad, turn_rad, duration_s)
+        return ExposureView(self.boresight, self.optics.field_rad, turn_rad, duration_s)
 
     @cached_property
     def few_poses(self) -> Poses:
@@ -197,7 +197,7 @@ class Lit(NamedTuple):
         return any_of(self.hidden_by)
 
 
-class Path(NamedTuple):
+class LightPath(NamedTuple):
     """One way of the light through the lens: 0 is the image, and the others, from 1, are ghosts."""
 
     number: int
@@ -208,7 +208,7 @@ class Beam(NamedTuple):
     """All light of an exposure on its way to the chip: of each light so far, the ways through the lens, its glare."""
 
     lits: tuple[Lit, ...]
-    paths: tuple[Path, ...]
+    paths: tuple[LightPath, ...]
     glares: tuple[GlareConfig, ...] = ()
 
     def plus(self, lit: Lit) -> Beam:
@@ -295,7 +295,7 @@ def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None
 
 def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
     """The light of all lights in an exposure."""
-    beam = Beam((), (Path(0, exposure.optics),))
+    beam = Beam((), (LightPath(0, exposure.optics),))
     for light in lights:
         beam = light.through(beam, exposure)
     return beam
@@ -307,7 +307,7 @@ def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LightPlan:
     """The scene and the hardware around a camera.
 
     scene     : as the camera sees it, see `Scene.of_head`

@@ -9,21 +9,16 @@ from numpy.typing import NDArray
 from skysim.camera.glow.earth_glow import earth_around
 from skysim.camera.glow.earth_glow import earth_light
 from skysim.core.types import Floats
-from skysim.scene.sections.orbit import EarthConfig
+from skysim.scene.sections.surroundings import EarthConfig
 from skysim.simulation.lights.light import (EdgedGlow, Exposure, Light, Lit, Obstacle, Occluder)
-from skysim.simulation.lights.light import Plan
-from skysim.sources.orbit.earth import hidden_by_earth, sun_m
+from skysim.simulation.lights.light import LightPlan
+from skysim.sources.camera_orbit import (hidden_by_earth, sun_m)
 from typing import ClassVar
 from skysim.scene.sections.light import StarsConfig
-from skysim.scene.sections.orbit import SatellitesConfig
+from skysim.scene.sections.surroundings import SatellitesConfig
 from skysim.simulation.lights.light import (Exposure, Light, Lit)
-from skysim.sources.orbit.elements import Elements, read_elements
-from skysim.sources.orbit.satellites import (
-    MovingLight,
-    as_sources,
-    known_satellites,
-    random_satellites,
-)
+from skysim.sources.orbit_elements import (MeanElements, read_elements)
+from skysim.sources.satellites import (MovingLight, as_sources, known_satellites, random_satellites)
 from skysim.sources.ephemeris import GcrsState
 from skysim.scene.sections.light import (BodiesConfig, StarsConfig)
 from skysim.sources.bodies import bodies_from
@@ -71,7 +66,7 @@ class LitEarth(DarkEarth):
         )
 
 
-def build_earth(plan: Plan) -> Iterator[Light]:
+def build_earth(plan: LightPlan) -> Iterator[Light]:
     orbit = plan.scene.orbit
     if orbit:
         yield LitEarth(orbit.earth) if orbit.earth else DarkEarth()
@@ -91,7 +86,7 @@ class Satellites(Light):
 
     only_adds: ClassVar[bool] = True
     config: SatellitesConfig
-    elements: Elements | None
+    elements: MeanElements | None
 
     def during(self, exposure: Exposure) -> Lit:
         """Their streaks; with no seed without the random ones."""
@@ -113,7 +108,7 @@ class Satellites(Light):
         return Lit("satellites", points=points, satellites=tuple(light.truth for light in found))
 
 
-def build_satellites(plan: Plan) -> Iterator[Light]:
+def build_satellites(plan: LightPlan) -> Iterator[Light]:
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.satellites:
         file = light.satellites.file
@@ -136,7 +131,7 @@ class SolarSystem(Light):
         return Lit("Sun, Moon and planets", discs=tuple(bodies))
 
 
-def build_solar_system(plan: Plan) -> Iterator[Light]:
+def build_solar_system(plan: LightPlan) -> Iterator[Light]:
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.bodies:
         yield SolarSystem(light.bodies)

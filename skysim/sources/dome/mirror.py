@@ -29,7 +29,7 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import (Surface, perpendicular)
-from skysim.sources.false_lights import MIRRORED
+from skysim.sources.satellites import MIRRORED
 
 
 

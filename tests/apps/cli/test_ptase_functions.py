@@ -20,7 +20,7 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import published_catalogs
 from estimator.core.checks import Ints
 from estimator.core.types import ra_dec_roll_rad
-from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
+from estimator.identification.published.fialho import (VERSIONS, MagnitudeMatch, fialho_2, fialho_4)
 from estimator.identification.registry import IDENTIFIERS
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core import files

@@ -19,21 +19,12 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 import httpx
 from astropy.io import fits
 
-from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
+from skysim.apps.gui.messages import (ALL_PIXELS, LIMITS, Display, LightColumns, Pixels)
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views import served as served_module
-from skysim.apps.gui.views.served import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
-from skysim.apps.gui.worker.pixels import (
-    BINS,
-    HEADER_BYTES,
-    SATURATED,
-    SHADES,
-    levels_of,
-    limits_of,
-    pixels_for,
-    shades,
-)
+from skysim.apps.gui.views import overlay as served_module
+from skysim.apps.gui.views.overlay import (FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of)
+from skysim.apps.gui.worker.pixels import (BINS, HEADER_BYTES, SATURATED, SHADES, levels_of, limits_of, pixels_for, shades)
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.results import annotate
@@ -371,7 +362,7 @@ def test_a_worker_keeps_the_pixels_of_its_newest_images() -> None:
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
     count = 500
     random = np.random.default_rng(7)
-    lights = Lights(
+    lights = LightColumns(
         np.arange(count),
         random.uniform(0, 1000, (count, 2)),
         random.random(count),

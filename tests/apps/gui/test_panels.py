@@ -20,16 +20,17 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui import memory
-from skysim.apps.gui.messages import Detection, Lights, TrackerResult
-from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
+from skysim.apps.gui import server
+from skysim.apps.gui.messages import (Detection, LightColumns, TrackerResult)
+from skysim.apps.gui.server import (FILES, Guard, KeptFiles, host_of, report_path, user_of)
 from skysim.apps.gui.views import forms
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.views.served import FRAMES, TabFrames
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.views.overlay import (FRAMES, TabFrames)
 from skysim.apps.gui.views.overlay import NAMES
-from skysim.apps.gui.worker import (photo, pixels, playback, study_process, tasks)
+from skysim.apps.gui.worker import (photo, playback, study_process, tasks)
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
@@ -41,18 +42,19 @@ from skysim.core.images import IMAGE_SUFFIXES
 from skysim.core.files import (ROOT, SCENES)
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import study_file as study_loader
 from skysim.results import (scoring)
 from skysim.results import annotate
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight, simulate_motion
-from skysim.sources import catalog, stars
+from skysim.sources import (stars)
+from skysim.sources import catalog
 
 
 def test_a_body_has_its_name_and_magnitude() -> None:
     """In the sensor's labels and in what the page says of a true light."""
     sensor = SimpleNamespace(prefix="HIP")
-    assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
+    assert [SensorView.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
         "Jupiter",
         "Sirius",
         "HIP 20",
@@ -275,7 +277,7 @@ def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: P
 
 # Marks.
 
-LIGHTS = Lights(
+LIGHTS = LightColumns(
     np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0])
 )
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
@@ -534,12 +536,12 @@ def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(
     """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
     collected = list[float]()
     frames = TabFrames(lambda _: None)
-    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(time.monotonic()))
-    monkeypatch.setattr(memory, "QUIET_S", 0.2)
+    monkeypatch.setattr(server, "release_memory", lambda: collected.append(time.monotonic()))
+    monkeypatch.setattr(server, "QUIET_S", 0.2)
     monkeypatch.setitem(FRAMES, "busy", frames)
 
     async def close_while_another_plays() -> None:
-        closed = memory.ClosedPages()
+        closed = server.ClosedPages()
         for number in range(8):
             frames.add(number, SimpleNamespace(), alone=False)
             closed.collect_soon()
@@ -562,13 +564,13 @@ def test_closed_pages_are_collected_in_the_end_though_frames_go_on(
 ) -> None:
     collected = list[bool]()
     frames = TabFrames(lambda _: None)
-    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(True))
-    monkeypatch.setattr(memory, "QUIET_S", 0.05)
-    monkeypatch.setattr(memory, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(server, "release_memory", lambda: collected.append(True))
+    monkeypatch.setattr(server, "QUIET_S", 0.05)
+    monkeypatch.setattr(server, "PATIENCE_S", 0.2)
     monkeypatch.setitem(FRAMES, "busy", frames)
 
     async def close_while_another_plays() -> None:
-        memory.ClosedPages().collect_soon()
+        server.ClosedPages().collect_soon()
         for number in range(20):
             frames.add(number, SimpleNamespace(), alone=False)
             await asyncio.sleep(0.02)

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import (AmbiguityMap, SurveyFound, SurveyPlan)
 from skysim.apps.gui.page.plan_panel import (ambiguity_text, greatest_tilt_deg, prediction_text, survey_flight, survey_lines)
 from skysim.apps.gui.views.style import color_scale
 from skysim.apps.gui.worker import workbench

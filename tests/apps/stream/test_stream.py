@@ -25,10 +25,11 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.apps.stream import (http, sinks)
+from skysim.apps.stream import (http)
+from skysim.apps.stream import sinks
 from skysim.apps.stream import sender
 from skysim.apps.stream.sender import Pace
-from skysim.apps.stream.packet import Packet, unpack
+from skysim.apps.stream.sinks import (Packet, unpack)
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight

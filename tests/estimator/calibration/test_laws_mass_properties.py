@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.calibration import mass_properties
 from estimator.calibration import mass_dynamics
 from estimator.calibration import mass_properties
-from estimator.calibration.mass_dynamics import (STATE, Motion, States)
+from estimator.calibration.mass_dynamics import (STATE, EquationsOfMotion, States)
 from estimator.calibration.mass_dynamics import (BearingRecord, MassEstimate, Prior, inertia_matrix, inertia_six)
 from tests.helpers.bearing_motion import SMALL, prior, record
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn
@@ -51,13 +51,13 @@ def test_a_change_of_states_is_found_again(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(moved.torque, 3 * states.torque, rtol=1e-12)
 
 
-@law(Motion.stored, Motion.rate, Motion.slope, Motion.integrate)
+@law(EquationsOfMotion.stored, EquationsOfMotion.rate, EquationsOfMotion.slope, EquationsOfMotion.integrate)
 @given(rng=SEEDS)
 def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Generator) -> None:
     """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
     free = SMALL.truth.copy()
     free[6:14] = 0
-    motion = Motion(RECORD, SMALL.lab, np.tile(free[:, None], 4), free)
+    motion = EquationsOfMotion(RECORD, SMALL.lab, np.tile(free[:, None], 4), free)
     states = drawn_states(rng, 4)._replace(torque=np.zeros((3, 4)))
     begin = rng.uniform(0, 10, 4)
     after = motion.integrate(begin, begin + 3.0, states, 2.0)

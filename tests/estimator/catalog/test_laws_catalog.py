@@ -12,7 +12,9 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from estimator.catalog import (catalog, quad_index, sky_index, spatial_grid)
+from estimator.catalog import (catalog, quad_index)
+from estimator.catalog import sky_index
+from estimator.catalog import sky_index
 from estimator.catalog import pair_index
 from estimator.catalog import pair_index
 from estimator.catalog import published_catalogs
@@ -181,7 +183,7 @@ def test_a_prepared_catalog_counts_every_star(
 @law(
     pair_index.build,
     pair_index.k_vector,
-    spatial_grid.build,
+    sky_index.build_grid,
     pair_index.build_pair_catalog,
     sky_index.build,
     sky_index.build_without_pairs,
@@ -205,7 +207,7 @@ def test_three_indexes_hold_the_pairs_that_there_are(
         assert len({tuple(sorted(pair)) for pair in made.pair.tolist()}) == pairs
     known = pair_index.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
     assert known is None or known.table[-1] == len(known.pair) == pairs
-    assert sorted(spatial_grid.build(vectors).row.tolist()) == list(range(count))
+    assert sorted(sky_index.build_grid(vectors).row.tolist()) == list(range(count))
     kvector, slope, offset = pair_index.k_vector(np.sort(every))
     z = slope * np.arange(len(kvector)) + offset
     assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
@@ -246,4 +248,4 @@ def test_the_shipped_catalog_is_brightest_first() -> None:
 def test_a_place_s_cell_is_the_nearest_there_is(place: float, last: int) -> None:
     """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
     expected = 0 if np.isnan(place) else min(max(place, 0), last)
-    assert spatial_grid.cell_of(float(place), last) == int(expected)
+    assert sky_index.cell_of(float(place), last) == int(expected)

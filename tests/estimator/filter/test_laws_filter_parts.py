@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter import (correct)
+from estimator.filter import correct
 from estimator.filter import consistency
 from estimator.filter import consistency
 from estimator.filter import states
@@ -34,7 +34,7 @@ def covariance(rng: np.random.Generator, size: int, scale: float = 1e-3) -> NDAr
     return root @ root.T + 1e-3 * scale**2 * np.eye(size)
 
 
-def state_of(rng: np.random.Generator, layout: states.Layout) -> states.State:
+def state_of(rng: np.random.Generator, layout: states.Layout) -> states.MekfState:
     """A state with some attitude, values, correlations and history."""
     values = rng.normal(0, 1e-3, layout.size)
     values[:3] = 0.0
@@ -48,10 +48,10 @@ def state_of(rng: np.random.Generator, layout: states.Layout) -> states.State:
 
 
 def solution_near(
-    rng: np.random.Generator, state: states.State, off_rad: float
-) -> correct.Solution:
+    rng: np.random.Generator, state: states.MekfState, off_rad: float
+) -> correct.AttitudeFix:
     near = Rotation.from_rotvec(rng.normal(0, off_rad, 3)) * state.body_from_ref
-    return correct.Solution(near, covariance(rng, 3), covariance(rng, 3))
+    return correct.AttitudeFix(near, covariance(rng, 3), covariance(rng, 3))
 
 
 # States of several heads
@@ -158,7 +158,7 @@ def test_the_states_fill_the_covariance_without_gap_or_overlap(
     assert len(set(inside)) == len(inside) == 3 * ("scale" in used) + 6 * ("misalignment" in used)
 
 
-@law(states.propagate_state, states.State.body_from_ref)
+@law(states.propagate_state, states.MekfState.body_from_ref)
 @given(rng=SEEDS, considered=CHOICES)
 def test_a_gyro_sample_moves_the_errors_as_it_moves_the_truth(
     rng: np.random.Generator, considered: tuple[str, ...]

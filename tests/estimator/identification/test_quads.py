@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import quad_index, sky_index
+from estimator.catalog import (quad_index)
+from estimator.catalog import sky_index
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.identification import star_quads

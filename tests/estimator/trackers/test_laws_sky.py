@@ -22,9 +22,9 @@ from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.direct_match import to_star_match
 from estimator.identification.solver_options import Options
-from estimator.identification.published import (shefex)
+from estimator.identification.published import shefex
 from estimator.identification.published import saa as saa_search
-from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
+from estimator.identification.published.fialho import (fialho_1, fialho_2, fialho_3, fialho_4)
 from estimator.identification.published.fialho import search_options as fialho_options
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid

@@ -16,7 +16,7 @@ from astropy.io import fits
 
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.characterize import input_checks
+from skysim.experiments.characterize import frame_files
 from skysim.experiments.characterize import characterize_camera
 from skysim.experiments.characterize.frame_files import (Setting, read_frames, read_stack)
 
@@ -339,7 +339,7 @@ def test_hot_pixels_are_no_stars(tmp_path: Path) -> None:
         for n in range(2):
             image = frame(rng, hot * exposure_s / 100, exposure_s)
             write(tmp_path / f"dark_{exposure_s:g}s_{n}.png", image)
-    input_checks.check_darks(read_stack(tmp_path, SHAPE, BITS))
+    frame_files.check_darks(read_stack(tmp_path, SHAPE, BITS))
 
 
 # The command

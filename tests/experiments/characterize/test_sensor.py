@@ -19,8 +19,8 @@ from skysim.experiments.characterize import fixed_pattern
 from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (Estimate, propagate)
 from skysim.experiments.characterize.photon_transfer import (Level, Moments, level)
-from skysim.experiments.characterize.photon_transfer import Point
-from skysim.experiments.characterize.sensor_fit import Sensor
+from skysim.experiments.characterize.photon_transfer import TransferPoint
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 from tests.helpers.two_samples import histogram_p
 
@@ -58,7 +58,7 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
     )
 
 
-def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
+def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> MeasuredSensor:
     """Darks of three exposures at two temperatures, and flats in pairs, of one simulated chip."""
     rng = np.random.default_rng(1000 + seed)
 
@@ -109,7 +109,7 @@ def test_an_odd_last_frame_is_left_out() -> None:
 
 def exact_points(
     gain_dn_e: float, curvature: float, read_dn: float, black_dn: float
-) -> list[Point]:
+) -> list[TransferPoint]:
     """Points of the law, from 10^7 numbers drawn for none: by the moments of a Poisson variable up to the fourth."""
     points = []
     for lit, rate_e_s, times in (
@@ -128,7 +128,7 @@ def exact_points(
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
             points.append(
-                Point(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance))
+                TransferPoint(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance))
             )
     return points
 
@@ -162,7 +162,7 @@ def test_the_lamp_s_flicker_is_what_noise_does_not_explain() -> None:
     points = []
     changes = []
     for mean in np.linspace(500, 3000, 400):
-        points.append(Point(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
+        points.append(TransferPoint(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
         change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
         changes.append(change**2)
     assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(
@@ -327,7 +327,7 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
         found["gain_e_dn"].value / CHIP["gain_e_dn"]
     )  # the lamp as the flats measured it, not as it is
 
-    def numbers(config: DetectorConfig, shot: frame_files.Shot, seed: int) -> Floats:
+    def numbers(config: DetectorConfig, shot: frame_files.PlannedFrame, seed: int) -> Floats:
         one = camera(side).model_copy(update={"detector": config})
         return np.concatenate(
             [frame.ravel() for frame in frame_files.frames_of(one, shot, seed)]
@@ -341,7 +341,7 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
         ("darks", 5.0, 32.0, 0.0),
         ("flats", 0.5, 20.0, 8000.0),
     ):
-        shot = frame_files.Shot(kind, exposure_s, at_c, rate_e_s, 1)
+        shot = frame_files.PlannedFrame(kind, exposure_s, at_c, rate_e_s, 1)
         measured_shot = shot._replace(light_e_s=rate_e_s * light)
         same, other = (numbers(config, measured_shot, 5) for config in (ours, wrong))
         assert histogram_p(numbers(true, shot, 4), same) > 0.01, (kind, at_c)

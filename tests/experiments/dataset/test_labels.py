@@ -16,7 +16,7 @@ from skysim.core.types import SourceTruth
 from skysim.experiments import dataset_labels
 from skysim.experiments import dataset_shards
 from skysim.experiments.study.execution import trials
-from skysim.experiments.study.execution.setups import Setup, prepared_setup
+from skysim.experiments.study.execution.setups import (TrialSetup, prepared_setup)
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
 from skysim.tracking.onboard_model import assumed_camera
@@ -29,7 +29,7 @@ PARTICLE = {
 
 def setup_with(
     settings: dict[str, object] | None = None, trial: dict[str, object] | None = None
-) -> Setup:
+) -> TrialSetup:
     base = {key: parse_yaml(value)[1] for key, value in SMALL.items()}
     spec = TrialSpec(
         "shefex2", ".", 1, {**base, **(settings or {})}, {"kind": "frames", **(trial or {})}, True

@@ -19,7 +19,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
-from skysim.experiments import dataset_plan
+from skysim.experiments import dataset_run
 from skysim.experiments import dataset_run
 from skysim.experiments import dataset_shards
 from skysim.experiments import dataset_shards
@@ -410,4 +410,4 @@ def test_a_shard_that_kills_its_workers_is_told_and_left_out() -> None:
     (chunk,) = dataset_run.ShardQueue([2]).next()
     failed = dataset_run.DatasetJob(made, "x").failed(chunk, engines.DIED)
     assert (failed.shard, failed.frames, failed.error) == (2, 0, engines.DIED)
-    assert dataset_plan.FORMATS
+    assert dataset_run.FORMATS

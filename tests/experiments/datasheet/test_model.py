@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.cells import QUICK, Designer
+from skysim.experiments.datasheet.cells import (QUICK, Designer)
 from skysim.experiments.datasheet import model_fit
-from skysim.experiments.datasheet import model_export
+from skysim.experiments.datasheet import model_fit
 from skysim.experiments.datasheet import model_fit
 from skysim.experiments.datasheet.error_model import (ErrorModel, State, correlated)
-from skysim.experiments.datasheet.datasheet_run import (AXES, Sheet)
+from skysim.experiments.datasheet.cells import (AXES, MeasuredFrames)
 from skysim.scene.loader import load
 
 CONSTANTS: dict[str, Any] = {
@@ -147,7 +147,7 @@ def test_more_than_a_hundred_thousand_errors_a_second(model):
 
 def test_the_module_stands_alone(tmp_path: Path) -> None:
     """Copied away it needs NumPy and its constants, and nothing of skysim."""
-    model_export.write_model(tmp_path, CONSTANTS)
+    model_fit.write_model(tmp_path, CONSTANTS)
     code = (
         "import sys, numpy; from tracker_error import ErrorModel; m = ErrorModel.read('tracker_error.json');"
         " print(m.draw(numpy.full(5, 1.0), 0.1, numpy.random.default_rng(1)).shape,"
@@ -171,8 +171,8 @@ def test_the_unit_runs_in_another_tool_with_the_same_errors(
     """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu3")
-    model_export.write_model(tmp_path, CONSTANTS)
-    path = model_export.write_fmu(tmp_path)
+    model_fit.write_model(tmp_path, CONSTANTS)
+    path = model_fit.write_fmu(tmp_path)
     assert fmpy.read_model_description(str(path)).fmiVersion == "3.0"
     outputs = ["x_arcsec", "y_arcsec", "roll_arcsec"]
     result = fmpy.simulate_fmu(
@@ -203,7 +203,7 @@ def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
     assert model_fit.log_scale(np.ones(9), np.ones(9)) == 0
 
 
-def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
+def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
     """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
     scene = load("shefex2", {})
     size = replace(QUICK, fields=fields)
@@ -232,7 +232,7 @@ def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
         "wrong": 0 * ones,
         "axis_rad": axis_rad * ones,
     }
-    return Sheet(scene, "shefex2", {}, size, designer, cells, columns, None)
+    return MeasuredFrames(scene, "shefex2", {}, size, designer, cells, columns, None)
 
 
 def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:

@@ -27,7 +27,7 @@ from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey import survey_images
 from skysim.experiments.dome_survey import survey_images
 from skysim.scene import loader
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 
 DEAD = 44
 FAR = 20

@@ -15,7 +15,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.dome_survey import (adjust)
 from skysim.experiments.dome_survey import survey_prior
 from skysim.experiments.dome_survey import survey_procedure
-from skysim.experiments.dome_survey.survey_procedure import Errors
+from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
 def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,12 +23,12 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
     found = iter(
         [
             InputError("survey", "too few"),
-            Errors(1e-8, 4e-8, 1.0, 90, 0),
-            Errors(3e-8, 4e-8, 9.0, 92, 1),
+            SimulatedErrors(1e-8, 4e-8, 1.0, 90, 0),
+            SimulatedErrors(3e-8, 4e-8, 9.0, 92, 1),
         ]
     )
 
-    def run_survey(*_: object) -> Errors:
+    def run_survey(*_: object) -> SimulatedErrors:
         one = next(found)
         if isinstance(one, InputError):
             raise one

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from estimator.calibration.home_position import Sighting, calibrate
-from skysim.experiments.papers.afit import (bump)
+from skysim.experiments.papers.afit import test3_attitude
 from skysim.experiments.papers.afit import test3_attitude
 from skysim.experiments.papers.afit import test3
 from skysim.experiments.papers.afit.test3 import (IMU_DEG, build_test3, lab_from_body, measure, photograph)
@@ -120,8 +120,8 @@ def test_an_imu_drifts_by_the_earth_s_rate() -> None:
 
 @pytest.mark.long
 def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
-    calm = bump.simulate_bump(None, 74)
-    knocked = bump.simulate_bump(bump.FITTED_BUMP, 74)
+    calm = test3_attitude.simulate_bump(None, 74)
+    knocked = test3_attitude.simulate_bump(test3_attitude.FITTED_BUMP, 74)
     assert calm.saturated_s == 0
     assert 0.15 < knocked.saturated_s < 0.25  # caught after 0.2 s
     lost = np.abs(knocked.imu_deg[-1] - calm.imu_deg[-1])
@@ -129,7 +129,7 @@ def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
     # No more than the excess of (12.1, 15) deg/s over 10 for as long as it stood at the limit.
     assert lost[1] < 2.1 * knocked.saturated_s
     assert lost[2] < 5.0 * knocked.saturated_s
-    assert bump.filter_errors_after(knocked).max() < 0.01
+    assert test3_attitude.filter_errors_after(knocked).max() < 0.01
 
 
 def test_the_vehicle_stands_where_the_tables_say() -> None:

@@ -16,18 +16,19 @@ from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
 from skysim.core import files
 from skysim.core.files import ROOT
-from skysim.experiments.papers import (papers_report, published)
+from skysim.experiments.papers import (papers_report)
+from skysim.experiments.papers import published
 from skysim.experiments.papers import compare
 from skysim.experiments.papers import compare
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.published import Experiment, Row
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.published import (Experiment, PublishedRow)
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
 from skysim.results import metrics, plots
 from skysim.results.metrics import Summary, exact, proportion
 
 # The law of the verdict.
 
-TEN = Row(quantity="ten", published=10.0, tolerance=0.5)
+TEN = PublishedRow(quantity="ten", published=10.0, tolerance=0.5)
 
 
 def interval(low: float, high: float) -> Summary:
@@ -70,15 +71,15 @@ def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_ther
 @pytest.mark.parametrize(
     ("row", "ours", "agrees"),
     [
-        (Row(quantity="x", at_least=0.9), 0.95, True),
-        (Row(quantity="x", at_least=0.9), 0.85, False),
-        (Row(quantity="x", at_least=0.9, tolerance=0.1), 0.85, True),
-        (Row(quantity="x", at_most=0.5), 0.2, True),
-        (Row(quantity="x", at_most=0.5), 0.6, False),
-        (Row(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
+        (PublishedRow(quantity="x", at_least=0.9), 0.95, True),
+        (PublishedRow(quantity="x", at_least=0.9), 0.85, False),
+        (PublishedRow(quantity="x", at_least=0.9, tolerance=0.1), 0.85, True),
+        (PublishedRow(quantity="x", at_most=0.5), 0.2, True),
+        (PublishedRow(quantity="x", at_most=0.5), 0.6, False),
+        (PublishedRow(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
     ],
 )
-def test_a_bound_is_held_on_its_side(row: Row, ours: float, agrees: bool) -> None:
+def test_a_bound_is_held_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
     assert (compare.verdict(row, RowResult(exact(ours))) == "agrees") == agrees
 
 
@@ -89,7 +90,7 @@ def test_an_interval_wider_than_the_tolerance_is_told() -> None:
 
 
 def test_machines_get_the_keys_that_were_promised() -> None:
-    bound = Row(quantity="share", at_least=0.9, note="of frames")
+    bound = PublishedRow(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
     told = line.as_dict()
     assert list(told) == [
@@ -163,7 +164,7 @@ def test_a_row_says_a_number_or_bounds() -> None:
         {"published": 1},
     ):
         with pytest.raises(ValidationError):
-            Row.model_validate(wrong)
+            PublishedRow.model_validate(wrong)
 
 
 def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
@@ -225,7 +226,7 @@ def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
-        (Drawing("<empty>", lambda fig: None),),
+        (FigureDrawing("<empty>", lambda fig: None),),
     )
     report = papers_report.papers_report([compare.compare("x", one, found, 0.0)], ("x",), True, 3)
     html = report.html()
@@ -276,7 +277,7 @@ def eased(ours: Summary, share: float) -> Summary:
     return ours._replace(low=ours.low - by, high=ours.high + by)
 
 
-def rows() -> list[tuple[str, Row, list[str]]]:
+def rows() -> list[tuple[str, PublishedRow, list[str]]]:
     """Every published row with the page's cells."""
     page_ = parts()
     return [

@@ -12,10 +12,10 @@ from skysim.core.types import Frame
 from skysim.experiments.papers.compare import ExperimentOptions
 from skysim.experiments.papers.compare import bootstrap_of_means
 from skysim.experiments.papers.shefex import shefex_camera
-from skysim.experiments.papers.shefex import shefex_catalog
+from skysim.experiments.papers.shefex import shefex_setup
 from skysim.experiments.papers.shefex import shefex_identification
-from skysim.experiments.papers.shefex import shefex_optics
-from skysim.experiments.papers.shefex.shefex_setup import (Field, pairs, random_fields, shefex_lab)
+from skysim.experiments.papers.shefex import shefex_nights
+from skysim.experiments.papers.shefex.shefex_setup import (StarField, pairs, random_fields, shefex_lab)
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
 from skysim.tracking.exposure_control import ExposureController
@@ -58,7 +58,7 @@ def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
 
 
 def test_three_stars_are_no_success() -> None:
-    field = Field(np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity())
+    field = StarField(np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity())
     told = shefex_identification.identify(field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1))
     assert (told.right, told.wrong) == (0.0, 0.0)
 
@@ -83,20 +83,20 @@ def test_where_a_line_passes_the_limit() -> None:
 def test_smear_is_rate_times_time_and_the_peak_falls_as_a_line_s(rate_deg_s: float) -> None:
     """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
     length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
-    assert shefex_optics.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
+    assert shefex_nights.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
     alone = erf(0.5 / (0.7 * np.sqrt(2)))
     loss_mag = 2.5 * np.log10(alone * length_px)
     # The pixel's own ends are rounded by the blur: a few thousandths.
-    assert shefex_optics.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(loss_mag, abs=0.02)
+    assert shefex_nights.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(loss_mag, abs=0.02)
 
 
 def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
-    assert shefex_optics.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
+    assert shefex_nights.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
 
 
 def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    told = shefex_optics.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    told = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     np.testing.assert_allclose(told, np.degrees(2 * np.arctan(half)), rtol=1e-9)
 
 
@@ -106,7 +106,7 @@ def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:
     even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
     for counts, expected in ((poisson, 1.0), (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8)):
         columns = np.hstack([counts, counts**2.0])
-        assert shefex_catalog.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
+        assert shefex_setup.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
             expected, rel=0.05
         )
 
@@ -148,5 +148,5 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
 
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
     """What the shutter lets in for 50 ms there, it lets in for 35 here."""
-    on_ground = shefex_optics.star_image(shefex_optics.ground_lab(), 0.05).sum()
-    assert on_ground == pytest.approx(shefex_optics.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)
+    on_ground = shefex_nights.star_image(shefex_nights.ground_lab(), 0.05).sum()
+    assert on_ground == pytest.approx(shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)

@@ -11,10 +11,12 @@ from scipy.stats import qmc
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.analysis import table
 from skysim.experiments.study.analysis import table
-from skysim.experiments.study.execution import engines, replay, runner, store
+from skysim.experiments.study.execution import (engines, store)
+from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.report import study_export
 from skysim.results import metrics
@@ -162,7 +164,7 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
 def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
     path = tmp_path / "question.yaml"
     path.write_text(ERRORS)
-    told = loader.load(path)
+    told = study_file.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
         runner.prepare_store(told, rows, resume=False)
         found = table.indices(told, rows)
@@ -174,7 +176,7 @@ def done(folder, text):
     """A study's plan, and its finished store to be opened."""
     path = folder / "question.yaml"
     path.write_text(text)
-    told = loader.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
+    told = study_file.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
     with store.writing(folder / "study.sqlite") as kept:
         runner.prepare_store(told, kept, resume=False)
         runner.run(told, kept, engines.Serial())
@@ -185,7 +187,7 @@ def loaded_with_a_fault(path):
     """A plan with a level that makes no scene, which `load` would refuse before the first trial."""
     good = path.with_name("good.yaml")
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
-    told = loader.load(good)
+    told = study_file.load(good)
     bad = [
         point._replace(
             settings={
@@ -250,16 +252,16 @@ def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
 def test_a_trial_is_replayed_with_its_frames(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
-        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
         assert again.changed == []
         assert again.row.seed == rows.trial(9)["seed"]
         assert [path.name for path in again.files] == ["frame_0000.fits"]
         assert all(path.is_file() for path in again.files + again.pictures)
-        failed = replay.replay(told, rows, 5, tmp_path / "trial_5")
+        failed = runner.replay(told, rows, 5, tmp_path / "trial_5")
         assert "camera.focal_length" in failed.row.error
         assert failed.files == []
         with pytest.raises(InputError, match="trial 16: not in the study; allowed: 0 to 15"):
-            replay.replay(told, rows, 16, tmp_path)
+            runner.replay(told, rows, 16, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +286,7 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 
     monkeypatch.setattr(StarTracker, "solve_centroids", broken)
     with kept as rows:
-        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
     assert "in the tracker" in again.row.error
     assert str(SCENES.parent) not in again.row.error
     assert [path.name for path in again.files] == ["frame_0000.fits"]

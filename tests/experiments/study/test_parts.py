@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
+from skysim.experiments.study import (plan)
+from skysim.experiments.study import study_file
 from skysim.experiments.study.analysis import (worst)
 from skysim.experiments.study.analysis import table
 from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import engines, runner, store, workers
+from skysim.experiments.study.execution import (engines, store, workers)
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.report import study_export
@@ -338,7 +340,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told = loader.load(tmp_path / "strays.yaml")
+    told = study_file.load(tmp_path / "strays.yaml")
     draw = random.Random(2)
     done(told, tmp_path / "whole.sqlite")
     often = tmp_path / "often.sqlite"

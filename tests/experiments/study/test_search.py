@@ -14,18 +14,20 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
+from skysim.experiments.study import (plan)
+from skysim.experiments.study import study_file
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import engines, runner, store
+from skysim.experiments.study.execution import (engines, store)
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
-from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.setups import (code_version, seed_of)
 from skysim.experiments.study.execution.trials import REFUSED, Row, TrialJob
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.report.study_report import front_table
 from skysim.results.files.parts import parts_list
-from skysim.results.files.prices import (find_prices, read_prices)
+from skysim.results.files.parts import (find_prices, read_prices)
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
 from skysim.scene import loader as scene_loader
@@ -106,7 +108,7 @@ def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(told))
-    made = loader.load(path)
+    made = study_file.load(path)
     search.check(made.study)
     return made
 
@@ -545,7 +547,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
-    made = loader.load("dome_for_the_money")
+    made = study_file.load("dome_for_the_money")
     search.check(made.study)
     first = {name: factor.value_at(0.5) for name, factor in made.study.factors.items()}
     settings: Settings = {}

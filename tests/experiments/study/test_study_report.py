@@ -15,7 +15,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import factors as designs
-from skysim.experiments.study.analysis import (axes)
+from skysim.experiments.study.analysis import table as axes
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.analysis.table import Index
 from skysim.experiments.study.analysis.table import (PointRow, cells, has_few_values, table)

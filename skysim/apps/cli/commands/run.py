@@ -132,10 +132,10 @@ def compare(
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
     from skysim.experiments import tracker_comparison
-    from skysim.results.recorder import Recorder
+    from skysim.results.run import Recorder
     from skysim.simulation.flight import Flight
     from skysim.simulation.lab import build_lab
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts
 
     loaded = load(scene, frames, seed, set_, tracker)
     programs = used_programs(program, [*tracker, *scene_names(loaded)])

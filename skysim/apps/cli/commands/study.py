@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import (Json, OpenReport, Out, Overrides, Programs, complete_study, output_folder, study_names, used_programs)
-from skysim.apps.cli.summaries import (print_replay, print_study_status, print_worst, study_status)
-from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
+from skysim.apps.cli.terminal import (print_replay, print_study_status, print_worst, study_status)
+from skysim.apps.cli.terminal import (print_error, print_json, print_titles, trial_progress)
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
@@ -69,11 +69,11 @@ def run(
     """Run a study, or a search if called as `optimize`, that has no store yet."""
     start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
-    from skysim.tracking import process
+    from skysim.experiments.study import study_file
+    from skysim.tracking import tracker_interface
 
     overrides = parse_overrides(set_)
-    plan = loader.load(study, overrides, process.program_commands(program))
+    plan = study_file.load(study, overrides, tracker_interface.program_commands(program))
     used_programs(program, study_names(plan) if program else ())
     search = context.info_name == "optimize"
     if search and plan.study.optimize is None:
@@ -173,7 +173,7 @@ def replay(
     json: Json = False,
 ) -> None:
     """Repeat one trial and write its frames."""
-    from skysim.experiments.study.execution import replay as execution
+    from skysim.experiments.study.execution import runner as execution
 
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
@@ -276,7 +276,8 @@ def run_and_report(
     repeat_failed : repeat the failed trials too
     """
     from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.execution import runner, store
+    from skysim.experiments.study.execution import (store)
+    from skysim.experiments.study.execution import runner
 
     path = folder_of(study, out) / store.STORE
     total = plan.study.trial_count(len(plan.points))
@@ -372,14 +373,14 @@ def load_stored_plan(
     Raises InputError if the store holds another study, or this one before it was changed.
     """
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
+    from skysim.experiments.study import study_file
     from skysim.experiments.study.execution import runner
-    from skysim.tracking import process
+    from skysim.tracking import tracker_interface
 
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)
-        plan = loader.load(
-            study, overrides, None if program is None else process.program_commands(program)
+        plan = study_file.load(
+            study, overrides, None if program is None else tracker_interface.program_commands(program)
         )
         kept = runner.stored_replicates(plan, stored)
         path = stored.path

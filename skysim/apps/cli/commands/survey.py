@@ -11,11 +11,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 import typer
-from skysim.apps.cli import summaries
+from skysim.apps.cli import terminal
 from skysim.apps.cli.options import (Json, Out, Overrides, SceneArg, Seed, load, output_folder)
-from skysim.apps.cli.terminal import print_error, print_json, progress, progress_callback
+from skysim.apps.cli.terminal import (print_error, print_json, progress, progress_callback)
 from skysim.core.errors import InputError
-from skysim.results.report.as_text import print_blocks, print_wrapped
+from skysim.results.report import (print_blocks, print_wrapped)
 
 if TYPE_CHECKING:
     from estimator.core.camera import Camera
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from skysim.experiments.dome_survey.survey_images import SurveyImage
     from skysim.experiments.dome_survey.survey_frames import SurveyFrame
     from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty)
-    from skysim.experiments.dome_survey.survey_procedure import Plan
+    from skysim.experiments.dome_survey.survey_procedure import HeldAttitudes
     from skysim.experiments.dome_survey.survey_findings import Coverage
-    from skysim.experiments.dome_survey.survey_run import SurveyRun
+    from skysim.experiments.dome_survey.survey_findings import SurveyRun
     from skysim.scene.scene import Scene
     from skysim.simulation.lab import Lab
 
@@ -184,8 +184,8 @@ def survey(
         statistics = simulated(request, checks or CHECKS, frames_to)
     if json:
         print_json(statistics)
-    elif mode in summaries.PRINTERS:
-        summaries.PRINTERS[mode](statistics)
+    elif mode in terminal.PRINTERS:
+        terminal.PRINTERS[mode](statistics)
 
 
 # What each mode of the command does not use.
@@ -227,7 +227,7 @@ def survey_mode(
     return mode
 
 
-def planned(request: Request) -> tuple[Lab, CalibrationPrior, Plan]:
+def planned(request: Request) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
     """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     from skysim.experiments.dome_survey import survey_procedure
 
@@ -264,7 +264,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     lab, _, plan = planned(request)
     surveys = survey_procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
     results = list(progress(surveys, repeat, "surveys"))
-    errors = [one for one in results if isinstance(one, survey_procedure.Errors)]
+    errors = [one for one in results if isinstance(one, survey_procedure.SimulatedErrors)]
     failures = [one for one in results if isinstance(one, InputError)]
     if not errors:
         raise failures[0]

@@ -19,11 +19,9 @@ from typing import Annotated, NamedTuple
 import typer
 from skysim.apps.cli.options import with_location
 from skysim.apps.cli.options import (Json, Overrides, Programs, SceneArg, load, scene_names, study_names, used_programs)
-from skysim.apps.cli.terminal import print_check, print_error, print_json
+from skysim.apps.cli.terminal import (print_check, print_error, print_json)
 from skysim.core.errors import InputError
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS
-
-
 
 
 
@@ -104,7 +102,7 @@ def relaxed(node: Any, name: str = "") -> Any:
 KINDS = ("scene", "study")
 
 
-class Verdict(NamedTuple):
+class FileVerdict(NamedTuple):
     """Result for one file: a description and warnings, or `fault`, the error in one line."""
 
     file: str
@@ -139,9 +137,9 @@ def validate(
         raise InputError("", "no files", "files, or --schema scene")
     programs = {}
     if program:
-        from skysim.tracking import process
+        from skysim.tracking import tracker_interface
 
-        programs = process.program_commands(program)
+        programs = tracker_interface.program_commands(program)
     verdicts = [check_file(path, programs) for path in files]
     if program and not any(verdict.fault for verdict in verdicts):
         used_programs(program, {name for path in files for name in names_in_file(path)})
@@ -165,7 +163,7 @@ def check(
     """
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.lab import build_lab
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts
 
     loaded = load(scene, None, None, set_)
     result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
@@ -176,12 +174,12 @@ def check(
         print_check(result.facts, findings)
 
 
-def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> Verdict:
+def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> FileVerdict:
     """Check one file; errors become the verdict's `fault`. programs : of trackers and controllers, by name"""
     try:
-        return Verdict(str(path), *describe_file(path, programs))
+        return FileVerdict(str(path), *describe_file(path, programs))
     except (InputError, OSError) as error:
-        return Verdict(str(path), fault=str(error))
+        return FileVerdict(str(path), fault=str(error))
 
 
 def describe_file(
@@ -209,9 +207,9 @@ def describe_file(
         return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
     keys = read_yaml(path)[0].keys()
     if keys & {"factors", "trial", "responses"}:
-        from skysim.experiments.study import loader
+        from skysim.experiments.study import study_file
 
-        plan = loader.load(path)
+        plan = study_file.load(path)
         return f"a study of {plan.trials} trials" if plan.trials else "a search", ()
     if "camera" in keys and keys <= {"camera", "schema"}:
         from skysim.scene.loader import load_camera
@@ -223,12 +221,12 @@ def describe_file(
 
 def names_in_file(path: Path) -> set[str | None]:
     """The names of trackers and controllers in a scene or a study; empty for other files."""
-    from skysim.experiments.study import loader as studies
+    from skysim.experiments.study import study_file as studies
     from skysim.scene import loader
 
     path = path if path.suffix else find_shipped(path)
     with contextlib.suppress(InputError):
-        return set(scene_names(loader.load(path)))
+        return set(scene_names(study_file.load(path)))
     with contextlib.suppress(InputError):
         return study_names(studies.load(path))
     return set()
@@ -249,10 +247,10 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.lab import build_lab, build_tracker
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import (build_lab, build_tracker)
+    from skysim.simulation.lab import UserParts
 
-    scene = loader.load(path)
+    scene = study_file.load(path)
     try:
         lab = build_lab(scene, UserParts(programs))
         build_tracker(lab.camera, programs)

@@ -12,7 +12,7 @@ from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import geometry
 
 Action = Callable[[], Awaitable[None] | None]
@@ -123,7 +123,7 @@ class Actions:
     def __init__(
         self,
         page: PageContext,
-        sensor: Sensor,
+        sensor: SensorView,
         step: Callable[[int], Awaitable[None]],
         performers: Mapping[str, Action],
         others: Sequence[Command],

@@ -9,7 +9,7 @@ from skysim.apps.gui.views import forms
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import (Contents, LiveText)
-from skysim.apps.gui.views.state import View
+from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.core.files import SCENES
 
@@ -80,7 +80,7 @@ class Head:
         self.title.set_text(info.title)
         self.noise.set_value(info.noise)
 
-    def set_state(self, state: View) -> None:
+    def set_state(self, state: PageView) -> None:
         """Say in the banner what the page shows."""
         self.banner.set_text(state.banner, state.kind)
         self.live_button.set_visibility(state.kind != "live")

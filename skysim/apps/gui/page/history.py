@@ -13,7 +13,7 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.views.context import Shown
-from skysim.apps.gui.views.state import View
+from skysim.apps.gui.views.state import PageView
 
 SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
@@ -67,7 +67,7 @@ class History:
         self.home = home
         self.show_query = show_query
         self.is_settling = is_settling
-        self.written: View | None = None
+        self.written: PageView | None = None
         self.showing = False
         self.moving = False
         self.unchanged = 0

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 from nicegui import ui
-from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.messages import (FrameView, SceneInfo)
 from skysim.apps.gui.views.context import Shown
 from skysim.apps.gui.views.live import csv_table
 

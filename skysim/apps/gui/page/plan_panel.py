@@ -12,7 +12,7 @@ import numpy as np
 from nicegui import run, ui
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import (AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan)
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import forms
 from skysim.apps.gui.views.context import PageContext

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 from nicegui import ui
-from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
+from skysim.apps.gui.messages import (FlightStep, FlightRow, MotionLog)
 from skysim.apps.gui.page.strips import (StripChart, rms_line, strips)
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.forms import (FEEDBACKS, loop_overrides)
 from skysim.apps.gui.views.live import (Contents, LiveInput, LiveText)
 from skysim.apps.gui.views.live import csv_table
-from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.sensor import SensorView
 
 
 
@@ -43,12 +43,12 @@ class RunPanel:
         closed again
     """
 
-    def __init__(self, page: PageContext, contents: Contents, sensor: Sensor) -> None:
+    def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
         self.page = page
         self.contents = contents
         self.sensor = sensor
         self.feedback: str | None = None
-        self.rows: list[FrameRow] = []
+        self.rows: list[FlightRow] = []
         self.log = MotionLog(())
         self.times_s: list[float] = []
         self.residuals: list[tuple[float, int, float]] = []
@@ -364,7 +364,7 @@ class RunPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(FrameRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv"
+            csv_table(FlightRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv"
         )
 
 

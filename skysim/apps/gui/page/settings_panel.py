@@ -53,7 +53,7 @@ class KeyForm:
     """
 
     def __init__(
-        self, page: PageContext, label: Callable[[forms.Field], str], opens: str = ""
+        self, page: PageContext, label: Callable[[forms.FormField], str], opens: str = ""
     ) -> None:
         self.page = page
         self.label = label
@@ -63,11 +63,11 @@ class KeyForm:
         self.expansions: dict[str, ui.expansion] = {}
         self.inputs: dict[str, ui.input | ui.select] = {}
         self.scene = ""
-        self.fields: dict[str, forms.Field] = {}
+        self.fields: dict[str, forms.FormField] = {}
         self.last_typed: dict[str, str] = {}
         self.labels: dict[str, ui.label] = {}
 
-    def show(self, groups: Mapping[str, Sequence[forms.Field]]) -> None:
+    def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         """Show the fields of the current scene. Open groups stay open, and text being typed is kept."""
         by_key = {field.key: field for fields in groups.values() for field in fields}
         same = [(key, field.allowed_values) for key, field in by_key.items()] == [
@@ -82,7 +82,7 @@ class KeyForm:
         self.scene = scene
         self.fields = by_key
 
-    def build(self, groups: Mapping[str, Sequence[forms.Field]]) -> None:
+    def build(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         open_now = open_now if self.expansions else {self.opens}
         self.parts.clear()
@@ -96,7 +96,7 @@ class KeyForm:
                     for field in fields:
                         self.row(field)
 
-    def row(self, field: forms.Field) -> None:
+    def row(self, field: forms.FormField) -> None:
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = (
                 ui.label(self.label(field))
@@ -125,14 +125,14 @@ class KeyForm:
         self.inputs[field.key] = entry
         self.labels[field.key] = head
 
-    def style_class(self, field: forms.Field) -> str:
+    def style_class(self, field: forms.FormField) -> str:
         """Style class of a key: changed by the user, set in a file, or default."""
         changed = any(
             field.key == key or field.key.startswith(f"{key}.") for key in self.page.state.overrides
         )
         return "warn" if changed else "given" if field.is_set else "quiet"
 
-    def update_field(self, field: forms.Field, before: forms.Field) -> None:
+    def update_field(self, field: forms.FormField, before: forms.FormField) -> None:
         """Update a field after the scene has changed; text typed since then is kept."""
         self.labels[field.key].classes(remove="warn given quiet", add=self.style_class(field))
         if field.shown != before.shown and (
@@ -207,7 +207,7 @@ class ScenePanel:
         self.no_match.set_visibility(False)
         self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
 
-    def set_scene(self, fields: Sequence[forms.Field]) -> None:
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
         """Show the fields of the current scene."""
         sections = dict.fromkeys(field.section for field in fields)
         self.form.show(
@@ -294,7 +294,7 @@ class TrackerPanel:
             )
         study.noise.on_value_change(self.show_noise)
 
-    def set_scene(self, fields: Sequence[forms.Field]) -> None:
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
         """Show the fields of the current scene."""
         offered = {field.key: field for field in fields if not field.no_effect}
         self.form.show(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 from nicegui import ui
-from skysim.apps.gui.messages import FrameRow, MotionLog
+from skysim.apps.gui.messages import (FlightRow, MotionLog)
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import (CURVE_COLORS, TOOLTIP, chart_color)
 
@@ -55,7 +55,7 @@ window.skysimMoment = (t_s) => {{
 
 
 @dataclass(frozen=True)
-class Curve:
+class StripCurve:
     """One curve of a strip. kind : line, dots (a value per frame), or band (an area of 3 standard errors)."""
 
     name: str
@@ -71,12 +71,12 @@ class Strip:
     """
 
     title: str
-    curves: tuple[Curve, ...] = ()
+    curves: tuple[StripCurve, ...] = ()
     logarithmic: bool = False
     dots: Points = field(default_factory=list)
 
     @property
-    def drawn(self) -> tuple[Curve, ...]:
+    def drawn(self) -> tuple[StripCurve, ...]:
         return tuple(curve for curve in self.curves if curve.points)
 
 
@@ -85,17 +85,17 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 
 def strips(
-    rows: Sequence[FrameRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
+    rows: Sequence[FlightRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
 ) -> list[Strip]:
     """The strips of a flight that have something to show. residuals : see `FlightStep`"""
 
-    def of_frames(value: Callable[[FrameRow], float]) -> Points:
+    def of_frames(value: Callable[[FlightRow], float]) -> Points:
         pairs = ((row.t_s, value(row)) for row in rows)
         return [[round(t, 4), float(f"{y:.5g}")] for t, y in pairs if not math.isnan(y)]
 
-    def of_motion(name: str) -> Curve:
+    def of_motion(name: str) -> StripCurve:
         values = log.curves.get(name, ())
-        return Curve(
+        return StripCurve(
             name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)]
         )
 
@@ -103,32 +103,32 @@ def strips(
         Strip(
             "cross-boresight error, ″",
             (
-                Curve("tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"),
-                Curve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
+                StripCurve("tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"),
+                StripCurve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
             ),
             logarithmic=True,
         ),
         Strip(
             "roll error, ″",
             (
-                Curve("tracker", of_frames(lambda row: row.roll_arcsec), "dots"),
-                Curve("−3σ", of_frames(lambda row: -3 * row.roll_sigma_arcsec), "band"),
-                Curve("+3σ", of_frames(lambda row: 3 * row.roll_sigma_arcsec), "band"),
+                StripCurve("tracker", of_frames(lambda row: row.roll_arcsec), "dots"),
+                StripCurve("−3σ", of_frames(lambda row: -3 * row.roll_sigma_arcsec), "band"),
+                StripCurve("+3σ", of_frames(lambda row: 3 * row.roll_sigma_arcsec), "band"),
             ),
         ),
         Strip(
             "attitude error, ″",
             (
                 *map(of_motion, ("pointing", "IMU alone", "filter")),
-                Curve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
+                StripCurve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
             ),
             logarithmic=True,
         ),
         Strip(
             "lights",
             (
-                Curve("in the field", of_frames(lambda row: row.lights)),
-                Curve("identified", of_frames(lambda row: row.identified)),
+                StripCurve("in the field", of_frames(lambda row: row.lights)),
+                StripCurve("identified", of_frames(lambda row: row.identified)),
             ),
         ),
         Strip("residual of each light, px", dots=thinned(residuals)),
@@ -275,7 +275,7 @@ def decades(values: list[float]) -> dict[str, float]:
     return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
 
 
-def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
+def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
     """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
     color = CURVE_COLORS[k % len(CURVE_COLORS)]
     look: dict[str, Any] = {
@@ -304,7 +304,7 @@ def in_strip(n: int) -> dict[str, int]:
     return {"xAxisIndex": n, "yAxisIndex": n}
 
 
-def rms_line(rows: Sequence[FrameRow]) -> str:
+def rms_line(rows: Sequence[FlightRow]) -> str:
     """Root mean squares over the flight's solved frames, and how many were solved."""
     solved = [row for row in rows if not math.isnan(row.cross_arcsec)]
     if not solved:

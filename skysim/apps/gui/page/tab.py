@@ -13,16 +13,16 @@ from typing import Any
 
 from nicegui import run, ui
 
-from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.messages import (FrameView, SceneInfo, Triple)
 from skysim.apps.gui.page.actions import Action, Actions, Command
 from skysim.apps.gui.page.head import Arrangement
 from skysim.apps.gui.page.head import Head
 from skysim.apps.gui.page.history import History
 from skysim.apps.gui.page.log_panel import LogPanel
-from skysim.apps.gui.page import lights_table
+from skysim.apps.gui.page import readouts
 from skysim.apps.gui.page import monte_carlo_panel
-from skysim.apps.gui.page.attitude_card import AttitudeCard
-from skysim.apps.gui.page.lights_table import LightsPanel
+from skysim.apps.gui.page.readouts import AttitudeCard
+from skysim.apps.gui.page.readouts import LightsPanel
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
 from skysim.apps.gui.page.photo_panel import PhotoPanel
 from skysim.apps.gui.page.plan_panel import PlanPanel
@@ -32,10 +32,10 @@ from skysim.apps.gui.views import forms
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views import style
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.state import View
+from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.views.live import for_page
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.views.served import FRAMES
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.views.overlay import FRAMES
 from skysim.apps.gui.views.space import Scene3D
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
@@ -70,7 +70,7 @@ class Tab:
         self.folder = folder
         self.out = out
         self.cameras = cameras
-        self.state = View(scene)
+        self.state = PageView(scene)
         self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
         self.is_open = True
@@ -122,7 +122,7 @@ class Tab:
         )
         with ui.element("div").classes("lab"):
             self.head = Head(self, self.contents, self.folder)
-            self.sensor = Sensor(self.id, self.contents)
+            self.sensor = SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
@@ -142,7 +142,7 @@ class Tab:
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
         # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
-        ui.timer(lights_table.UPDATE_S, self.update_lights)
+        ui.timer(readouts.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
     async def build_panels(self) -> None:
@@ -256,7 +256,7 @@ class Tab:
     async def show_query(self, query: str) -> None:
         """Show the view of an address; refuse one that is not of this server."""
         try:
-            wanted = View.from_query(query, self.head.scenes())
+            wanted = PageView.from_query(query, self.head.scenes())
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
         except InputError as error:
@@ -265,7 +265,7 @@ class Tab:
         if wanted:
             await self.restore(wanted)
 
-    async def restore(self, wanted: View) -> None:
+    async def restore(self, wanted: PageView) -> None:
         """Show a view again: open its scene if it is another, point there, then fly or replay."""
         now = self.state
         is_shown = self.view is not None and (now.scene, now.overrides) == (

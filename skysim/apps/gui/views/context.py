@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol
-from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.views.state import View
+from skysim.apps.gui.messages import (FrameView, SceneInfo, Triple)
+from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
 
 
@@ -20,7 +20,7 @@ class Shown(Protocol):
     """
 
     @property
-    def state(self) -> View: ...
+    def state(self) -> PageView: ...
     @property
     def scene_info(self) -> SceneInfo | None: ...
     @property

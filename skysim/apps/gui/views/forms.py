@@ -85,7 +85,7 @@ FIRST_VALUES: dict[str, Any] = {
 ONE_KIND = ("light",)
 
 
-class Field(NamedTuple):
+class FormField(NamedTuple):
     """One key of a scene.
 
     key   : dotted;  text: its value as YAML, from the file, or else the default
@@ -114,7 +114,7 @@ class Field(NamedTuple):
         return self.meaning if self.meaning and self.text == "null" else self.text
 
 
-def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
+def fields(name: str, overrides: Mapping[str, str]) -> list[FormField]:
     """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
     scene = load(name, overrides)
     tree = with_overrides(read(find(name))[0], overrides)
@@ -138,7 +138,7 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
 
 def section_fields(
     model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()
-) -> Iterator[Field]:
+) -> Iterator[FormField]:
     """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
 
     kinds : that the section could have instead of its own
@@ -154,13 +154,13 @@ def section_fields(
         if isinstance(value, BaseModel) and (subtree is None or isinstance(subtree, dict)):
             yield from section_fields(value, subtree, f"{key}.", others)
         elif value is None and len(others) == len(models(annotation)) + 1:
-            yield Field(f"{key}.kind", "null", "", others, is_set, NO_SECTION)
+            yield FormField(f"{key}.kind", "null", "", others, is_set, NO_SECTION)
         elif file_key == "kind" and kinds:
-            yield Field(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
+            yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
             subtree = short_path(subtree)
             text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            yield Field(key, text, display_unit(file_key), allowed_values(annotation), is_set)
+            yield FormField(key, text, display_unit(file_key), allowed_values(annotation), is_set)
 
 
 def short_path(value: Any) -> Any:

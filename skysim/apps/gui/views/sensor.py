@@ -11,33 +11,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
-
 import cv2
 import numpy as np
 from nicegui import ui
-
-from skysim.apps.gui.messages import (
-    LIMITS,
-    NO_LIGHTS,
-    Detection,
-    FrameView,
-    Lens,
-    Light,
-    Lights,
-    Pixels,
-    Pose,
-    SceneInfo,
-    TrackerResult,
-)
+from skysim.apps.gui.messages import (LIMITS, NO_LIGHTS, Detection, FrameView, Lens, LightRow, LightColumns, Pixels, Pose, SceneInfo, TrackerResult)
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.live import (Contents, LiveText)
 from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
+from skysim.apps.gui.views.overlay import (FRAMES, ServedFrame, Source, TabFrames, display_of)
 from skysim.apps.gui.views.overlay import NAMES
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import annotate
 from skysim.sources.bodies import NAMES as BODIES
+
+
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
@@ -58,7 +46,7 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
     """The frame with its loupe and plot, implemented in frame.js."""
 
 
-class Sensor:
+class SensorView:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
     id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
@@ -72,7 +60,7 @@ class Sensor:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
-        self.lights: Lights = NO_LIGHTS
+        self.lights: LightColumns = NO_LIGHTS
         self.result: TrackerResult | None = None
         self.size_px = (4, 3)
         self.prefix = "HIP"
@@ -243,7 +231,7 @@ class Sensor:
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
         self.update_text()
 
-    def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
@@ -258,7 +246,7 @@ class Sensor:
             light
         ]
 
-    def light_text(self, detection: Detection | None, light: Light | None) -> str:
+    def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
         lines = []
         if light:
@@ -320,3 +308,5 @@ def statistics_text(
     detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     rows += [(*lights, *detected, "", "", "", "")[:4]]
     return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)
+
+

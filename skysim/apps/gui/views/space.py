@@ -15,11 +15,11 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
+from skysim.apps.gui.messages import (FrameView, LabGeometry, SceneInfo, Triple)
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.style import (DARK, color_scale)
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.worker.push import Grip
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 
@@ -46,7 +46,7 @@ class Scene3D:
     newest_view : that is not sent yet;  waits : whether `send_newest` will be called
     """
 
-    def __init__(self, page: PageContext, sensor: Sensor) -> None:
+    def __init__(self, page: PageContext, sensor: SensorView) -> None:
         self.page = page
         self.sensor = sensor
         self.newest_view: FrameView | None = None
@@ -120,7 +120,7 @@ class PushControl:
     """
 
     def __init__(
-        self, page: PageContext, sensor: Sensor, canvas: ui.element, moved: Callable[[], None]
+        self, page: PageContext, sensor: SensorView, canvas: ui.element, moved: Callable[[], None]
     ) -> None:
         self.page = page
         self.sensor = sensor

@@ -20,7 +20,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PageView:
     """What a page shows.
 
     scene, overrides : the scene and the keys that differ from its file
@@ -60,7 +60,7 @@ class View:
         return "?" + urlencode(pairs + [pair for pair in optional if pair[1]])
 
     @classmethod
-    def from_query(cls, query: str, scenes: Collection[str]) -> View | None:
+    def from_query(cls, query: str, scenes: Collection[str]) -> PageView | None:
         """The view that an address names; None if it names none.
 
         scenes : those that the page offers. An address from elsewhere opens no other file. Raises InputError.
@@ -89,7 +89,7 @@ class View:
         photo = one.get("photo", "")
         return cls(one["scene"], overrides, kind, angles, t_s, study, trial, photo)  # type: ignore[arg-type]
 
-    def same_step(self, other: View) -> bool:
+    def same_step(self, other: PageView) -> bool:
         """Whether only attitude or time differ, which change continuously."""
         return self.coarse == other.coarse
 

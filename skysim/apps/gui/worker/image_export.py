@@ -22,7 +22,7 @@ from skysim.core.yaml_reader import (VERSION, set_key)
 from skysim.core.files import SCENES
 from skysim.results import scoring
 from skysim.results.annotate import annotate
-from skysim.results.files import frame_folder
+from skysim.results.files import recording
 from skysim.scene.loader import find
 
 
@@ -43,7 +43,7 @@ def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> d
     if workbench.frame is None or workbench.truth is None:
         raise InputError("", "no frame has been rendered yet")
     with tempfile.TemporaryDirectory() as folder:
-        frame_folder.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
+        recording.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
         contents = {
             f"frame{path.suffix}": path.read_bytes() for path in sorted(Path(folder).iterdir())
         }

@@ -15,22 +15,14 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import (
-    NO_LIGHTS,
-    NO_PIXELS,
-    Lens,
-    Lights,
-    Pixels,
-    Pose,
-    TrackerResult,
-    Triple,
-)
+from skysim.apps.gui.messages import (NO_LIGHTS, NO_PIXELS, Lens, LightColumns, Pixels, Pose, TrackerResult, Triple)
 from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker.workbench import (detection_views, id_prefix, magnitude_by_id, matches_by_row, tracker_result, true_lights)
 from skysim.core.errors import InputError
 from skysim.core import images
-from skysim.experiments.study import loader
-from skysim.experiments.study.execution import replay, store
+from skysim.experiments.study import study_file
+from skysim.experiments.study.execution import (store)
+from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
@@ -58,7 +50,7 @@ class Photo:
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
-    lights: Lights = NO_LIGHTS
+    lights: LightColumns = NO_LIGHTS
     prefix: str = "HIP"
     hint: str = ""
 
@@ -95,12 +87,12 @@ def photo_from_file(
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
-    plan = loader.load(study)
+    plan = study_file.load(study)
     with store.open_store(folder / STORE) as stored:
-        segment = replay.segment_of(plan, stored, trial)
+        segment = runner.segment_of(plan, stored, trial)
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
-    frame, truth, report = next(replay.replayed_frames(setup, row.seed))
+    frame, truth, report = next(runner.replayed_frames(setup, row.seed))
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)

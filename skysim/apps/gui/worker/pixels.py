@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
-
 import numba
 import numpy as np
 from astropy.visualization import ZScaleInterval
 from numba import float32, int32, uint32, uint64
 from numpy.typing import NDArray
-
-from skysim.apps.gui.messages import Display, Pixels
+from skysim.apps.gui.messages import (Display, Pixels)
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
 from skysim.results import annotate
+
+
 
 LEVELS = 2**16 - 1
 HEADER_BYTES = 16
@@ -33,7 +33,7 @@ ZSCALE_SAMPLES = 1000  # pixels, as in IRAF
 LOUPE_PX = 11  # most rows and columns in the loupe
 
 
-class Levels(NamedTuple):
+class PixelLevels(NamedTuple):
     """An image as unsigned integers n: pixel = offset + step n.
 
     integers : (H, W), of 8 or 16 bits
@@ -48,31 +48,31 @@ class Levels(NamedTuple):
         return header(self) + self.integers.tobytes()
 
 
-def levels_of(image: NDArray) -> Levels:
+def levels_of(image: NDArray) -> PixelLevels:
     """The levels of an image: exact for integers of 8 and 16 bits; other numbers are rounded to 65,535 steps between
     the least and the greatest value."""
     if image.dtype in (np.uint8, np.uint16):
-        return Levels(image)
+        return PixelLevels(image)
     low = float(image.min())
     high = float(image.max())
     step = (high - low) / LEVELS or 1.0
-    return Levels(np.rint((image - low) / step).astype(np.uint16), low, step)
+    return PixelLevels(np.rint((image - low) / step).astype(np.uint16), low, step)
 
 
-def header(levels: Levels) -> bytes:
+def header(levels: PixelLevels) -> bytes:
     return np.array([levels.offset, levels.step]).tobytes()
 
 
-def levels_from(data: bytes, size_px: tuple[int, int]) -> Levels:
+def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
     """The levels that `Levels.data` has encoded. size_px : width and height"""
     offset, step = np.frombuffer(data, float, 2).tolist()
     kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16
-    return Levels(
+    return PixelLevels(
         np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step
     )
 
 
-def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: int = 0) -> Pixels:
+def pixels_for(display: Display, levels: PixelLevels, saturation_dn: float, number: int = 0) -> Pixels:
     """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
     columns than the image.
 
@@ -191,7 +191,7 @@ def _mark(integers: Any, saturation: Any, shaded: Any) -> None:
                 shaded[top : bottom + 1, left : right + 1] = SATURATED
 
 
-def limits_of(levels: Levels, limits: str | tuple[float, float]) -> tuple[float, float]:
+def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[float, float]:
     """Black and white level by name, or from values in DN."""
     integers = levels.integers
     if not isinstance(limits, str):
@@ -221,3 +221,5 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
     return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts.tolist()}
+
+

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from estimator.core.types import Centroids
-from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import (FrameView, SurveyFound, SurveyPlan)
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -24,7 +24,7 @@ from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.experiments.dome_survey import survey_findings
 from skysim.experiments.dome_survey import survey_report
 from skysim.experiments.dome_survey.survey_findings import Coverage
-from skysim.experiments.dome_survey.survey_run import SurveyRun
+from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation.flight import Flight

@@ -10,26 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import (
-    ALL_PIXELS,
-    AmbiguityMap,
-    Display,
-    FlightStep,
-    FrameView,
-    Pixels,
-    PlanCheck,
-    PushedView,
-    SceneInfo,
-    SurveyFound,
-    SurveyPlan,
-    Triple,
-)
-from skysim.apps.gui.worker import (photo, pixels, playback)
+from skysim.apps.gui.messages import (ALL_PIXELS, AmbiguityMap, Display, FlightStep, FrameView, Pixels, PlanCheck, PushedView, SceneInfo, SurveyFound, SurveyPlan, Triple)
+from skysim.apps.gui.worker import (photo, playback)
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker import workbench as planning
 from skysim.apps.gui.worker import geometry
 from skysim.apps.gui.worker import survey_flight
-from skysim.apps.gui.worker.push import (Grip, Push)
+from skysim.apps.gui.worker.geometry import (Grip, Push)
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core import images
@@ -50,7 +38,7 @@ class Worker:
 
     current: Workbench | None = None
     display: Display | None = None
-    shown: dict[int, tuple[pixels.Levels, float]] = field(default_factory=dict)
+    shown: dict[int, tuple[pixels.PixelLevels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Playback | None = None
     pushed: Push | None = None
@@ -68,7 +56,7 @@ class Worker:
             raise InputError("", "no scene is set up")
         return self.current
 
-    def show_frame(self, view: FrameView, levels: pixels.Levels) -> FrameView:
+    def show_frame(self, view: FrameView, levels: pixels.PixelLevels) -> FrameView:
         """Return the view with its pixels, and forget the other image, because the page now shows the scene."""
         self.other = self.image = None
         return replace(view, pixels=self.show(levels, view.saturation_dn))
@@ -80,7 +68,7 @@ class Worker:
             self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn)
         )
 
-    def show(self, levels: pixels.Levels, saturation_dn: float) -> Pixels:
+    def show(self, levels: pixels.PixelLevels, saturation_dn: float) -> Pixels:
         """Keep an image for the page, and return its pixels for the browser's display."""
         self.number += 1
         self.shown[self.number] = levels, saturation_dn
@@ -95,7 +83,7 @@ class Worker:
         return self.surveyed
 
     @property
-    def levels(self) -> pixels.Levels:
+    def levels(self) -> pixels.PixelLevels:
         """The newest frame of the workbench. Raises InputError if there is none."""
         if self.workbench.frame is None:
             raise InputError("", "no frame has been rendered")

@@ -13,15 +13,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import (
-    Detection,
-    FrameView,
-    LabGeometry,
-    Lens,
-    Lights,
-    SceneInfo,
-    TrackerResult,
-)
+from skysim.apps.gui.messages import (Detection, FrameView, LabGeometry, Lens, LightColumns, SceneInfo, TrackerResult)
 from skysim.apps.gui.worker import geometry
 from skysim.apps.gui.worker import geometry as lens
 from skysim.core import quaternion
@@ -34,11 +26,11 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
 from skysim.simulation.compilation import warm_up
-from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
+from skysim.simulation.lab import (Lab, StarCamera, build_lab, build_tracker)
 from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory
 from skysim.tracking import factory as tracker_settings
-from skysim.apps.gui.messages import AmbiguityMap, PlanCheck
+from skysim.apps.gui.messages import (AmbiguityMap, PlanCheck)
 from skysim.experiments.dome_survey import survey_prior
 from skysim.simulation import checks
 from skysim.simulation.lab import Lab
@@ -181,7 +173,7 @@ def id_prefix(lab: Lab) -> str:
     return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
-def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
     """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
     sources = truth.sources
     of_bodies = {body.id: body.v_mag for body in truth.bodies}
@@ -189,7 +181,7 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    return Lights(
+    return LightColumns(
         ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float)
     )
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from skysim.core.constants import INCH_M
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -82,7 +82,7 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
     chords = [chord_in(dome, STATED_HEIGHT_IN, angle) for angle in ANGLES_DEG]
     results["sphere"] = RowResult(exact(np.ptp(chords)))
     caption = "Table 1: width of the image on a flat surface."
-    return ExperimentResult(results, (Drawing(caption, lambda fig: draw(fig, panel)),))
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, panel)),))
 
 
 def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:

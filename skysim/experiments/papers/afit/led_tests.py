@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.configs import with_config
-from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
+from skysim.experiments.tracker_comparison import with_config
+from skysim.experiments.papers.afit.test2 import (INTENSITY_CD, NOISE_E, ON_FRACTION)
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
     WHITE,
@@ -25,7 +25,7 @@ from skysim.experiments.papers.afit.test_stand import (
     measure_lights,
     render_at_attitude,
 )
-from skysim.experiments.papers.compare import (Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
 from skysim.experiments.papers.compare import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
@@ -191,17 +191,17 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
         take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)
     ]
     drawings = (
-        Drawing(
+        FigureDrawing(
             "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
             lambda fig: draw_apertures(fig, aperture_images),
             (7.4, 2.8),
         ),
-        Drawing(
+        FigureDrawing(
             "Figs 37 and 40: pixels above four thresholds, with the camera's own noise (top) and with that of Test 2.",
             lambda fig: draw_thresholds(fig, noise_images),
             (7.4, 4.0),
         ),
-        Drawing(
+        FigureDrawing(
             "Pulses of five LEDs against their measured magnitude, beside Table 7's.",
             lambda fig: draw_pulses(fig, magnitude),
         ),

@@ -24,7 +24,7 @@ from skysim.experiments.papers.published import experiments
 from skysim.scene import loader
 from skysim.scene.sections.motion import AttitudeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking import onboard_model
 from skysim.tracking import factory as tracker_settings
 from collections.abc import Callable
@@ -39,9 +39,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_interval
-from skysim.experiments.papers.published import experiments, published_values
+from skysim.experiments.papers.published import (experiments, published_values)
 from skysim.results.metrics import Summary, exact, extremum
 from skysim.results.plots import INK, MARKS
 from skysim.simulation.lab import Lab
@@ -224,12 +224,12 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
     results |= epsilons(ours, with_faults, bumped, drifted) | buckets()
     caption = f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}."
     drawings = (
-        Drawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
-        Drawing(
+        FigureDrawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
+        FigureDrawing(
             f"Fig. 76: angles of all pairs, ours with {CAUSE}.",
             lambda fig: draw_separations(fig, with_faults),
         ),
-        Drawing(
+        FigureDrawing(
             "Figs 77 and 79: positions of the five LEDs; the IMU is correct except at the bumped position 5.",
             lambda fig: draw_scatter(fig, bumped),
             (6.4, 3.9),

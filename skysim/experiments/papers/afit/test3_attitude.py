@@ -8,9 +8,19 @@ two LEDs under a rolling shutter, drift of an LN-200 during a stay at each posit
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import Any, NamedTuple
 import numpy as np
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.experiments.papers.afit.test3 import angles_deg
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import prediction_interval
+from skysim.experiments.papers.published import experiments
+from skysim.results.plots import INK
+from skysim.scene import loader
+from skysim.simulation.flight import Shot, open_flight
+from collections.abc import Callable
 from scipy.spatial.transform import Rotation
 from estimator.attitude.solvers import quest
 from estimator.catalog.catalog import unit
@@ -18,20 +28,143 @@ from estimator.catalog.pair_index import (PairCatalog, build_pair_catalog, candi
 from estimator.core.checks import Ints
 from estimator.identification.published.saa import (Gates, SearchInput, build_primary, gate_rad, match_assumptions)
 from skysim.core.constants import ARCSEC_RAD, INCH_M
-from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
 from skysim.dynamics import guidance, imu
 from skysim.dynamics.multibody import imu_position_m
-from skysim.experiments.papers.afit import bump
 from skysim.experiments.papers.afit.test3 import (ALGORITHM_DEG, EPSILON_MAG, EPSILON_POS_M, EPSILON_SEP_ARCSEC, FITTED_IMAGING, HOME, IMU_DEG, LEDS, angles_deg, build_test3, lab_from_body, photograph)
 from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import (percent, prediction_interval, sample_std)
 from skysim.results.metrics import proportion
-from skysim.results.plots import INK
-from skysim.scene import loader
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 
+
+
+
+
+# AFIT's bump at position 5 (Padro 2012, 4.4, Table 14): the gyros saturate and the IMU loses part
+# of the rotation.
+
+
+BumpRate = tuple[float, float, float]
+# deg/s about the body axes: fitted to Table 14's theta_2 and theta_3, and the scene's own.
+FITTED_BUMP: BumpRate = (0.0, -12.1, -15.0)
+ASSUMED_BUMP: BumpRate = (3.0, -2.0, 14.0)
+BUMP_START_S = 1.5
+BUMP_END_S = 2.0
+NEXT_IMAGE_S = 2.5
+CAUSE = f"a bump of {FITTED_BUMP} deg/s, gyros saturated at 10"
+
+
+class BumpRun(NamedTuple):
+    """A simulated motion of `simsat_bump`.
+
+    t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
+    saturated_s : how long a gyro was saturated;  tracker_error_deg : the star tracker's worst error after the bump
+    """
+
+    t_s: Floats
+    imu_deg: Floats
+    filter_deg: Floats
+    saturated_s: float
+    tracker_error_deg: float
+
+
+def bump(options: ExperimentOptions) -> ExperimentResult:
+    """Errors without a bump, with the fitted bump and with the scene's bump, each with several IMUs."""
+    runs = []
+    for n, bump_deg_s in enumerate((None, FITTED_BUMP, ASSUMED_BUMP)):
+        options.watch(n, 3)
+        runs.append(simulate_bumps(bump_deg_s, options.trials(10, 2), options.seed))
+    with_fitted = runs[1]
+    # Absolute errors of the IMU's angles at the end, (runs, 3).
+    without_deg, fitted_deg, assumed_deg = (
+        np.abs([run.imu_deg[-1] for run in imus]) for imus in runs
+    )
+    results = {
+        f"theta_{n + 1}": with_cause(
+            CAUSE, prediction_interval, without_deg[:, n], fitted_deg[:, n]
+        )
+        for n in range(3)
+    }
+    cause = f"the scene's bump of {ASSUMED_BUMP} deg/s"
+    results["order"] = with_cause(cause, prediction_interval, without_deg[:, 2], assumed_deg[:, 2])
+    saturated_s = [[run.saturated_s for run in imus] for imus in runs[:2]]
+    results["limited"] = with_cause(CAUSE, prediction_interval, *saturated_s)
+    results["tracker"] = RowResult(
+        prediction_interval([run.tracker_error_deg for run in with_fitted])
+    )
+    results["filter"] = RowResult(
+        prediction_interval([filter_errors_after(run).max() for run in with_fitted])
+    )
+    caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
+    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, with_fitted[0])),))
+
+
+def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[BumpRun]:
+    """Simulate the same motion with `imus` IMUs of random hardware seeds."""
+    seeds = random_stream(seed, 14).integers(2**31, size=imus)
+    return [simulate_bump(bump_deg_s, int(imu_seed)) for imu_seed in seeds]
+
+
+def filter_errors_after(run: BumpRun) -> Floats:
+    """(K,) the filter's errors after the first image that follows the bump."""
+    return run.filter_deg[run.t_s > NEXT_IMAGE_S]
+
+
+def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
+    """Simulate six seconds around a bump, with one image per second."""
+    bump_leg = f'{{kind: bump, rate_deg_s: {list(bump_deg_s or ())}, duration: "40 ms", caught_after: "0.2 s"}}, '
+    hold_leg = f'{{kind: hold, duration: "{BUMP_START_S} s"}}, '
+    overrides = {
+        "seed": str(seed),
+        "vehicle.imu.hardware_seed": str(seed),
+        "motion.maneuver": f'[{hold_leg}{bump_leg if bump_deg_s else ""}{{kind: hold, duration: "30 s"}}]',
+        "exposure": '{time: "10 ms", rate_hz: 1, frames: 6, first: "0.4 s"}',
+    }
+    with open_flight(loader.load("simsat_bump", overrides)) as flight:
+        errors_deg = [
+            tracker_error_deg(shot) for shot in flight.shots() if shot.truth.t_s > BUMP_END_S
+        ]
+        log = flight.telemetry()
+    assert log.lab_from_imu is not None
+    assert log.lab_from_filter is not None
+    assert log.saturated is not None
+    return BumpRun(
+        log.t_s,
+        angles_deg(log.lab_from_imu) - angles_deg(log.lab_from_body),
+        np.degrees((log.lab_from_filter * log.lab_from_body.inv()).magnitude()),
+        float(log.saturated.sum() * log.period_s),
+        max(errors_deg),
+    )
+
+
+def tracker_error_deg(shot: Shot) -> float:
+    """The star tracker's error; infinite if the image was not solved."""
+    assert shot.report is not None
+    estimate = shot.report.attitude.cam_from_ref
+    return (
+        math.inf
+        if estimate is None
+        else float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
+    )
+
+
+def draw(fig: Any, run: BumpRun) -> None:
+    axes = fig.subplots()
+    rows = experiments()["afit-bump"].rows
+    for axis in range(3):
+        axes.plot(
+            run.t_s,
+            np.abs(run.imu_deg[:, axis]),
+            color=INK[(0, 2, 5)[axis]],
+            label=f"IMU, theta_{axis + 1}",
+        )
+        published = rows[f"theta_{axis + 1}"].published
+        label = f"published, theta_{axis + 1}"
+        axes.plot(run.t_s[-1] + 0.15, published, "os^"[axis], color=INK[1], label=label)
+    axes.plot(run.t_s, run.filter_deg, color=INK[6], ls="--", label="filter with star tracker")
+    axes.set(xlabel="time (s)", ylabel="error (deg)")
+    axes.legend(ncols=2)
 
 
 HOLD_MIN = 0.75  # time at a position: fitted, see `draw_holds`
@@ -91,7 +224,7 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
         HOLD_MIN, units, random_stream(options.seed, 2), earth=False
     )
     options.watch(3, 4)
-    bump_runs = bump.simulate_bumps(bump.FITTED_BUMP, options.trials(10, 3), options.seed)
+    bump_runs = simulate_bumps(FITTED_BUMP, options.trials(10, 3), options.seed)
     bump_deg = np.array([run.imu_deg[-1] for run in bump_runs])
     earth_deg = (drift_without_earth_deg - drift_deg[HOLD_MIN]).mean(axis=0)
     causes = combine_causes(camera.error_deg, drift_without_earth_deg, bump_deg, earth_deg)
@@ -265,15 +398,15 @@ def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
 # Figures.
 
 
-def make_drawings(causes: AllCauses, drift: dict[float, Floats]) -> tuple[Drawing, ...]:
+def make_drawings(causes: AllCauses, drift: dict[float, Floats]) -> tuple[FigureDrawing, ...]:
     return (
-        Drawing(
+        FigureDrawing(
             "Tables 10-14: the algorithm minus the IMU, and 95 % of ours with camera noise, the IMU's drift and the"
             " bump; diamonds: with the Earth rate in the IMU too.",
             lambda fig: draw_differences(fig, causes),
             (7.4, 3.5),
         ),
-        Drawing(
+        FigureDrawing(
             "Errors of an IMU that measures the Earth rate against the time at a position, and those of Table 15.",
             lambda fig: draw_holds(fig, drift),
             (7.4, 3.3),

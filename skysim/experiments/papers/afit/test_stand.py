@@ -23,8 +23,8 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.light import Plan
+from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lights.light import LightPlan
 from skysim.simulation.lights.registry import build_lights
 from skysim.tracking import onboard_model
 
@@ -51,7 +51,7 @@ def build_test_stand(scene: Scene) -> Lab:
     """Lab of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
     lab = base_lab()
     assert isinstance(scene.light, DomeConfig)
-    plan = Plan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
+    plan = LightPlan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
     return lab.with_scene(scene).with_camera(
         lights=build_lights(plan),
         optics=Optics.from_camera(scene.camera),

@@ -15,7 +15,7 @@ from estimator.detection.shefex_detection import (maximum_scan, sequential_scan)
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import (bootstrap_interval, bootstrap_of_means)
 from skysim.experiments.papers.shefex.shefex_nights import (FULL_MOON, exposure_override, render_frames)
 from skysim.experiments.papers.shefex.shefex_setup import (MAX_CENTROIDS, PUBLISHED)
@@ -24,8 +24,8 @@ from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import StarCamera, build_lab
-from skysim.simulation.lights.stars import Background
+from skysim.simulation.lab import (StarCamera, build_lab)
+from skysim.simulation.lights.starlight import BackgroundLight
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.exposure_control import ExposureController
 
@@ -63,7 +63,7 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
         ),
     }
     return ExperimentResult(
-        results, (Drawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),)
+        results, (FigureDrawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),)
     )
 
 
@@ -161,7 +161,7 @@ class ExposureLoop:
         lab = self.lab
         if glare_e_s:
             glow = (*lab.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
-            lab = lab.with_light(Background(glow))
+            lab = lab.with_light(BackgroundLight(glow))
         if planets:
             lab = lab.with_sources(with_planets(lab.camera, self.rest, planets))
         window = exposure_window(lab.scene, self.frames, self.controller.exposure_s)
@@ -243,7 +243,7 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
         results[name] = RowResult(
             Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
         )
-    drawing = Drawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0]))
+    drawing = FigureDrawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0]))
     return ExperimentResult(results, (drawing,))
 
 

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
-from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
+from estimator.identification.published.shefex import (FOURTH_STAR, angle_interval, cos_error, search)
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult)
+from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.experiments.papers.shefex.shefex_setup import (CHOSEN_COS_ERROR, MAX_CENTROIDS, PIXEL_RAD, PRINTED_FIELD_RAD, PUBLISHED, Field, identify_and_solve, pairs, plot_curve, random_fields, search_options, shefex_lab)
+from skysim.experiments.papers.shefex.shefex_setup import (CHOSEN_COS_ERROR, MAX_CENTROIDS, PIXEL_RAD, PRINTED_FIELD_RAD, PUBLISHED, StarField, identify_and_solve, pairs, plot_curve, random_fields, search_options, shefex_lab)
 from skysim.experiments.study.report.figures import logarithmic
 from skysim.results.metrics import Summary, exact, extremum, proportion
 from skysim.tracking import onboard_model
@@ -47,7 +47,7 @@ class Identification(NamedTuple):
 
 
 def identify(
-    field: Field,
+    field: StarField,
     centroid_px: float,
     cosine_error: float,
     spikes: int,
@@ -155,16 +155,16 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     )
     results |= equation_results(random_stream(options.seed, 2))
     drawings = (
-        Drawing(
+        FigureDrawing(
             "Fig. 7: angles compared by an identification, against cosError.",
             partial(draw_time, curves),
         ),
-        Drawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
-        Drawing(
+        FigureDrawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
+        FigureDrawing(
             "Fig. 9: wrong recognitions against the spikes among the stars.",
             partial(draw_wrong, curves),
         ),
-        Drawing(
+        FigureDrawing(
             "Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)
         ),
     )

@@ -16,7 +16,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.checks import Ints
 from estimator.core.types import Centroids
-from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions, search
+from estimator.identification.published.shefex import (FOURTH_STAR, ShefexOptions, search)
 from estimator.trackers.pipeline import Settings
 from skysim.core.files import CATALOGS
 from skysim.core.random_streams import random_stream
@@ -26,8 +26,14 @@ from skysim.experiments.study.execution import detections
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking import onboard_model
+from functools import partial
+from typing import Any
+from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import bootstrap_of_means
+from skysim.results.metrics import exact
+from skysim.results.plots import INK
 
 
 
@@ -122,12 +128,12 @@ processing_chain = cache(ProcessingChain)
 
 def search_options(
     index: PairIndex, cos_error: float, lights: int, accept_log10_chance: float
-) -> SearchOptions:
+) -> ShefexOptions:
     """SearchOptions of the paper's identifier for a number of lights, without a limit on its work."""
     # The angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3).
     max_angle_rad = index.max_angle_rad
     tolerance_rad = float(max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0)))
-    return SearchOptions(
+    return ShefexOptions(
         cos_error, tolerance_rad, UNLIMITED, UNLIMITED, lights, accept_log10_chance
     )
 
@@ -150,21 +156,21 @@ def identify_and_solve(
     )
 
 
-class Field(NamedTuple):
+class StarField(NamedTuple):
     """The catalog's stars on the detector at a random attitude: (N, 2) pixels, brightest first; the true attitude."""
 
     xy_px: Floats
     cam_from_ref: Rotation
 
 
-def random_fields(count: int, seed: int) -> list[Field]:
+def random_fields(count: int, seed: int) -> list[StarField]:
     """Random attitudes over the whole sky, with the projected stars of the chosen catalog."""
     lab = lab_with(paper_catalog("chosen"))
     result = []
     for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
         xy_px, electrons = detections.visible_sources(lab, lab_from_body)
         order = np.argsort(-electrons, kind="stable")
-        result.append(Field(xy_px[order], lab.camera.mount.cam_from_body * lab_from_body.inv()))
+        result.append(StarField(xy_px[order], lab.camera.mount.cam_from_body * lab_from_body.inv()))
     return result
 
 
@@ -181,5 +187,113 @@ def plot_curve(axes: Any, x: Any, summaries: list[Summary], curve: int, label: s
         capsize=2,
         label=label,
     )
+
+
+
+
+# SHEFEX-2's on-board catalogs: counts, pairs, sky maps, uniformity (Samaan & Theil 2011, section
+# 3.3, figs 4, 5).
+
+
+BRIGHT_LIMIT_MAG = 4.5
+FAINTEST_MAG = 5.75
+MIN_STARS = 4
+
+
+def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
+    """The paper's counts for our versions of its catalogs, stars in view at random attitudes, and two sky maps."""
+    asymmetric, uniform, chosen = (
+        paper_catalog(name) for name in ("asymmetric", "uniform", "chosen")
+    )
+    counts = count_in_fields((asymmetric, uniform), options)
+    bright = stars().id[stars().v_mag <= BRIGHT_LIMIT_MAG]
+    faint = [count_between(one, 5.2, 5.4) for one in (asymmetric, chosen)]
+    pool = stars().take(stars().v_mag <= FAINTEST_MAG)
+    uniform_with_all_bright = published_catalogs.uniform(pool, len(uniform), BRIGHT_LIMIT_MAG)
+    uniform_faint = [count_between(one, 5.25, 5.75) for one in (uniform, uniform_with_all_bright)]
+    results = {
+        "asymmetric_faint": with_cause("the thinning of the chosen catalog", exact, *faint),
+        "asymmetric_faintest": RowResult(exact(asymmetric.v_mag.max())),
+        "uniform_faint": with_cause("all stars to 4.5 mag kept", exact, *uniform_faint),
+        "chosen_stars": RowResult(exact(len(chosen))),
+        "chosen_pairs": RowResult(exact(count_pairs(chosen))),
+        "chosen_bright": RowResult(exact(np.isin(bright, chosen.id).mean())),
+        "uniform_pairs": RowResult(exact(count_pairs(uniform))),
+        "spread": RowResult(
+            bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion)
+        ),
+        "poor": RowResult(
+            bootstrap_of_means((counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0])
+        ),
+    }
+    drawings = (
+        FigureDrawing("Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)),
+        FigureDrawing("Fig. 5: the uniform catalog.", partial(draw, uniform), (7.4, 4.2)),
+        FigureDrawing(
+            "Stars in the field of 14.9 x 11.2 deg at random attitudes.",
+            partial(draw_counts, counts),
+        ),
+    )
+    return ExperimentResult(results, drawings)
+
+
+def count_between(star_catalog: StarCatalog, bright_mag: float, faint_mag: float) -> int:
+    """Number of stars with bright_mag < V <= faint_mag."""
+    return int(np.sum((star_catalog.v_mag > bright_mag) & (star_catalog.v_mag <= faint_mag)))
+
+
+def count_pairs(star_catalog: StarCatalog) -> int:
+    """Number of pairs closer than the field's printed diagonal."""
+    return len(pair_index.build(star_catalog.vectors, float(PRINTED_FIELD_RAD)).pair)
+
+
+def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOptions) -> Floats:
+    """(N, K) number of stars of each catalog on the detector at N random attitudes."""
+    labs = [lab_with(star_catalog) for star_catalog in catalogs]
+    attitudes = Rotation.random(options.trials(2000, 300), rng=random_stream(options.seed, 0))
+    counts = [
+        [len(detections.visible_sources(one, attitude)[0]) for one in labs]
+        for attitude in attitudes
+    ]
+    return np.array(counts, float)
+
+
+def relative_dispersion(means: Floats) -> Floats:
+    """Index of dispersion (variance over mean) of the uniform catalog's counts, divided by the asymmetric one's.
+
+    means : (..., 4) mean counts of both catalogs, then mean squared counts
+    """
+    mean = means[..., :2]
+    square = means[..., 2:]
+    dispersion_index = (square - mean**2) / mean
+    return np.asarray(dispersion_index[..., 1] / dispersion_index[..., 0])
+
+
+def draw(star_catalog: StarCatalog, fig: Any) -> None:
+    """Sky map in Mollweide projection, right ascension increasing to the left; brighter stars are larger."""
+    axes = fig.add_subplot(projection="mollweide")
+    x, y, z = star_catalog.vectors.T
+    size = 0.6 + 1.6 * np.clip(6 - star_catalog.v_mag, 0, None)
+    axes.scatter(-np.arctan2(y, x), np.arcsin(z), s=size, color=INK[0], lw=0)
+    axes.set_xticks(np.radians(np.arange(-120, 121, 60)), [])
+    axes.set_xlabel("right ascension grows to the left from 0 in the middle", fontsize=8)
+    axes.set_yticks(
+        np.radians(np.arange(-60, 61, 30)), [f"{dec} deg" for dec in range(-60, 61, 30)]
+    )
+    axes.tick_params(labelsize=7)
+    axes.set_title(
+        f"ours: {len(star_catalog)} stars to {star_catalog.v_mag.max():.2f} mag", fontsize=9
+    )
+
+
+def draw_counts(counts: Floats, fig: Any) -> None:
+    axes = fig.subplots()
+    edges = np.arange(-0.5, counts.max() + 1)
+    for n, name in enumerate(("asymmetric", "uniform")):
+        fraction, _ = np.histogram(counts[:, n], edges, density=True)
+        axes.step(edges[:-1] + 0.5, fraction, where="mid", color=INK[n * 2], label=f"ours, {name}")
+    axes.axvline(MIN_STARS - 0.5, color=PUBLISHED, ls="--", label="published: four are needed")
+    axes.set(xlabel="stars in the field", ylabel="share of the fields")
+    axes.legend()
 
 

@@ -28,8 +28,8 @@ from skysim.experiments.study.analysis.table import (format_level, format_summar
 from skysim.experiments.study.factors import (Point, make_point)
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
-from skysim.experiments.study.execution.runner import Progress, Watch, run_points
-from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.runner import (Progress, Watch, run_points)
+from skysim.experiments.study.execution.setups import (code_version, seed_of)
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.execution.trials import REFUSED, Row
 from skysim.experiments.study.factors import (Distribution, Range, Value)

@@ -18,8 +18,8 @@ import scipy
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import axes
-from skysim.experiments.study.analysis.axes import Axis
+from skysim.experiments.study.analysis import table
+from skysim.experiments.study.analysis.table import Axis
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.plan import Curve, Study, Threshold
 from skysim.results import metrics
@@ -171,11 +171,11 @@ def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRo
         raise InputError(
             f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ..."
         )
-    if axes.is_sampled(study):
+    if table.is_sampled(study):
         raise InputError(
             where, "points are sampled, without levels", "design factorial or one_at_a_time"
         )
-    axis = axes.axis(study, rows, threshold.along)
+    axis = table.axis(study, rows, threshold.along)
     if not axis.numeric or len(axis.levels) < 2:
         raise InputError(
             f"{where}.along",
@@ -186,13 +186,13 @@ def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRo
 
 def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:
     """The study's thresholds of a curve's response, along its x, at its levels."""
-    levels = axes.fixed_levels(curve, study, lines)
+    levels = table.fixed_levels(curve, study, lines)
     shown = (curve.y, curve.x, curve.by)
     return [
         one
         for one in study.thresholds
         if (one.response, one.along, one.by) == shown
-        and axes.fixed_levels(one, study, lines) == levels
+        and table.fixed_levels(one, study, lines) == levels
     ]
 
 
@@ -200,12 +200,12 @@ def crossings(
     threshold: Threshold, study: Study, lines: Sequence[PointRow]
 ) -> dict[str, Crossing | None]:
     """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
-    axis = axes.axis(study, lines, threshold.along)
-    chosen = axes.shown_points(lines, threshold, study)
+    axis = table.axis(study, lines, threshold.along)
+    chosen = table.shown_points(lines, threshold, study)
     groups = {"": chosen}
     if threshold.by is not None:
-        groups = axes.group_points(
-            chosen, axes.axis(study, lines, threshold.by), threshold.by, study
+        groups = table.group_points(
+            chosen, table.axis(study, lines, threshold.by), threshold.by, study
         )
     return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
 
@@ -225,8 +225,8 @@ def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) 
 
 def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
-    axis = axes.axis(study, lines, threshold.along)
-    unit = axes.unit_of(axes.axis(study, lines, threshold.by)) if threshold.by is not None else ""
+    axis = table.axis(study, lines, threshold.along)
+    unit = table.unit_of(table.axis(study, lines, threshold.by)) if threshold.by is not None else ""
     return [
         (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
@@ -240,7 +240,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     name = threshold.along
     if found is None:
         return f"{response} has no trials at two levels of {name} yet."
-    unit = axes.unit_of(axis)
+    unit = table.unit_of(axis)
     if math.isnan(found.value):
         return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
     first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import points_at
+from skysim.experiments.study.analysis.table import points_at
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study

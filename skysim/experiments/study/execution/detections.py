@@ -10,11 +10,9 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
@@ -23,12 +21,14 @@ from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
-from skysim.simulation.lab import Lab, StarCamera
-from skysim.simulation.lights.air import Atmosphere
+from skysim.simulation.lab import (Lab, StarCamera)
+from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.lights.light import (Exposure, Obstacle, any_of, find_light)
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
+
+
 
 LEAST_SIGMA_PX = 1e-3
 FLUX_NOISE = (
@@ -36,7 +36,7 @@ FLUX_NOISE = (
 )
 
 
-class View(NamedTuple):
+class VisibleSources(NamedTuple):
     """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
     rows : (N,) in `lab.camera.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
@@ -53,7 +53,7 @@ def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
     return view.xy_px, view.electrons
 
 
-def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
+def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
     R_cam_from_body = lab.camera.mount.cam_from_body.as_matrix()
     camera_body_m = lab.camera.mount.camera_body_m
@@ -66,7 +66,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
     rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
     ends = np.cumsum([0, *map(len, rows)])
     near = lab.camera.sources.take(np.concatenate(rows))
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
@@ -85,7 +85,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
         chosen = begin + np.flatnonzero(visible[begin:end])
         if occludes := occlusion(lab.camera, replace(start, lab_from_body=lab_from_body[n])):
             chosen = chosen[~occludes(near.place[chosen])]
-        views.append(View(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
+        views.append(VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
     return views
 
 
@@ -170,3 +170,5 @@ def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
     return np.asarray(shown.strength * lit_s / window.exposure_s / mean)
+
+

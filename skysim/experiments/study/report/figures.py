@@ -5,21 +5,14 @@ from __future__ import annotations
 from typing import Any
 import numpy as np
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import is_share, label
+from skysim.experiments.study.analysis.table import (is_share, label)
 from skysim.experiments.study.plan import Heat, Map
 from skysim.results.metrics import MORE_IS_BETTER, split_name
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
-from skysim.experiments.study.analysis.axes import (
-    Axis,
-    axis,
-    is_sampled,
-    is_share,
-    label,
-    shown_points,
-)
+from skysim.experiments.study.analysis.table import (Axis, axis, is_sampled, is_share, label, shown_points)
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
 from skysim.experiments.study.plan import Curve, Heat, Study

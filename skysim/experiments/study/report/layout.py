@@ -13,16 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import (
-    Axis,
-    axis,
-    distinct,
-    fixed_levels,
-    group_points,
-    is_sampled,
-    label,
-    shown_points,
-)
+from skysim.experiments.study.analysis.table import (Axis, axis, distinct, fixed_levels, group_points, is_sampled, label, shown_points)
 from skysim.experiments.study.analysis.table import (PointRow, format_level, has_few_values)
 from skysim.experiments.study.analysis.thresholds import thresholds_of
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study

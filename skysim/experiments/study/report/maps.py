@@ -7,13 +7,11 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import axis, group_points, shown_points
+from skysim.experiments.study.analysis.table import (axis, group_points, shown_points)
 from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.experiments.study.plan import Map, Study
@@ -23,6 +21,8 @@ from skysim.results import metrics
 from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns
 from skysim.results.plots import png
+
+
 
 CELL_TRIALS = 25  # mean number of trials in a cell
 MAX_CELLS = 240  # of a panel
@@ -36,7 +36,7 @@ RING_LABEL_DEG = 67.5  # azimuth of the labels of the rings
 LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
 
 
-class Cell(NamedTuple):
+class MapCell(NamedTuple):
     """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
 
     value : the response, NaN without values;  values : number of trials with a value
@@ -60,7 +60,7 @@ class DirectionMap(NamedTuple):
 
     label: str
     sky: bool
-    cells: list[Cell]
+    cells: list[MapCell]
     worst: list[WorstTrial]
 
 
@@ -112,7 +112,7 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     for one, (first, end) in zip(ranges, itertools.pairwise(ends.tolist()), strict=True):
         summary = summarize(subset(columns, order[first:end]))
         value = summary.value if summary.trials >= least else math.nan
-        cells.append(Cell(*one, value, summary.trials))
+        cells.append(MapCell(*one, value, summary.trials))
     return DirectionMap(label, sky, cells, worst_trials(columns, response))
 
 
@@ -253,7 +253,7 @@ def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
         )
 
 
-def outline(cell: Cell, sky: bool) -> Floats:
+def outline(cell: MapCell, sky: bool) -> Floats:
     """(K, 2) outline of a cell in the drawing."""
     left = cell.left_deg
     right = cell.right_deg
@@ -338,3 +338,5 @@ def caption(
         else ""
     )
     return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")
+
+

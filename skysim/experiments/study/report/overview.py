@@ -16,15 +16,15 @@ from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.factors import (Point, make_point)
 from skysim.experiments.study.execution.trials import rate_axis
 from skysim.experiments.study.factors import (Distribution, Factor, Range)
-from skysim.experiments.study.loader import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.study_file import (fixed_seeds, may_report_ambiguity)
 from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import (DomeConfig, StarsConfig)
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.user_parts import UserParts
+from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import UserParts
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"

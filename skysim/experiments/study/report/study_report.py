@@ -15,14 +15,15 @@ from skysim.experiments.study.analysis import answer
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.analysis import table as sensitivity
 from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.analysis.axes import axis, is_sampled, same, shown_points
+from skysim.experiments.study.analysis.table import (axis, is_sampled, same, shown_points)
 from skysim.experiments.study.analysis.search import SearchResult
 from skysim.experiments.study.analysis.table import Index
 from skysim.experiments.study.analysis.table import (PointRow, format_response, format_summary)
 from skysim.experiments.study.analysis.worst import ColumnsOf
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
-from skysim.experiments.study.report import (layout, maps)
+from skysim.experiments.study.report import (layout)
+from skysim.experiments.study.report import maps
 from skysim.experiments.study.report import figures
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
@@ -40,7 +41,7 @@ from skysim.results.report import (
     Text,
     Verdict,
 )
-from skysim.results.report.blocks import Kind, Tone
+from skysim.results.report_blocks import (Kind, Tone)
 
 POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"

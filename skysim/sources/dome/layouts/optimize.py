@@ -210,7 +210,7 @@ def optimize_places(
         if visible * config.count < options.sparse_below
         else (options.dense_steps, options.dense_field)
     )
-    search = Search(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
+    search = LocalSearch(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
     count = np.clip(
         options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes
     )
@@ -239,7 +239,7 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
 
 
-class Search(NamedTuple):
+class LocalSearch(NamedTuple):
     """Local search: (K, 3) candidate sites, m, a k-d tree of them, the step sizes and the part of the field used."""
 
     config: layouts.OptimizedConfig
@@ -260,7 +260,7 @@ class Search(NamedTuple):
 
 
 def descend(
-    search: Search, place_m: Floats, attitude_count: int, rng: np.random.Generator
+    search: LocalSearch, place_m: Floats, attitude_count: int, rng: np.random.Generator
 ) -> list[Floats]:
     """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
 

@@ -23,7 +23,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.layouts.neighborhoods import unique_levels
+from skysim.sources.dome.layouts.ambiguity import unique_levels
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 

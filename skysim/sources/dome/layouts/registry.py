@@ -25,7 +25,7 @@ from skysim.scene.sections.layouts import (
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
 from skysim.sources.dome import display
-from skysim.sources.dome.projector import projector_sources
+from skysim.sources.dome.display import projector_sources
 from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.string import displace_ends
 from skysim.sources.dome.layouts.spreads import geodesic
