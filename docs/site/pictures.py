@@ -10,7 +10,7 @@ import cv2
 from skysim.core import files
 from skysim.dynamics.multibody.scene_picture import picture
 from skysim.results import (telemetry_report)
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 
@@ -49,7 +49,7 @@ def main() -> None:
         f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = annotate.contact_sheet(
+    sheet = plots.contact_sheet(
         [image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3
     )
     files.write_image(IMAGES / "smear.png", sheet)

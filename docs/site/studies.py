@@ -13,7 +13,7 @@ import numpy as np
 
 from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import search
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE, Store
 from skysim.experiments.study.study_file import load

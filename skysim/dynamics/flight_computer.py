@@ -18,9 +18,9 @@ from skysim.dynamics.controllers import (NO_SOURCE, ControllerSource, ExternalLa
 from skysim.dynamics.controllers import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
-from skysim.dynamics.multibody.actuators.fans import Desaturator, MomentumDump
-from skysim.dynamics.multibody.actuators.kind import (Actuators, ControlInput)
-from skysim.dynamics.multibody.actuators.registry import IdealTorque, build_actuators
+from skysim.dynamics.multibody.fans import (Desaturator, MomentumDump)
+from skysim.dynamics.multibody.actuator_kind import (Actuators, ControlInput)
+from skysim.dynamics.multibody.actuators import (IdealTorque, build_actuators)
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 

@@ -11,7 +11,7 @@ from skysim.core.files import (make_folder, write_image, write_table)
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
 from skysim.results import run_report, scoring, telemetry_report
-from skysim.results.annotate import annotate_truth
+from skysim.results.plots import annotate_truth
 from skysim.results.files.recording import (remove_results, write_frame)
 from skysim.results.report import Report
 from skysim.results.scoring import Score

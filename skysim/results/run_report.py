@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import FrameRow
-from skysim.results.plots import figure_png, stacked_axes
+from skysim.results.plots import (figure_png, stacked_axes)
 from skysim.results.report import (
     Cell,
     Column,

@@ -16,8 +16,8 @@ from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import (metrics)
-from skysim.results import annotate as stretch
-from skysim.results.annotate import (annotate, visible)
+from skysim.results import plots as stretch
+from skysim.results.plots import (annotate, visible)
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig

@@ -30,7 +30,7 @@ from skysim.simulation.motion import (Motion, history_s)
 from skysim.simulation.lab import (NO_PARTS, UserParts, with_parts)
 from skysim.tracking import factory
 from skysim.tracking import navigation
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 FIRST_OBSERVATION = (
     1_000_000  # index of the first frame beside the schedule; it selects the frame's noise

@@ -25,7 +25,7 @@ from skysim.core.errors import InputError
 from skysim.core import files
 from skysim.core.types import Floats
 from skysim.results import (scoring)
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.results.files import recording
 from skysim.results.files import run_export
 from skysim.results.files import run_export
@@ -302,7 +302,7 @@ def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> 
     for stem in run.stems:
         there, picture = film.read()
         assert there
-        meant = annotate.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
+        meant = plots.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
             :492, :658
         ]
         assert np.corrcoef(picture[:, :, 0].ravel(), meant.ravel())[0, 1] > 0.8

@@ -21,7 +21,7 @@ from skysim.core.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
-from skysim.dynamics.multibody.actuators.cmgs import STEERING
+from skysim.dynamics.multibody.cmgs import STEERING
 from skysim.scene import loader, scene
 from skysim.scene.sections import (camera, leds, motion, vehicle)
 from skysim.scene.sections import light

@@ -10,7 +10,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import search
 from skysim.experiments.study.execution import (engines, store)
 from skysim.experiments.study.execution import runner
 from skysim.scene import loader

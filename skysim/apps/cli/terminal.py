@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from skysim.simulation.checks.facts import Fact
     from skysim.simulation.lab import Lab
 if TYPE_CHECKING:
-    from skysim.experiments.study.analysis.worst import WorstTrial
+    from skysim.experiments.study.worst import WorstTrial
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
-from skysim.results import annotate
+from skysim.results import plots
 
 
 
@@ -33,7 +33,7 @@ class Display(NamedTuple):
 
     screen_px: tuple[int, int] = (0, 0)
     limits: str | tuple[float, float] = LIMITS[0]
-    curve: str = next(iter(annotate.CURVES))
+    curve: str = next(iter(plots.CURVES))
     near_px: tuple[int, int] | None = None
 
 
@@ -176,7 +176,7 @@ class FrameView:
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
     exposure_s: float
-    statistics: annotate.FrameStatistics
+    statistics: plots.FrameStatistics
     lights: LightColumns
     result: TrackerResult | None
     ms: float

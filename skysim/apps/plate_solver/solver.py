@@ -509,7 +509,7 @@ def center_from_cam(camera: Camera) -> Rotation:
 
 def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
     """The image annotated with detections, matched stars and their numbers."""
-    from skysim.results.annotate import annotate
+    from skysim.results.plots import annotate
 
     match = report.attitude.match
     detected_px = report.centroids.xy_px

@@ -19,7 +19,7 @@ from skysim.apps.stream.sinks import Packet
 from skysim.apps.stream.sinks import encode_png
 from skysim.core.errors import InputError
 from skysim.core import files
-from skysim.results.annotate import (jpeg, to_8bit)
+from skysim.results.plots import (jpeg, to_8bit)
 
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # for a client that stops reading

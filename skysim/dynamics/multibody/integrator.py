@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.multibody.actuators.registry import set_start
+from skysim.dynamics.multibody.actuators import set_start
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel
 

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import joints
-from skysim.dynamics.multibody.actuators.registry import TRIM
+from skysim.dynamics.multibody.actuator_kind import joints
+from skysim.dynamics.multibody.actuators import TRIM
 from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"

@@ -22,17 +22,11 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.actuators.kind import (Hinges, joints)
-from skysim.dynamics.multibody.actuators.fans import Fans
-from skysim.dynamics.multibody.actuators.registry import (
-    KINDS,
-    TORQUES,
-    add_actuators,
-    lock_unused,
-    locked_joint_hint,
-)
-from skysim.dynamics.multibody.actuators.wheels import WHEEL
+from skysim.dynamics.multibody.cmgs import (GIMBAL, ROTOR)
+from skysim.dynamics.multibody.actuator_kind import (Hinges, joints)
+from skysim.dynamics.multibody.fans import Fans
+from skysim.dynamics.multibody.actuators import (KINDS, TORQUES, add_actuators, lock_unused, locked_joint_hint)
+from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,

@@ -19,7 +19,7 @@ from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.actuators.registry import lock_unused, set_start
+from skysim.dynamics.multibody.actuators import (lock_unused, set_start)
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import (compile_spec, load, mujoco_warnings)
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin

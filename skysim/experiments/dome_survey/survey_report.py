@@ -9,7 +9,7 @@ import numpy as np
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_findings import (accuracy_statistics, fault_lines)
 from skysim.experiments.dome_survey.survey_findings import (SurveyRun, residuals_px)
-from skysim.results.plots import INK, png
+from skysim.results.plots import (INK, png)
 from skysim.results.report import (
     Block,
     Cell,

@@ -25,7 +25,7 @@ from skysim.experiments.dome_survey.survey_frames import detect_lights
 from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, with_cause)
 from skysim.experiments.papers.compare import bootstrap_interval
 from skysim.results.metrics import Summary, proportion
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.scene import loader
 from skysim.scene.sections.light import (DomeConfig, FlatSurfaceConfig)
 from skysim.simulation.exposure import render_at_rest

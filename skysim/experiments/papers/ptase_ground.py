@@ -23,7 +23,7 @@ from skysim.experiments.papers.compare import (bootstrap_interval, sample_std, s
 from skysim.experiments.papers.published import (experiments, published_values)
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import (Lab, build_lab, build_tracker)

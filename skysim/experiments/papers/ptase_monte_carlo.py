@@ -25,7 +25,7 @@ from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentO
 from skysim.experiments.papers.compare import (bootstrap_interval, percent, sample_std)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import WRONG_RAD, Summary, proportion
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 
 
 

@@ -13,16 +13,16 @@ from skysim.experiments.papers.afit import test3_attitude
 from skysim.experiments.papers.afit import afit_surface
 from skysim.experiments.papers.afit import test3
 from skysim.experiments.papers.compare import (ExperimentOptions, ExperimentResult, Reproduction, compare)
-from skysim.experiments.papers import apl
+from skysim.experiments.papers import other_domes
 from skysim.experiments.papers import nps
-from skysim.experiments.papers import oled
+from skysim.experiments.papers import other_domes
 from skysim.experiments.papers import ptase_ground
 from skysim.experiments.papers import ptase_monte_carlo
 from skysim.experiments.papers.published import experiments
-from skysim.experiments.papers.shefex import shefex_camera
-from skysim.experiments.papers.shefex import shefex_setup
-from skysim.experiments.papers.shefex import shefex_identification
-from skysim.experiments.papers.shefex import shefex_nights
+from skysim.experiments.papers import shefex_camera
+from skysim.experiments.papers import shefex_setup
+from skysim.experiments.papers import shefex_identification
+from skysim.experiments.papers import shefex_nights
 
 ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
 
@@ -35,8 +35,8 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "afit-table-10-15": test3_attitude.tables_10_to_15,
     "afit-bump": test3_attitude.bump,
     "nps": nps.initial_error_trials,
-    "apl": apl.discrepancies_and_counts,
-    "oled": oled.noise_and_absolute_error,
+    "apl": other_domes.discrepancies_and_counts,
+    "oled": other_domes.noise_and_absolute_error,
     "ptase-table-1": ptase_monte_carlo.table_1,
     "ptase-table-2": ptase_ground.table_2,
     "shefex-fig-2": shefex_camera.exposure_control,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from skysim.core.yaml_reader import override_texts
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import table as tables
+from skysim.experiments.study import table as tables
 from skysim.experiments.study.execution import (store)
 from skysim.experiments.study.execution import runner
 from skysim.experiments.study.plan import Plan

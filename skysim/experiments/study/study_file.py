@@ -107,8 +107,8 @@ def check(plan: Plan, to_run: bool) -> None:
 
     to_run : whether the trackers and controllers must be installed
     """
-    from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study import search
+    from skysim.experiments.study import search
     from skysim.experiments.study.execution.store import COLUMNS
 
     study = plan.study
@@ -143,9 +143,9 @@ def check(plan: Plan, to_run: bool) -> None:
 
 def check_figures(plan: Plan) -> None:
     """Raise InputError for a figure or threshold of an unknown factor, level or response."""
-    from skysim.experiments.study.analysis import (thresholds)
-    from skysim.experiments.study.analysis import table
-    from skysim.experiments.study.analysis.table import PointRow
+    from skysim.experiments.study import thresholds
+    from skysim.experiments.study import table
+    from skysim.experiments.study.table import PointRow
 
     study = plan.study
     rows = [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]

@@ -21,7 +21,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core import files
 from skysim.core import images
 from skysim.core.encoded import silent_stderr
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.results.files import recording as frame_files
 from skysim.results.files.recording import (FrameTruth, Recording)
 from skysim.results.files.row_parts import EXTRA
@@ -417,7 +417,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
     rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
-    low, high = np.median([annotate.display_levels(run.image(stem)) for stem in sampled], axis=0)
+    low, high = np.median([plots.display_levels(run.image(stem)) for stem in sampled], axis=0)
     height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
     with files.atomic_file(path) as temporary:
         film = cv2.VideoWriter(
@@ -432,7 +432,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
                 )
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = check_same_format(run.image(stem), first, stem)
-                gray = annotate.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
+                gray = plots.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
                 with silent_stderr():
                     film.write(np.ascontiguousarray(gray[:height, :width]))
         finally:

@@ -21,7 +21,7 @@ from skysim.simulation.checks.sampling import (CheckedSamples, sampled)
 from skysim.simulation.checks import sky_warnings
 from skysim.simulation.checks import sky_warnings
 from skysim.simulation.lab import Lab
-from skysim.simulation.reference_limits import check_reference
+from skysim.simulation.motion import check_reference
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
 
 

@@ -22,7 +22,7 @@ from skysim.sources.dome.layouts.ambiguity import (Ambiguity, field_ambiguity)
 from skysim.simulation.checks.detection import Context, threshold_e
 from skysim.simulation.checks.facts import short
 from skysim.simulation.lights.light import find_light
-from skysim.simulation.lights.room import (IMAGES, Mirror)
+from skysim.simulation.lights.lab_room import (IMAGES, Mirror)
 
 
 

@@ -15,8 +15,8 @@ from typing import Any
 from skysim.scene.sections.light import (LightConfig, add_kind)
 from skysim.simulation.lights import (lens)
 from skysim.simulation.lights import atmosphere
-from skysim.simulation.lights import room
-from skysim.simulation.lights import room
+from skysim.simulation.lights import lab_room
+from skysim.simulation.lights import lab_room
 from skysim.simulation.lights import starlight
 from skysim.simulation.lights import sky_bodies
 from skysim.simulation.lights import sky_bodies
@@ -51,9 +51,9 @@ LIGHTS: dict[str, Callable[[LightPlan], Iterable[Light]]] = {
     "satellites": sky_bodies.build_satellites,
     "air": atmosphere.build,
     "further lights": further_lights,
-    "wall": room.build_wall,
+    "wall": lab_room.build_wall,
     "baffle": lens.build_baffle,
-    "vehicle and dome": room.build_obstacles,
+    "vehicle and dome": lab_room.build_obstacles,
     "lens": lens.build,
 }
 

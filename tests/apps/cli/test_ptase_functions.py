@@ -29,7 +29,7 @@ from skysim.core.files import (CATALOGS, ROOT)
 from skysim.core.types import Floats
 from skysim.experiments.papers.ptase_monte_carlo import (SIGMA_MAG, TOLERANCE_RAD, catalog, drawings, run_version, version)
 from skysim.results.plots import png
-from skysim.results.annotate import to_8bit
+from skysim.results.plots import to_8bit
 
 SCENE = ("shefex2", "--frames", "1", "--set", "motion.rate_deg_s=[0,0,0]")
 STUDY = """schema: 1

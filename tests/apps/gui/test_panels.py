@@ -44,7 +44,7 @@ from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import study_file as study_loader
 from skysim.results import (scoring)
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.sources import (stars)
@@ -837,7 +837,7 @@ def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
         image = np.rint(random.normal(200, sigma_dn, (800, 800)))
         image[random.random(image.shape) < 0.02] += 40 * sigma_dn + 100
         image[:2, :3] = 4095
-        values = annotate.frame_statistics(image.astype(np.uint16), 4095.0)
+        values = plots.frame_statistics(image.astype(np.uint16), 4095.0)
         np.testing.assert_allclose(values.sky_dn, 200, rtol=0, atol=0.06 * sigma_dn + 0.01)
         np.testing.assert_allclose(
             values.scatter_dn, np.hypot(sigma_dn, 12**-0.5), rtol=0.06, atol=0
@@ -860,7 +860,7 @@ def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
     """Black and white are measured from the sky."""
     image = np.random.default_rng(2).poisson(20, (200, 200)).astype(np.uint16)
     image[50, 60] = 900
-    shown = [annotate.to_8bit((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
+    shown = [plots.to_8bit((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
     np.testing.assert_array_equal(*shown)
 
 

@@ -23,7 +23,8 @@ from skysim.experiments.papers import compare
 from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.published import (Experiment, PublishedRow)
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
-from skysim.results import metrics, plots
+from skysim.results import (metrics)
+from skysim.results import plots
 from skysim.results.metrics import Summary, exact, proportion
 
 # The law of the verdict.

@@ -11,14 +11,14 @@ from estimator.identification.published.shefex import FOURTH_STAR
 from skysim.core.types import Frame
 from skysim.experiments.papers.compare import ExperimentOptions
 from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.experiments.papers.shefex import shefex_camera
-from skysim.experiments.papers.shefex import shefex_setup
-from skysim.experiments.papers.shefex import shefex_identification
-from skysim.experiments.papers.shefex import shefex_nights
-from skysim.experiments.papers.shefex.shefex_setup import (StarField, pairs, random_fields, shefex_lab)
+from skysim.experiments.papers import shefex_camera
+from skysim.experiments.papers import shefex_setup
+from skysim.experiments.papers import shefex_identification
+from skysim.experiments.papers import shefex_nights
+from skysim.experiments.papers.shefex_setup import (StarField, pairs, random_fields, shefex_lab)
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
 

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import (PointRow, format_summary)
+from skysim.experiments.study import answer
+from skysim.experiments.study.table import (PointRow, format_summary)
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report

@@ -12,8 +12,8 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import table
-from skysim.experiments.study.analysis import table
+from skysim.experiments.study import table
+from skysim.experiments.study import table
 from skysim.experiments.study.execution import (engines, store)
 from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution import runner

@@ -12,7 +12,7 @@ import yaml
 from skysim.core.errors import InputError
 from skysim.experiments.study import (plan)
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import table
+from skysim.experiments.study import table
 from skysim.experiments.study.execution import (store)
 from skysim.experiments.study.execution import runner
 from skysim.experiments.study.execution import runner

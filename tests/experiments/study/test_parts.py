@@ -20,8 +20,8 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.experiments.study import (plan)
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import (worst)
-from skysim.experiments.study.analysis import table
+from skysim.experiments.study import worst
+from skysim.experiments.study import table
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution import (engines, store, workers)
 from skysim.experiments.study.execution import runner

@@ -16,8 +16,8 @@ import yaml
 from skysim.core.errors import InputError
 from skysim.experiments.study import (plan)
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import search
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import search
+from skysim.experiments.study import search
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution import (engines, store)
 from skysim.experiments.study.execution import runner

@@ -15,10 +15,10 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import factors as designs
-from skysim.experiments.study.analysis import table as axes
-from skysim.experiments.study.analysis import search
-from skysim.experiments.study.analysis.table import Index
-from skysim.experiments.study.analysis.table import (PointRow, cells, has_few_values, table)
+from skysim.experiments.study import table as axes
+from skysim.experiments.study import search
+from skysim.experiments.study.table import Index
+from skysim.experiments.study.table import (PointRow, cells, has_few_values, table)
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome

@@ -13,9 +13,9 @@ from scipy import stats
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import study_file
-from skysim.experiments.study.analysis import thresholds
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.thresholds import Crossing, crossing
+from skysim.experiments.study import thresholds
+from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.thresholds import (Crossing, crossing)
 from skysim.experiments.study.plan import Study, Threshold
 from skysim.results import metrics
 

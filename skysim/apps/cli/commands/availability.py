@@ -153,7 +153,7 @@ def write_picture(path: Path, found: SkySamples, scene: Scene) -> None:
     import numpy as np
 
     from skysim.core.files import atomic_file
-    from skysim.results.plots import INK, png
+    from skysim.results.plots import (INK, png)
 
     assert scene.orbit is not None
     assert scene.orbit.exclusion is not None

@@ -219,7 +219,7 @@ def worst(
     json: Json = False,
 ) -> None:
     """Name the attitudes of the worst trials, and the commands that repeat them."""
-    from skysim.experiments.study.analysis import worst as analysis
+    from skysim.experiments.study import worst as analysis
     from skysim.results import metrics
 
     study, out = located(study, out)
@@ -275,7 +275,7 @@ def run_and_report(
     resumed       : the store may hold trials already
     repeat_failed : repeat the failed trials too
     """
-    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study import search
     from skysim.experiments.study.execution import (store)
     from skysim.experiments.study.execution import runner
 
@@ -314,8 +314,8 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.analysis import table
+    from skysim.experiments.study import search
+    from skysim.experiments.study import table
     from skysim.experiments.study.report import study_report
 
     path = folder_of(study, out) / "report.html"

@@ -20,7 +20,7 @@ from nicegui import json
 from skysim.apps.gui.messages import (LIMITS, Display, Pixels)
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
-from skysim.results.annotate import CURVES
+from skysim.results.plots import CURVES
 
 
 

@@ -22,14 +22,14 @@ from skysim.apps.gui.views.overlay import (FRAMES, ServedFrame, Source, TabFrame
 from skysim.apps.gui.views.overlay import NAMES
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
 
 
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
-STRETCHES = list(annotate.CURVES)
+STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
     "gray": None,
     "gray, inverted": None,
@@ -290,7 +290,7 @@ def color_table(name: str) -> str:
 
 def statistics_text(
     size_px: tuple[int, int],
-    statistics: annotate.FrameStatistics,
+    statistics: plots.FrameStatistics,
     result: TrackerResult | None,
     view: FrameView | None = None,
     scene_info: SceneInfo | None = None,

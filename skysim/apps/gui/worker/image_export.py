@@ -21,7 +21,7 @@ from skysim.core import files as file_io
 from skysim.core.yaml_reader import (VERSION, set_key)
 from skysim.core.files import SCENES
 from skysim.results import scoring
-from skysim.results.annotate import annotate
+from skysim.results.plots import annotate
 from skysim.results.files import recording
 from skysim.scene.loader import find
 

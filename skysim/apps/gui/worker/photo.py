@@ -27,7 +27,7 @@ from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
 from skysim.results import (scoring)
-from skysim.results import annotate
+from skysim.results import plots
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Photo:
     size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
-    statistics: annotate.FrameStatistics
+    statistics: plots.FrameStatistics
     pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
     lens: Lens | None = None
@@ -102,7 +102,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         (width, height),
         result,
         {},
-        annotate.frame_statistics(frame.image_dn, frame.saturation_dn),
+        plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.lab.camera.mount),
         lights=true_lights(truth, magnitude_by_id(setup.lab)),
@@ -134,7 +134,7 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    statistics = annotate.frame_statistics(image, saturation_dn)
+    statistics = plots.frame_statistics(image, saturation_dn)
     photo = Photo((width, height), result, solution, statistics)
     if attitude.solved:
         camera = attitude.camera or tracker.camera

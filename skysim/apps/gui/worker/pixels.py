@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import (Display, Pixels)
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
-from skysim.results import annotate
+from skysim.results import plots
 
 
 
@@ -117,7 +117,7 @@ def shades(
     rows = max(round(height * columns / width), 1)
     low, high = limits
     fraction = np.clip((np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1)
-    table = np.rint((SHADES - 1) * annotate.CURVES[curve](fraction)).astype(np.uint8)
+    table = np.rint((SHADES - 1) * plots.CURVES[curve](fraction)).astype(np.uint8)
     shaded = np.empty((rows, columns), np.uint8)
     _shade(integers, table, shaded)
     if len(table) - 1 >= saturation:
@@ -203,7 +203,7 @@ def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[f
         return float(low), float(high)
     if limits == "min to max":
         return float(integers.min()), float(integers.max())
-    return annotate.display_levels(integers)
+    return plots.display_levels(integers)
 
 
 def histogram(integers: NDArray) -> dict[str, Any]:
@@ -212,7 +212,7 @@ def histogram(integers: NDArray) -> dict[str, Any]:
 
     sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
     """
-    sample = integers[:: 2 * annotate.SAMPLE_STRIDE, :: annotate.SAMPLE_STRIDE].astype(float)
+    sample = integers[:: 2 * plots.SAMPLE_STRIDE, :: plots.SAMPLE_STRIDE].astype(float)
     low = float(integers.min())
     high = float(integers.max())
     below, sky = np.percentile(sample, (25, 50))

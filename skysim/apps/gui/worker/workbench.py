@@ -20,7 +20,7 @@ from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import (scoring)
-from skysim.results import annotate
+from skysim.results import plots
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -154,7 +154,7 @@ class Workbench:
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
-            annotate.frame_statistics(frame.image_dn, frame.saturation_dn),
+            plots.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
             result,
             1e3 * seconds,

@@ -28,7 +28,7 @@ from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions,
 from skysim.experiments.papers.compare import (bootstrap_interval, confidence_interval, sample_std, symmetric_interval)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import MoffatPsfConfig

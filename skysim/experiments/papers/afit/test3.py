@@ -43,7 +43,7 @@ from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentO
 from skysim.experiments.papers.compare import bootstrap_interval
 from skysim.experiments.papers.published import (experiments, published_values)
 from skysim.results.metrics import Summary, exact, extremum
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.simulation.lab import Lab
 
 

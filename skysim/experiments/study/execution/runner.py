@@ -29,7 +29,7 @@ from skysim.experiments.study.execution.setups import (TrialSetup, prepared_setu
 from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.results.annotate import (annotate, visible)
+from skysim.results.plots import (annotate, visible)
 from skysim.results.files import recording
 from skysim.tracking import factory
 

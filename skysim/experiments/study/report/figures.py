@@ -5,23 +5,23 @@ from __future__ import annotations
 from typing import Any
 import numpy as np
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import (is_share, label)
+from skysim.experiments.study.table import (is_share, label)
 from skysim.experiments.study.plan import Heat, Map
 from skysim.results.metrics import MORE_IS_BETTER, split_name
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
-from skysim.experiments.study.analysis.table import (Axis, axis, is_sampled, is_share, label, shown_points)
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
+from skysim.experiments.study.table import (Axis, axis, is_sampled, is_share, label, shown_points)
+from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.thresholds import (crossings, thresholds_of)
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
-from skysim.results.plots import INK, MARKS, png
+from skysim.results.plots import (INK, MARKS, png)
 
 if TYPE_CHECKING:
-    from skysim.experiments.study.analysis.table import Index
+    from skysim.experiments.study.table import Index
 
 
 

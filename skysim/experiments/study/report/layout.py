@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import (Axis, axis, distinct, fixed_levels, group_points, is_sampled, label, shown_points)
-from skysim.experiments.study.analysis.table import (PointRow, format_level, has_few_values)
-from skysim.experiments.study.analysis.thresholds import thresholds_of
+from skysim.experiments.study.table import (Axis, axis, distinct, fixed_levels, group_points, is_sampled, label, shown_points)
+from skysim.experiments.study.table import (PointRow, format_level, has_few_values)
+from skysim.experiments.study.thresholds import thresholds_of
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.results import metrics
 from skysim.results.metrics import Summary

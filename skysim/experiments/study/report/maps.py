@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import (axis, group_points, shown_points)
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
+from skysim.experiments.study.table import (axis, group_points, shown_points)
+from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.worst import (ColumnsOf, WorstTrial, worst_trials)
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.layout import caption_title, fixed_text
 from skysim.experiments.study.report.figures import (HATCHED, add_color_bar, color_scale, halo)

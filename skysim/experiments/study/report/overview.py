@@ -12,7 +12,7 @@ import numpy as np
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import format_level
+from skysim.experiments.study.table import format_level
 from skysim.experiments.study.factors import (Point, make_point)
 from skysim.experiments.study.execution.trials import rate_axis
 from skysim.experiments.study.factors import (Distribution, Factor, Range)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skysim.core.errors import InputError, unknown_name
 from skysim.core import files
-from skysim.experiments.study.analysis.table import (level_columns, table, to_columns, with_levels)
+from skysim.experiments.study.table import (level_columns, table, to_columns, with_levels)
 from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 
 from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis import search
-from skysim.experiments.study.analysis import table as sensitivity
-from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.analysis.table import (axis, is_sampled, same, shown_points)
-from skysim.experiments.study.analysis.search import SearchResult
-from skysim.experiments.study.analysis.table import Index
-from skysim.experiments.study.analysis.table import (PointRow, format_response, format_summary)
-from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study import answer
+from skysim.experiments.study import search
+from skysim.experiments.study import table as sensitivity
+from skysim.experiments.study import table as tables
+from skysim.experiments.study.table import (axis, is_sampled, same, shown_points)
+from skysim.experiments.study.search import SearchResult
+from skysim.experiments.study.table import Index
+from skysim.experiments.study.table import (PointRow, format_response, format_summary)
+from skysim.experiments.study.worst import ColumnsOf
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import (layout)

@@ -7,17 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
 import mujoco
 import numpy as np
-
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (Hinges, add_motor, joints, member_values)
-from skysim.dynamics.multibody.actuators.kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (Hinges, add_motor, joints, member_values)
+from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
 from skysim.scene.sections.vehicle import CmgsConfig
+
+
 
 GIMBAL = "gimbal_"
 ROTOR = "rotor_"
@@ -300,3 +300,5 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
 CMGS = ActuatorKind(
     "cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs
 )
+
+

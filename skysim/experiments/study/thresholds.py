@@ -12,17 +12,17 @@ import bisect
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
-
 import numpy as np
 import scipy
-
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import table
-from skysim.experiments.study.analysis.table import Axis
-from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study import table
+from skysim.experiments.study.table import Axis
+from skysim.experiments.study.table import PointRow
 from skysim.experiments.study.plan import Curve, Study, Threshold
 from skysim.results import metrics
+
+
 
 TAIL = (1 - metrics.CONFIDENCE) / 2
 MOST_TRIALS = 1_000_000  # more trials than that are no advice
@@ -270,3 +270,5 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     if math.isinf(found.high):
         return f"{100 * metrics.CONFIDENCE:g} %: above {low}{needs}"
     return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"
+
+

@@ -9,16 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 import numpy as np
-from skysim.experiments.study.analysis.table import (Place, PointRow)
+from skysim.experiments.study.table import (Place, PointRow)
 from skysim.results import metrics
 from skysim.results.metrics import Summary
-from skysim.experiments.study.analysis import (thresholds)
-from skysim.experiments.study.analysis.table import (axis, distinct, unit_of)
-from skysim.experiments.study.analysis.table import (Place, PointRow, format_level, format_summary, has_few_values)
+from skysim.experiments.study import thresholds
+from skysim.experiments.study.table import (axis, distinct, unit_of)
+from skysim.experiments.study.table import (Place, PointRow, format_level, format_summary, has_few_values)
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
-
-
 
 
 

@@ -12,15 +12,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
-
 import mujoco
 import numpy as np
-
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (Hinges, add_motor, joints, member_values)
-from skysim.dynamics.multibody.actuators.kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (Hinges, add_motor, joints, member_values)
+from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
 from skysim.scene.sections.vehicle import WheelsConfig
+
+
 
 WHEEL = "wheel_"
 
@@ -110,3 +110,5 @@ def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
 
 
 WHEELS = ActuatorKind("wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels)
+
+

@@ -24,7 +24,7 @@ from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights
 from skysim.experiments.study.execution import detections
 from skysim.results.metrics import Summary
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.scene.loader import load
 from skysim.simulation.lab import (Lab, build_lab)
 from skysim.tracking import onboard_model

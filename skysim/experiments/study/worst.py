@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import points_at
-from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.table import points_at
+from skysim.experiments.study.table import PointRow
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.results import metrics
 from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import Columns
+
+
 
 COUNT = 3  # number of worst trials that a report lists
 DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
@@ -184,3 +184,5 @@ def worst_of_levels(
     rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
     chosen = points_at(rows, study, levels)
     return worst_trials(store.point_columns(*(row.point for row in chosen)), response, count)
+
+

@@ -18,7 +18,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.experiments.papers.shefex.shefex_setup import (CHOSEN_COS_ERROR, MAX_CENTROIDS, PIXEL_RAD, PRINTED_FIELD_RAD, PUBLISHED, StarField, identify_and_solve, pairs, plot_curve, random_fields, search_options, shefex_lab)
+from skysim.experiments.papers.shefex_setup import (CHOSEN_COS_ERROR, MAX_CENTROIDS, PIXEL_RAD, PRINTED_FIELD_RAD, PUBLISHED, StarField, identify_and_solve, pairs, plot_curve, random_fields, search_options, shefex_lab)
 from skysim.experiments.study.report.figures import logarithmic
 from skysim.results.metrics import Summary, exact, extremum, proportion
 from skysim.tracking import onboard_model

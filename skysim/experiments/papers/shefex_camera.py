@@ -17,17 +17,17 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
 from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import (bootstrap_interval, bootstrap_of_means)
-from skysim.experiments.papers.shefex.shefex_nights import (FULL_MOON, exposure_override, render_frames)
-from skysim.experiments.papers.shefex.shefex_setup import (MAX_CENTROIDS, PUBLISHED)
+from skysim.experiments.papers.shefex_nights import (FULL_MOON, exposure_override, render_frames)
+from skysim.experiments.papers.shefex_setup import (MAX_CENTROIDS, PUBLISHED)
 from skysim.results.metrics import Summary, exact, quantile
-from skysim.results.plots import INK, MARKS
+from skysim.results.plots import (INK, MARKS)
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import (StarCamera, build_lab)
 from skysim.simulation.lights.starlight import BackgroundLight
 from skysim.simulation.timing import exposure_window
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 
 

@@ -19,7 +19,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.papers.compare import (ExperimentOptions, RowResult, format_summary)
 from skysim.experiments.papers.compare import (bootstrap_interval, symmetric_interval)
-from skysim.experiments.papers.shefex.shefex_setup import (apparent, shefex_lab, stars)
+from skysim.experiments.papers.shefex_setup import (apparent, shefex_lab, stars)
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.plan import FrameTrial
@@ -34,13 +34,11 @@ from skysim.camera.glow import background
 from skysim.core.types import Floats, Frame, Truth
 from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.papers.compare import bootstrap_interval
-from skysim.experiments.papers.shefex.shefex_setup import (PUBLISHED, plot_curve, processing_chain)
+from skysim.experiments.papers.shefex_setup import (PUBLISHED, plot_curve, processing_chain)
 from skysim.results import metrics
 from skysim.results.metrics import Summary, proportion
 from skysim.simulation.lab import (build_lab, build_tracker)
 from skysim.tracking import factory
-
-
 
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import Any
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.kind import (add_motor, all_names, sites)
-from skysim.dynamics.multibody.actuators.kind import (RANK_TOLERANCE, ActuatorKind, Actuators, ControlInput, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (add_motor, all_names, sites)
+from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, Actuators, ControlInput, scale_to_limit, unit_columns)
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
+
+
 
 FAN = "fan_"
 
@@ -157,3 +157,5 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
 
 
 FANS = ActuatorKind("fans", add_fans, FanActuator, sites=(FAN,))
+
+

@@ -24,7 +24,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 import numpy as np
 from skysim.core.errors import InputError
-from skysim.experiments.study.analysis.table import (format_level, format_summary)
+from skysim.experiments.study.table import (format_level, format_summary)
 from skysim.experiments.study.factors import (Point, make_point)
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
@@ -36,8 +36,6 @@ from skysim.experiments.study.factors import (Distribution, Range, Value)
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.results import metrics
 from skysim.results.metrics import Columns, Summary
-
-
 
 
 
