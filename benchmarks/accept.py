@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import AREAS
-from skysim.core.files import to_json
-from skysim.core.files import ROOT
+from skysim.core.files import ROOT, to_json
 from skysim.experiments.study.execution.setups import code_version
 
 OUT = ROOT / "out"

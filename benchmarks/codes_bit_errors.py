@@ -26,13 +26,13 @@ from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
-from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.codes import LedCodes
-from skysim.tracking.onboard_model import calibration
+from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking.factory import assumed_settings
+from skysim.tracking.onboard_model import calibration
 
 FRAMES = 250
 MAX_OFF = 0.1  # relative difference from theory

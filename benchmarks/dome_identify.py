@@ -16,13 +16,12 @@ from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
 from estimator.identification import led_search
-from estimator.identification.led_index import (DomeIndex, build_dome_index)
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.layouts import placing
-from skysim.sources.dome.layouts import optimize
-from skysim.sources.dome.surface import (Surface, build_surface)
+from skysim.sources.dome.layouts import optimize, placing
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
 TRIALS = 2000

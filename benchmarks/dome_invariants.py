@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.dome_identify import attitude, leds_m
 from benchmarks.timing import figure
 from estimator.attitude.dome_map import Lever, project
-from estimator.core.checks import (Floats, Ints)
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 from estimator.identification.chance import ACCEPT_DEX, GATE_SIGMA
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab

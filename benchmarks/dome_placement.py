@@ -25,10 +25,8 @@ from skysim.scene.sections import layouts
 from skysim.scene.sections import leds as led_schema
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.layouts import registry
-from skysim.sources.dome.layouts import fisher
-from skysim.sources.dome.layouts import optimize
-from skysim.sources.dome.surface import (Surface, build_surface)
+from skysim.sources.dome.layouts import fisher, optimize, registry
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 from skysim.tracking.onboard_model import calibration
 

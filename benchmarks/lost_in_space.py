@@ -22,8 +22,8 @@ from benchmarks import peers
 from benchmarks.timing import figure, verdict
 from estimator.attitude.solvers import quest
 from estimator.catalog import catalog
-from estimator.core.checks import Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Ints
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker

@@ -20,11 +20,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from benchmarks.timing import figure
-from estimator.calibration.star_field import (Calibration, StarFrame, calibrate, self_calibrate)
+from estimator.calibration.star_field import Calibration, StarFrame, calibrate, self_calibrate
 from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir, raised, refraction_constants
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker

@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.rate import (covariance_of, error_gain, streak_factor)
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.attitude.rate import chords
+from estimator.attitude.rate import chords, covariance_of, error_gain, streak_factor
 from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
@@ -31,7 +30,7 @@ from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import factory
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.timing import verdict
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import (engines, store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.engines import Chunk, Chunks, Engine, Job
 from skysim.experiments.study.execution.outcomes import FIELDS, Outcome
 from skysim.experiments.study.execution.trials import Row, Segment

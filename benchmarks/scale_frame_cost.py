@@ -18,7 +18,6 @@ from benchmarks.scale_rates import CMOS
 from benchmarks.timing import figure
 from skysim.core.types import Floats
 from skysim.experiments import dataset_run
-from skysim.experiments import dataset_run
 from skysim.experiments.dataset_shards import Storage
 
 FRAMES = 32

@@ -24,13 +24,10 @@ from benchmarks import scale_coordination as coordination
 from benchmarks.timing import figure, verdict, versus
 from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
-from skysim.experiments import dataset_run
-from skysim.experiments import dataset_run
-from skysim.experiments import dataset_shards
-from skysim.experiments.dataset_labels import (LabelledFrame, label_frame, labeller)
+from skysim.experiments import dataset_run, dataset_shards
+from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import (engines, store, trials)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
 from skysim.simulation.flight import Flight

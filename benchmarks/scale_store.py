@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from benchmarks.timing import verdict
 from skysim.core.files import make_folder
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import runner, store
 from skysim.results.files import row_parts
 
 STUDY = """

@@ -23,7 +23,7 @@ from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution.trials import visible_rows
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.sources import star_archives
 
 DEEP = Path("out/catalogs/gaia_v10.0.ecsv")

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import figure
-from estimator.catalog import (catalog)
-from estimator.catalog import published_catalogs
+from estimator.catalog import catalog, published_catalogs
 from estimator.core.checks import ImageError
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -26,7 +25,7 @@ from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.onboard_model import calibration
 
 FRAMES = 100

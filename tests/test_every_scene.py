@@ -13,18 +13,18 @@ from estimator.attitude.dome_map import project
 from skysim.camera.glow.display_glow import black_glow
 from skysim.core.files import SCENES
 from skysim.dynamics import multibody
-from skysim.experiments.tracker_comparison import with_config
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results import metrics
 from skysim.results.simulate import render
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import (CollimatedDisplayConfig, StarsConfig)
+from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.simulation.timing import exposure_window
 from skysim.tracking import onboard_model
 

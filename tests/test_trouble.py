@@ -21,11 +21,9 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core.errors import InputError
 from skysim.core import files
-from skysim.results.files import recording
-from skysim.results.files import run_export
-from skysim.results.files import recording
+from skysim.core.errors import InputError
+from skysim.results.files import recording, run_export
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 

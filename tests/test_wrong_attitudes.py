@@ -9,7 +9,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 
 FIELDS = 60
 

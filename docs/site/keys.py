@@ -23,7 +23,7 @@ from estimator.centroiding.centroid import CENTROIDERS
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
-from skysim.apps.gui.views.forms import (file_value, yaml_line)
+from skysim.apps.gui.views.forms import file_value, yaml_line
 from skysim.core.files import ROOT
 from skysim.core.tolerance import ErrorSchema
 from skysim.core.units import ConfigModel, si_unit

@@ -9,8 +9,7 @@ import cv2
 
 from skysim.core import files
 from skysim.dynamics.multibody.scene_picture import picture
-from skysim.results import (telemetry_report)
-from skysim.results import plots
+from skysim.results import plots, telemetry_report
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 

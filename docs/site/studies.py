@@ -16,7 +16,6 @@ from skysim.core.types import Floats
 from skysim.experiments.study import search
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE, Store
-from skysim.experiments.study.study_file import load
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import (
     POINTS,
@@ -25,6 +24,7 @@ from skysim.experiments.study.report.study_report import (
     commands,
     compose,
 )
+from skysim.experiments.study.study_file import load
 from skysim.results.report import Report, Section, Text
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"

@@ -10,21 +10,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.types import Centroids, RateEstimate
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.least_squares import misfit_factor
-from typing import Any
-
-
-
-
+from estimator.core.types import Centroids, RateEstimate
 
 # Motion of the images of a turning camera: velocities, the rows' times of a rolling shutter, a
 # frame at one time.
@@ -33,8 +29,12 @@ from typing import Any
 class Sight(NamedTuple):
     """Where the lights are that a camera sees.
 
-    lever_cam_m : (3,) the camera from the bearing, in camera axes
-    radius_m    : distance of the lights from the bearing: of all, or (N,) of each
+    Attributes
+    ----------
+    lever_cam_m
+        (3,) the camera from the bearing, in camera axes
+    radius_m
+        Distance of the lights from the bearing: of all, or (N,) of each
     """
 
     lever_cam_m: Floats
@@ -55,7 +55,10 @@ STARS = Sight(np.zeros(3), 1.0)  # without a lever arm the distance has no effec
 def places_cam(rays_cam: Floats, sight: Sight) -> Floats:
     """(N, 3) places of lights from the bearing, in camera axes, from their rays (N, 3).
 
-    Raises ValueError if the camera is farther from the bearing than a light.
+    Raises
+    ------
+    ValueError
+        If the camera is farther from the bearing than a light.
     """
     return on_sphere(rays_cam, sight.lever_cam_m, sight.radius_m)
 
@@ -225,8 +228,6 @@ def _fit(
     )
 
 
-
-
 # Angular rate of the camera from the shape of round lights in one frame of a rolling shutter: a
 # first guess.
 
@@ -276,12 +277,19 @@ def _roots(moments_px2: Floats, rows: float, side: int) -> Any:
     return z
 
 
-def _fit_disks(roots: Any, sigma_px: Floats, motion_px: Floats, start: complex) -> RateEstimate | None:
+def _fit_disks(
+    roots: Any, sigma_px: Floats, motion_px: Floats, start: complex
+) -> RateEstimate | None:
     """The rate from one of the two roots (2, N) of each light: the one nearer to the motion by the last rate.
 
-    sigma_px  : (2, N) of the roots
-    motion_px : (N, 2, 3) motion of each image from row to row, by the rate
-    start     : root of the median moments
+    Parameters
+    ----------
+    sigma_px
+        (2, N) of the roots
+    motion_px
+        (N, 2, 3) motion of each image from row to row, by the rate
+    start
+        Root of the median moments
     """
     near = np.full(roots.shape[1], start)
     for _ in range(DISK_ROUNDS):
@@ -296,5 +304,3 @@ def _fit_disks(roots: Any, sigma_px: Floats, motion_px: Floats, start: complex) 
         rate = np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, measured))
         near = (motion_px @ rate) @ np.array([1, 1j])
     return RateEstimate(rate, np.asarray(usable.sum() * np.linalg.inv(normal), dtype=float))
-
-

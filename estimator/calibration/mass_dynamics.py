@@ -24,14 +24,12 @@ Arrays have their components first, (3, B) for B motions.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
-from typing import NamedTuple
-from estimator.core.checks import (Floats, Ints)
 
-
+from estimator.core.checks import Floats, ImageError, Ints
 
 # What is measured of a motion on an air bearing, what is assumed of it, and what is to be found.
 
@@ -54,14 +52,24 @@ MIN_ATTITUDES = 4
 class BearingRecord:
     """One motion without contact: attitudes of the star tracker, and momenta of the wheels by their speeds.
 
-    t_s                : (N,) ascending times of the attitudes
-    lab_from_body      : N measured attitudes
-    covariance_rad2    : (N, 3, 3) of their errors, rotation vectors in body axes
-    wheel_t_s          : (M,) ascending times of the wheel speeds, over all attitudes' times
-    wheel_momentum_nms : (M, n) assumed axial inertia times measured speed
-    added_inertia_kg_m2, added_moment_kg_m : (3, 3) and (3,) that trim masses have added to the vehicle since the
-        configuration whose mass properties are sought
-    systematic_rad2    : (N, 3, 3) the part of covariance_rad2 that attitudes near one another share; None without one
+    Attributes
+    ----------
+    t_s
+        (N,) ascending times of the attitudes
+    lab_from_body
+        N measured attitudes
+    covariance_rad2
+        (N, 3, 3) of their errors, rotation vectors in body axes
+    wheel_t_s
+        (M,) ascending times of the wheel speeds, over all attitudes' times
+    wheel_momentum_nms
+        (M, n) assumed axial inertia times measured speed
+    added_inertia_kg_m2, added_moment_kg_m
+        (3, 3) and (3,) that trim masses have added to the vehicle since the configuration whose
+        mass properties are sought
+    systematic_rad2
+        (N, 3, 3) the part of covariance_rad2 that attitudes near one another share; None
+        without one
     """
 
     t_s: Floats
@@ -105,11 +113,18 @@ class BearingRecord:
 class LabConstants:
     """What is known of the lab and of the wheels.
 
-    gravity_m_s2, earth_lab_rad_s : along lab -z; (3,) the Earth's rate
-    wheel_axes            : (3, n) in body axes
-    torque_rms_nm         : (3,) standard deviation of the random torque (air currents) about each lab axis
-    torque_correlation_s  : its correlation time; its autocorrelation is rms^2 exp(-|lag| / correlation)
-    wheel_sigma_nms       : standard deviation of a measured wheel momentum, independent from sample to sample
+    Attributes
+    ----------
+    gravity_m_s2, earth_lab_rad_s
+        Along lab -z; (3,) the Earth's rate
+    wheel_axes
+        (3, n) in body axes
+    torque_rms_nm
+        (3,) standard deviation of the random torque (air currents) about each lab axis
+    torque_correlation_s
+        Its correlation time; its autocorrelation is rms^2 exp(-|lag| / correlation)
+    wheel_sigma_nms
+        Standard deviation of a measured wheel momentum, independent from sample to sample
     """
 
     gravity_m_s2: float
@@ -143,9 +158,16 @@ class Prior:
 class MassEstimate:
     """The nine mass properties with their covariance, and the other parameters.
 
-    values, covariance : (P,) and (P, P), in the order of `Prior`
-    misfit     : chi-square of the residuals over their number; 1 if noise and torques are as assumed
-    iterations : 0 of a recursive estimate;  attitude_factor : by which the attitudes' noise was scaled
+    Attributes
+    ----------
+    values, covariance
+        (P,) and (P, P), in the order of `Prior`
+    misfit
+        chi-square of the residuals over their number; 1 if noise and torques are as assumed
+    iterations
+        0 of a recursive estimate
+    attitude_factor
+        By which the attitudes' noise was scaled
     """
 
     values: Floats
@@ -245,7 +267,10 @@ def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
 class EquationsOfMotion:
     """The equations of motion of one record, for given parameters (P, B) of B motions.
 
-    assumed : (P,) parameters with the inertia J0
+    Attributes
+    ----------
+    assumed
+        (P,) parameters with the inertia J0
     """
 
     def __init__(
@@ -334,13 +359,23 @@ def difference_steps(
 
 
 def transition(
-    record: BearingRecord, lab: LabConstants, first: int, before: States, values: Floats, prior: Prior
+    record: BearingRecord,
+    lab: LabConstants,
+    first: int,
+    before: States,
+    values: Floats,
+    prior: Prior,
 ) -> Transition:
     """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
 
-    values : (P,) parameters;  prior : its standard deviations scale the steps of their difference quotients
-
     Every interval is integrated once for each element of state and parameters, a little changed, all at once.
+
+    Parameters
+    ----------
+    values
+        (P,) parameters
+    prior
+        Its standard deviations scale the steps of their difference quotients
     """
     count = before.momentum.shape[1]
     size = len(values)
@@ -418,5 +453,3 @@ def momentum_scale(
     R_lab_from_body = states.rotation.as_matrix()
     scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))
     return np.asarray(R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1))
-
-

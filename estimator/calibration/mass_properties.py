@@ -18,22 +18,32 @@ those of the noise alone, and the covariance of the parameters has what the shar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial.transform import Rotation
-from estimator.calibration.mass_dynamics import (STATE, EquationsOfMotion, States, inverse_inertia, momentum_scale, transition, turn)
-from estimator.calibration.mass_dynamics import (BIAS, BearingRecord, LabConstants, MassEstimate, Prior, inertia_matrix)
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+
+from estimator.calibration.mass_dynamics import (
+    BIAS,
+    MIN_ATTITUDES,
+    STATE,
+    BearingRecord,
+    EquationsOfMotion,
+    LabConstants,
+    MassEstimate,
+    Prior,
+    States,
+    inertia_matrix,
+    inverse_inertia,
+    momentum_scale,
+    transition,
+    turn,
+)
+from estimator.core.checks import Floats, ImageError
 from estimator.filter.states import TrackerModel
-from collections.abc import Iterator
-from estimator.calibration.mass_dynamics import (STATE, transition)
-from estimator.calibration.mass_dynamics import (BIAS, MIN_ATTITUDES, BearingRecord, LabConstants, MassEstimate, Prior)
-
-
 
 MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
@@ -61,7 +71,9 @@ class Reduced(NamedTuple):
     chi2: float
 
 
-def estimate_mass(records: Sequence[BearingRecord], lab: LabConstants, prior: Prior) -> MassEstimate:
+def estimate_mass(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
     """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
     values = prior.values.copy()
     motions = [first_states(record, lab, values) for record in records]
@@ -93,7 +105,9 @@ def estimate_mass(records: Sequence[BearingRecord], lab: LabConstants, prior: Pr
     )
 
 
-def estimate_with_noise(records: Sequence[BearingRecord], lab: LabConstants, prior: Prior) -> MassEstimate:
+def estimate_with_noise(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
     """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
     A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
@@ -257,8 +271,6 @@ def lower_band(diagonal: Floats, beside: Floats) -> Floats:
     return band
 
 
-
-
 # Mass properties in flight: an extended Kalman filter of state and parameters, one attitude after
 # another.
 
@@ -346,5 +358,3 @@ def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
     kept[:, :3] -= gain
     kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain
     return np.asarray(kept @ covariance @ kept.T + gain @ noise @ gain.T)
-
-

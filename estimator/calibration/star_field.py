@@ -13,28 +13,25 @@ by the square of the field angle, and k2 and k3 resemble k1 over a narrow field.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-import numpy as np
-from estimator.core import checks
-from estimator.core.checks import Floats
-from estimator.core.constants import SIGMA_PER_MAD
-from estimator.core.checks import ImageError
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
+
+import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.catalog.catalog import StarCatalog
-from estimator.core.checks import (Floats, Ints)
+from estimator.core import checks
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.types import Attitude, Centroids
-
-
 
 # Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
 
@@ -43,9 +40,14 @@ from estimator.core.types import Attitude, Centroids
 class MagnitudeZero:
     """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
 
-    sigma_mag   : standard deviation of the offset
-    scatter_mag : of one star about the offset, mainly by its color
-    stars       : number of different stars
+    Attributes
+    ----------
+    sigma_mag
+        Standard deviation of the offset
+    scatter_mag
+        Of one star about the offset, mainly by its color
+    stars
+        Number of different stars
     """
 
     offset_mag: float
@@ -91,9 +93,19 @@ MIN_STAR_FRACTION = (
 class StarFrame:
     """Identified stars of one frame.
 
-    xy_px : (K, 2);  sigma_px : (K,) of each coordinate;  vectors_ref : (K, 3) unit vectors of the identified stars
-    flux, v_mag : (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None without it
-    exposure_s  : of the frame
+    Attributes
+    ----------
+    xy_px
+        (K, 2)
+    sigma_px
+        (K,) of each coordinate
+    vectors_ref
+        (K, 3) unit vectors of the identified stars
+    flux, v_mag
+        (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None
+        without it
+    exposure_s
+        Of the frame
     """
 
     xy_px: Floats
@@ -108,9 +120,13 @@ class StarFrame:
 class LensPrior:
     """Prior standard deviations of the lens parameters about the start camera.
 
-    center : of the principal point, as a fraction of the chip's width
-    radial, tangential : displacement by each coefficient alone in the farthest corner, as a fraction of the corner's
-        distance from the center
+    Attributes
+    ----------
+    center
+        Of the principal point, as a fraction of the chip's width
+    radial, tangential
+        Displacement by each coefficient alone in the farthest corner, as a fraction of the
+        corner's distance from the center
     """
 
     center: float = 0.05
@@ -130,15 +146,26 @@ class LensPrior:
 class FieldReport:
     """Diagnostics of a calibration.
 
-    status       : "converged", or "stopped ..." if the iteration did not converge
-    cam_from_ref : (F,) attitudes; identity for a frame that is not `tied`
-    attitude_covariance_rad2 : (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
-    tied         : (F,) frames with three or more stars
-    outliers     : (K, 2) frame, and row in it, of the stars rejected as wrong identifications
-    stars        : number of sightings used
-    rms_px       : of the residual coordinates
-    misfit       : sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
-    magnitude    : zero point; None if the frames have no brightness
+    Attributes
+    ----------
+    status
+        "converged", or "stopped ..." if the iteration did not converge
+    cam_from_ref
+        (F,) attitudes; identity for a frame that is not `tied`
+    attitude_covariance_rad2
+        (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
+    tied
+        (F,) frames with three or more stars
+    outliers
+        (K, 2) frame, and row in it, of the stars rejected as wrong identifications
+    stars
+        Number of sightings used
+    rms_px
+        Of the residual coordinates
+    misfit
+        sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
+    magnitude
+        Zero point; None if the frames have no brightness
     """
 
     status: str
@@ -223,11 +250,16 @@ def self_calibrate(
 ) -> Calibration:
     """Calibrate a camera from centroids alone: alternately identify the stars and calibrate with them.
 
-    tracker : makes a tracker from a camera and the relative uncertainty of its focal length, 0 after a calibration
-    camera  : prior knowledge: the chip, and the focal length to `focal_uncertainty`
-
     Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
     many (MIN_STAR_FRACTION). Raises ValueError if no frame is identified.
+
+    Parameters
+    ----------
+    tracker
+        Makes a tracker from a camera and the relative uncertainty of its focal length, 0 after
+        a calibration
+    camera
+        Prior knowledge: the chip, and the focal length to `focal_uncertainty`
     """
     checks.each_of_type("self_calibrate: frames", frames, Centroids)
     checks.of_type("self_calibrate: camera", camera, Camera)
@@ -424,8 +456,15 @@ def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Float
 def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_Problem, bool]:
     """Minimize over lens and attitudes by Levenberg-Marquardt; returns the problem and whether it converged.
 
-    width : of Cauchy's loss in sigmas; inf for least squares
-    Raises ValueError if the lens is undetermined.
+    Parameters
+    ----------
+    width
+        Of Cauchy's loss in sigmas; inf for least squares
+
+    Raises
+    ------
+    ValueError
+        If the lens is undetermined.
     """
     damping = 1e-4
     cost, weight = problem.cost(sightings, width)
@@ -535,5 +574,3 @@ def _identified(
                 )
             )
     return identified
-
-

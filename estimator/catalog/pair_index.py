@@ -13,32 +13,46 @@ hold the other stars of its pairs, sorted by separation, and are searched by bis
 from __future__ import annotations
 
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
-from estimator.core.jit import jit
-from estimator.core.checks import (Floats, Ints)
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.constants import ARCSEC_RAD
-
+from estimator.core.jit import jit
 
 
 class PairIndex(NamedTuple):
     """Pairs of catalog stars closer than max_angle_rad. A named tuple, so that compiled code accepts it.
 
-    vectors   : (N, 3) unit vectors, brightest star first
-    pair      : (P, 2) star rows, by increasing angle;  angle_rad : (P,)
-    kvector   : (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
-    slope_rad, offset_rad : the line of the k-vector
-    first     : (N + 1,) first entry of each star in `neighbor`
-    neighbor : rows of the neighbors, by increasing angle;  separation_rad : their angles
-    group     : (N,) label of each star's group (patch board); pairs within a group are left out of `pair`, as
-        the pattern of a board repeats on every other board
-    magnitude : (N,) increasing, in the camera's own scale; NaN if unknown
-    cells     : the stars by direction
+    Attributes
+    ----------
+    vectors
+        (N, 3) unit vectors, brightest star first
+    pair
+        (P, 2) star rows, by increasing angle
+    angle_rad
+        (P,)
+    kvector
+        (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
+    slope_rad, offset_rad
+        The line of the k-vector
+    first
+        (N + 1,) first entry of each star in `neighbor`
+    neighbor
+        Rows of the neighbors, by increasing angle
+    separation_rad
+        Their angles
+    group
+        (N,) label of each star's group (patch board); pairs within a group are left out of
+        `pair`, as the pattern of a board repeats on every other board
+    magnitude
+        (N,) increasing, in the camera's own scale; NaN if unknown
+    cells
+        The stars by direction
     """
 
     vectors: Floats
@@ -64,10 +78,18 @@ def build(
 ) -> PairIndex:
     """Index all pairs of (N, 3) unit vectors, brightest first, up to an angle.
 
-    group     : (N,) labels of stars not placed independently (LEDs of one patch board); if omitted, each star is
-        its own group
-    magnitude : (N,) non-decreasing; unknown if omitted
-    Raises ImageError for fewer than 3 pairs and for magnitudes that decrease or are not one for each star.
+    Parameters
+    ----------
+    group
+        (N,) labels of stars not placed independently (LEDs of one patch board); if omitted,
+        each star is its own group
+    magnitude
+        (N,) non-decreasing; unknown if omitted
+
+    Raises
+    ------
+    ImageError
+        For fewer than 3 pairs and for magnitudes that decrease or are not one for each star.
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
@@ -179,8 +201,6 @@ def first_from(values: Floats, begin: int, end: int, least: float) -> int:
     return begin
 
 
-
-
 # Boeing's pair catalog: star pairs grouped into buckets of separation, without storing the
 # separations.
 
@@ -191,11 +211,21 @@ BUCKET_WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.
 class PairCatalog(NamedTuple):
     """Stars, and their pairs in buckets of separation.
 
-    vectors   : (N, 3) unit;  magnitude : (N,) any scale
-    pair      : (P, 2) star rows, bucket after bucket, unsorted within a bucket
-    table     : (M + 1,) first pair of each bucket; the last entry is P
-    max_rad   : upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i) width_rad
-    cells     : the stars by direction; Boeing sorts them by declination instead
+    Attributes
+    ----------
+    vectors
+        (N, 3) unit
+    magnitude
+        (N,) any scale
+    pair
+        (P, 2) star rows, bucket after bucket, unsorted within a bucket
+    table
+        (M + 1,) first pair of each bucket; the last entry is P
+    max_rad
+        Upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i)
+        width_rad
+    cells
+        The stars by direction; Boeing sorts them by declination instead
     """
 
     vectors: Floats
@@ -216,8 +246,12 @@ def build_pair_catalog(
 ) -> PairCatalog:
     """Build the catalog of pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
 
-    range_rad : range of angles, both ends included; if omitted, that of the pairs found
     Buckets are counted back from the largest angle. Raises ImageError where there is no pair.
+
+    Parameters
+    ----------
+    range_rad
+        Range of angles, both ends included; if omitted, that of the pairs found
     """
     vectors = np.ascontiguousarray(vectors, dtype=float)
     if not width_rad > 0:
@@ -270,5 +304,3 @@ def candidates(catalog: PairCatalog, low_rad: float, high_rad: float) -> tuple[i
     limits = np.array([low_rad, high_rad])
     first, last = bucket_of(limits, catalog.max_rad, catalog.width_rad, buckets)
     return catalog.table[first], catalog.table[last + 1]
-
-

@@ -10,22 +10,19 @@ unpublished and is not imitated.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
-from estimator.catalog import catalog
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.checks import ImageError
-from collections.abc import Callable
 from numpy.typing import NDArray
-from estimator.catalog import sky_index
+
+from estimator.catalog import catalog, sky_index
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.sky_index import (Cells, within)
-from estimator.core.checks import Floats
+from estimator.catalog.sky_index import Cells, within
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.jit import jit
-
-
 
 # of a G2 star, used where the catalog has no color
 SUN_B_V = 0.65
@@ -45,8 +42,18 @@ class Color(NamedTuple):
 class OnBoard:
     """A catalog at one epoch, as a tracker stores it.
 
-    id        : (N,) of the brightest star in each entry;  vectors : (N, 3) unit, barycentric, ICRS axes
-    magnitude : (N,) instrumental;  components : (N,) number of catalog stars in each entry;  epoch_yr : Julian year
+    Attributes
+    ----------
+    id
+        (N,) of the brightest star in each entry
+    vectors
+        (N, 3) unit, barycentric, ICRS axes
+    magnitude
+        (N,) instrumental
+    components
+        (N,) number of catalog stars in each entry
+    epoch_yr
+        Julian year
     """
 
     id: Ints
@@ -64,10 +71,15 @@ def read_cat(
 ) -> OnBoard:
     """READCAT: select stars to a limiting V, propagate to the mission epoch, compute instrumental magnitudes.
 
-    epoch_yr : that of the file if omitted
-    color : coefficients of the instrument; if omitted the magnitude is V, and the file needs no color columns. A
-        missing color is replaced by that of the Sun
     Keeps the order of the file. Raises ImageError for a file that is not a catalog, and if no star is bright enough.
+
+    Parameters
+    ----------
+    epoch_yr
+        That of the file if omitted
+    color
+        Coefficients of the instrument; if omitted the magnitude is V, and the file needs no
+        color columns. A missing color is replaced by that of the Sun
     """
     numbers, file_epoch_yr = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
     numbers = numbers[:, numbers[6] <= limit_v_mag]
@@ -148,8 +160,6 @@ def log(stars: OnBoard, step_mag: float = 0.5) -> str:
     return "\n".join(lines) + "\n"
 
 
-
-
 # SHEFEX-2's on-board catalogs: a magnitude limit for each hemisphere, and a uniform distribution
 # over the sky.
 
@@ -226,5 +236,3 @@ CATALOGS: dict[str, Selection] = {
     "uniform": lambda stars: uniform(stars.take(stars.v_mag <= 5.75), COUNT),
     "chosen": chosen,
 }
-
-

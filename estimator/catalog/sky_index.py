@@ -14,16 +14,12 @@ from __future__ import annotations
 
 from math import pi, sqrt
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.core.checks import Floats
+
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
-from math import sqrt
-from estimator.core.checks import ImageError
-
-
-
-
 
 # Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into
 # cells.
@@ -35,8 +31,14 @@ MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
 class Cells(NamedTuple):
     """Stars by the cell of the cube [-1, 1]^3 that holds their direction. A named tuple, for compiled code.
 
-    side  : cells along an edge
-    first : (side^3 + 1,) first entry of each cell in `row`;  row : (N,) rows of the vectors, cell after cell
+    Attributes
+    ----------
+    side
+        Cells along an edge
+    first
+        (side^3 + 1,) first entry of each cell in `row`
+    row
+        (N,) rows of the vectors, cell after cell
     """
 
     side: int
@@ -114,7 +116,9 @@ def within(
 
 
 @jit
-def nearest_in_grid(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
+def nearest_in_grid(
+    cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float
+) -> int:
     """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
     best = -1
     least2 = chord * chord
@@ -147,13 +151,23 @@ FACE_HALF_WIDTH = 1.2
 class SkyIndex(NamedTuple):
     """Stars, and pairs of the brightest, in bins. A named tuple, so that compiled code accepts it.
 
-    vectors : (N, 3) unit vectors, brightest star first
-    pair    : (P, 2) rows of stars, in bins of the angle between them
-    first   : (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
-    mag     : (N,) magnitudes, increasing;  share : their density per magnitude, from mag[0] in steps of MAG_STEP
-    cell_first, cell_star : the stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
+    Attributes
+    ----------
+    vectors
+        (N, 3) unit vectors, brightest star first
+    pair
+        (P, 2) rows of stars, in bins of the angle between them
+    first
+        (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
+    mag
+        (N,) magnitudes, increasing
+    share
+        Their density per magnitude, from mag[0] in steps of MAG_STEP
+    cell_first, cell_star
+        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
         cube has side x side cells
-    cells   : the stars in the cells of `spatial_grid`, for wide searches
+    cells
+        The stars in the cells of `spatial_grid`, for wide searches
     """
 
     vectors: Floats
@@ -178,7 +192,11 @@ def build(
 ) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
-    paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
+    Parameters
+    ----------
+    paired
+        Number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3
+        pairs.
     """
     sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors[:paired]
@@ -313,8 +331,12 @@ def nearest(
 ) -> tuple[int, float]:
     """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
 
-    gate : radians, at most 0.05
     The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
+
+    Parameters
+    ----------
+    gate
+        Radians, at most 0.05
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax = abs(x)
@@ -358,5 +380,3 @@ def nearest(
                 best = star
                 closest2 = distance2
     return best, closest2
-
-

@@ -7,19 +7,15 @@ array, or an int in place of a float, would cost a compilation of seconds.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
 import difflib
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
+
+import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
-
-
-
-
 
 # Errors of the estimator.
 
@@ -32,8 +28,6 @@ class ImageError(ValueError):
         super().__init__(
             "".join(character if character.isprintable() else "?" for character in line)
         )
-
-
 
 
 # Array types.
@@ -194,5 +188,3 @@ def excerpt(value: object, most: int = 60) -> str:
 def _shape_text(shape: tuple[int | None, ...]) -> str:
     words = ["N" if length is None else str(length) for length in shape]
     return f"({', '.join(words)}{',' * (len(words) == 1)})"
-
-

@@ -10,19 +10,17 @@ of them, each up to its sign, give t and w; if most of the brightest blobs agree
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.jit import jit
 from dataclasses import replace
 from enum import IntFlag
 from math import atan2, cos, hypot, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.checks import Floats, Ints
+from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
-
-
-
-
 
 # Text burned into a picture: dates, names of cameras, exposure times.
 
@@ -71,7 +69,12 @@ def _grow(
 ) -> tuple[int, int, int]:
     """Extend a line from its first letter, in place; return the number of letters and their extreme widths.
 
-    letter : (N,) whether a blob is a letter of it;  line : (4,) its box
+    Parameters
+    ----------
+    letter
+        (N,) whether a blob is a letter of it
+    line
+        (4,) its box
     """
     top = boxes[first, 1]
     base = boxes[first, 3]
@@ -132,12 +135,20 @@ MAX_PIECES = 200
 class Flag(IntFlag):
     """Anomalies of a blob.
 
-    SATURATED : a pixel is saturated: still a star, with a less accurate position
-    HOT       : a single pixel, sharper than the optics allow: a defect or a particle hit
-    TRACK     : a line that the other blobs do not share: a particle or a satellite
-    HUGE      : too large for a star: the Moon, a lamp, the horizon
-    TEXTURE   : in a part of the frame much noisier than the rest: trees, clouds
-    TEXT      : of a line of text that is burned into the picture
+    Attributes
+    ----------
+    SATURATED
+        A pixel is saturated: still a star, with a less accurate position
+    HOT
+        A single pixel, sharper than the optics allow: a defect or a particle hit
+    TRACK
+        A line that the other blobs do not share: a particle or a satellite
+    HUGE
+        Too large for a star: the Moon, a lamp, the horizon
+    TEXTURE
+        In a part of the frame much noisier than the rest: trees, clouds
+    TEXT
+        Of a line of text that is burned into the picture
     """
 
     SATURATED = 1
@@ -222,8 +233,14 @@ def _flags(
 ) -> Ints:
     """Return the (N,) flags of each blob, from its row of `_shapes` and the streaks shared by the blobs.
 
-    field  : shared streak (dx, dy) at the center, and turn;  smeared : whether the frame has streaks
-    step   : floor of the noise, from quantization
+    Parameters
+    ----------
+    field
+        Shared streak (dx, dy) at the center, and turn
+    smeared
+        Whether the frame has streaks
+    step
+        Floor of the noise, from quantization
     """
     height, width = size
     typical_noise = max(median(noise), step)
@@ -496,5 +513,3 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
             out[n, 3] = 12 * (xx - yy)
             out[n, 4] = 24 * xy
     return out
-
-

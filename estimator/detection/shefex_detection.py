@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from estimator.core.checks import (Floats, Ints)
+
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.components import AREA, FLUX, PEAK, SUMS, X, Y
-
 
 
 @jit
@@ -140,5 +140,3 @@ def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, object_sums: Float
     sums[k] = object_sums
     boxes[k] = box
     return min(count + 1, len(sums))
-
-

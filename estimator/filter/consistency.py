@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from estimator.core.checks import Floats
-from estimator.filter.states import GyroModel
-from estimator.filter.states import (MISSING, SATURATED)
 import math
 from typing import NamedTuple
-from estimator.filter.states import JumpModel
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from estimator.core.checks import Floats
+from estimator.filter.states import MISSING, SATURATED, GyroModel, JumpModel
 
 # Share of the gyro's limit from which a sample's mean rate counts as saturated (`assumed`).
 NEAR_LIMIT = 0.9
@@ -74,8 +72,11 @@ def checked_covariances(
 ) -> tuple[Floats, Floats]:
     """Return the covariance without its systematic part, and that part, (3, 3) each.
 
-    Raises ValueError unless the first is symmetric and positive definite, and the second symmetric and without negative
-    eigenvalues.
+    Raises
+    ------
+    ValueError
+        Unless the first is symmetric and positive definite, and the second symmetric and
+        without negative eigenvalues.
     """
     total = np.asarray(covariance_rad2, dtype=float)
     if not is_covariance(total):
@@ -107,8 +108,6 @@ def is_covariance(matrix: NDArray, singular: bool = False) -> bool:
     )
 
 
-
-
 # Weigh a jump: is the filter wrong, because the gyros missed a motion, or are the solutions that
 # contradict it?
 
@@ -126,13 +125,22 @@ SHOCK_SIGMA = 20.0
 class Jump(NamedTuple):
     """Refused solutions that agree with each other, and what supports the filter.
 
-    angle_rad : rotation from the filter's attitude to the last of them
-    distance  : its Mahalanobis distance
-    agreeing  : their number, 1 or more
-    since_s   : time since the last solution that was used
-    lost_rad  : rotation since then that the gyro may have missed: the sum of the attitude's standard deviations due to
-        saturation and outages, and `shock_rad`
-    support   : number of solutions used since the attitude depends on solutions alone; 0: it is the initial one
+    Attributes
+    ----------
+    angle_rad
+        Rotation from the filter's attitude to the last of them
+    distance
+        Its Mahalanobis distance
+    agreeing
+        Their number, 1 or more
+    since_s
+        Time since the last solution that was used
+    lost_rad
+        Rotation since then that the gyro may have missed: the sum of the attitude's standard
+        deviations due to saturation and outages, and `shock_rad`
+    support
+        Number of solutions used since the attitude depends on solutions alone; 0: it is the
+        initial one
     """
 
     angle_rad: float
@@ -179,7 +187,12 @@ def shock_rad(start_s: float, samples: Floats, arw_rad_sqrt_s: float) -> float:
     A knock shows so even where its saturation is not flagged: a rate that steps within an interval, or faster than the
     gyro follows, is known to about this. A smooth maneuver and the gyro's noise are no shocks.
 
-    start_s : begin of the first interval;  samples : (N, 5) rows as of `propagate.advance`
+    Parameters
+    ----------
+    start_s
+        Begin of the first interval
+    samples
+        (N, 5) rows as of `propagate.advance`
     """
     step_s = np.diff(samples[:, 0], prepend=start_s)
     if len(step_s) < 3:
@@ -188,5 +201,3 @@ def shock_rad(start_s: float, samples: Floats, arw_rad_sqrt_s: float) -> float:
     turn_rad = bend_rad_s * step_s[2:]
     noise_rad = arw_rad_sqrt_s * np.sqrt(step_s[2:])
     return float(turn_rad[turn_rad > SHOCK_SIGMA * noise_rad].max(initial=0.0))
-
-

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
-from estimator.core.checks import Floats
-from estimator.filter.states import (rotate_quaternion, transition)
-from estimator.filter.states import (Layout, MekfState, of_head)
 
+from estimator.core.checks import Floats
+from estimator.filter.states import Layout, MekfState, of_head, rotate_quaternion, transition
 
 
 class AttitudeFix(NamedTuple):
     """A star tracker's solution, at the time of a State.
 
-    noise_rad2      : (3, 3) covariance of its small rotation error in body axes, without what solutions share
-    systematic_rad2 : (3, 3) covariance of the slow error that it shares with others of its head
-    head            : number of the star camera
+    Attributes
+    ----------
+    noise_rad2
+        (3, 3) covariance of its small rotation error in body axes, without what solutions share
+    systematic_rad2
+        (3, 3) covariance of the slow error that it shares with others of its head
+    head
+        Number of the star camera
     """
 
     body_from_ref: Rotation
@@ -28,10 +33,16 @@ class AttitudeFix(NamedTuple):
 class Innovation(NamedTuple):
     """Residual of a solution, linearized: residual = H error + noise.
 
-    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's
-    H            : (3, N)
-    noise_rad2   : (3, 3) covariance of the noise
-    distance2    : squared Mahalanobis distance of the residual
+    Attributes
+    ----------
+    residual_rad
+        (3,) rotation vector in body axes from the filter's attitude to the solution's
+    H
+        (3, N)
+    noise_rad2
+        (3, 3) covariance of the noise
+    distance2
+        Squared Mahalanobis distance of the residual
     """
 
     residual_rad: Floats
@@ -156,5 +167,3 @@ def root(covariance: Floats) -> Floats:
         return np.zeros((3, 3))
     variances, axes = np.linalg.eigh(covariance)
     return (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
-
-

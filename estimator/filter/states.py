@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-import numpy as np
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.jit import jit
 from dataclasses import dataclass, fields
-from estimator.core import checks
 from typing import NamedTuple
+
+import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-
-
-
+from estimator.core import checks
+from estimator.core.checks import Floats, Ints
+from estimator.core.jit import jit
 
 # Compiled propagation of the filter: gyro samples advance attitude, other states and covariance
 # between solutions.
@@ -37,12 +35,21 @@ def advance(
 ) -> tuple[Floats, Floats, Floats, float, float]:
     """Return attitude, values, covariance, saturation_rad and lost_rad after the samples; equations: AttitudeFilter.
 
-    state   : t_s, ref_from_body_wxyz, values (N,), covariance (N, N), saturation_rad, lost_rad
-    samples : (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED, SATURATED or MISSING
-    noise   : arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
-    columns : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
-    inverse : (3, 3) `inverse_response` of the values, of which no element of M changes here
-    slow    : first and last + 1 of the normalized systematic states
+    Parameters
+    ----------
+    state
+        t_s, ref_from_body_wxyz, values (N,), covariance (N, N), saturation_rad, lost_rad
+    samples
+        (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED,
+        SATURATED or MISSING
+    noise
+        arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
+    columns
+        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    inverse
+        (3, 3) `inverse_response` of the values, of which no element of M changes here
+    slow
+        First and last + 1 of the normalized systematic states
     """
     t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
     arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
@@ -130,7 +137,12 @@ def fill_rows(
 ) -> None:
     """Fill the attitude rows (3, N) of the transition matrix: exp(-[p]), -T J A, and -(J A)_i p_j for M_ij.
 
-    exponential : (3, 6) of `transition` with an effective time of 1;  inverse : A = (I + M)^-1
+    Parameters
+    ----------
+    exponential
+        (3, 6) of `transition` with an effective time of 1
+    inverse
+        A = (I + M)^-1
     """
     for i in range(3):
         for j in range(3):
@@ -229,15 +241,26 @@ class GyroModel:
     Attitude Determination and Control, 4.7) has the scale factors in its diagonal and the misalignments of the three
     sense axes elsewhere, all constant. A common rotation of the axes is among the misalignments.
 
-    arw_rad_sqrt_s : angle random walk, rad / sqrt(s)
-    bias_rad_s     : standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time is inf)
-    bias_time_s    : its correlation time, long compared with a sample interval; inf for a constant bias
-    scale, misalignment_rad : standard deviations of M's elements on the diagonal and off it
-    limit_rad_s    : the largest rate about an axis that is measured; inf if saturation is flagged with the samples
-    outage_rad_s   : standard deviation of the rate about each axis while the gyro gives no samples (`assumed`)
-
     Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
     bias_rad_s = u sqrt(t / 2). Raises ValueError for negative or unusable numbers.
+
+    Attributes
+    ----------
+    arw_rad_sqrt_s
+        Angle random walk, rad / sqrt(s)
+    bias_rad_s
+        Standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time
+        is inf)
+    bias_time_s
+        Its correlation time, long compared with a sample interval; inf for a constant bias
+    scale, misalignment_rad
+        Standard deviations of M's elements on the diagonal and off it
+    limit_rad_s
+        The largest rate about an axis that is measured; inf if saturation is flagged with the
+        samples
+    outage_rad_s
+        Standard deviation of the rate about each axis while the gyro gives no samples
+        (`assumed`)
     """
 
     arw_rad_sqrt_s: float
@@ -256,15 +279,23 @@ class GyroModel:
 class TrackerModel:
     """Errors that successive solutions of a star tracker share: they do not average out.
 
-    systematic_rad       : standard deviation about each axis of the slow error: distortion across the field, a survey
-    systematic_time_s    : its correlation time; inf for a constant
-    systematic_angle_rad : rotation after which it is another one, because other stars are in the field
-    mounting_rad         : standard deviation about each axis of the rotation from assumed to true mount
-    mounting_drift_rad_sqrt_s : its random walk about each axis, rad / sqrt(s); 0 for a constant one
-
     The slow error is a first-order Gauss-Markov process with the correlation exp(-T / time - rotation / angle). The
     covariance that a solution names (`Attitude.systematic_rad2`) is part of the same process, and is added to
     systematic_rad^2. The times and angles are `assumed`. Raises ValueError for negative or unusable numbers.
+
+    Attributes
+    ----------
+    systematic_rad
+        Standard deviation about each axis of the slow error: distortion across the field, a
+        survey
+    systematic_time_s
+        Its correlation time; inf for a constant
+    systematic_angle_rad
+        Rotation after which it is another one, because other stars are in the field
+    mounting_rad
+        Standard deviation about each axis of the rotation from assumed to true mount
+    mounting_drift_rad_sqrt_s
+        Its random walk about each axis, rad / sqrt(s); 0 for a constant one
     """
 
     systematic_rad: float = 0.0
@@ -283,12 +314,21 @@ class TrackerModel:
 class JumpModel:
     """What is assumed of wrong solutions and of motions that a gyro misses; all `assumed`. See `jumps.log_odds`.
 
-    missed_per_s : rate at which a gyro that flags nothing misses a motion, 1e-4 an hour
-    wrong_share  : probability that a wrong solution begins at any given one
-    wrong_repeat : probability that a wrong solution is followed by one that agrees with it
-    wrong_start  : probability that the initial attitude is wrong beyond its standard deviation
+    Attributes
+    ----------
+    missed_per_s
+        Rate at which a gyro that flags nothing misses a motion, 1e-4 an hour
+    wrong_share
+        Probability that a wrong solution begins at any given one
+    wrong_repeat
+        Probability that a wrong solution is followed by one that agrees with it
+    wrong_start
+        Probability that the initial attitude is wrong beyond its standard deviation
 
-    Raises ValueError unless all are above 0 and below 1.
+    Raises
+    ------
+    ValueError
+        Unless all are above 0 and below 1.
     """
 
     missed_per_s: float = 1e-4 / 3600
@@ -326,12 +366,20 @@ class Layout(NamedTuple):
     Heads are the star cameras on the body. The states of head n above 0 have its number in their name: "mounting_1",
     which is relative to the mounting of the first head.
 
-    size      : N
-    slices    : of each state by name, "attitude" and "systematic" included
-    slow      : that of the slow errors of all heads
-    mountings : (M,) index of each state of a mounting
-    columns   : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
-    estimated : (N,) whether its value is estimated; False if it is only considered
+    Attributes
+    ----------
+    size
+        N
+    slices
+        Of each state by name, "attitude" and "systematic" included
+    slow
+        That of the slow errors of all heads
+    mountings
+        (M,) index of each state of a mounting
+    columns
+        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    estimated
+        (N,) whether its value is estimated; False if it is only considered
     """
 
     size: int
@@ -352,12 +400,20 @@ class Layout(NamedTuple):
 class MekfState(NamedTuple):
     """State of the filter at one time.
 
-    values         : (N,) estimates in the order of Layout; those of the attitude are 0
-    covariance     : (N, N) of the errors
-    saturation_rad : standard deviation of the attitude from the saturation or outage that now lasts, else 0
-    lost_rad       : rotation that the gyro may have missed since the last solution that was used
-    used_s, used_wxyz : time and attitude of the last solution that was used, or of the start
-    support        : number of solutions used in agreement, see Jump
+    Attributes
+    ----------
+    values
+        (N,) estimates in the order of Layout; those of the attitude are 0
+    covariance
+        (N, N) of the errors
+    saturation_rad
+        Standard deviation of the attitude from the saturation or outage that now lasts, else 0
+    lost_rad
+        Rotation that the gyro may have missed since the last solution that was used
+    used_s, used_wxyz
+        Time and attitude of the last solution that was used, or of the start
+    support
+        Number of solutions used in agreement, see Jump
     """
 
     t_s: float
@@ -419,7 +475,9 @@ def build_layout(
     return Layout(size, slices, slow, np.array(mountings, dtype=int), columns, np.array(estimated))
 
 
-def start_state(t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout) -> MekfState:
+def start_state(
+    t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout
+) -> MekfState:
     """The state at the start: all values 0, all states independent with these standard deviations."""
     sigma = np.empty(layout.size)
     for name, rows in layout.slices.items():
@@ -469,5 +527,3 @@ def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> Mekf
     covariance = state.covariance * np.outer(factor, factor)
     covariance[rows, rows] += (1 - kept**2) * np.eye(rows.stop - rows.start)
     return state._replace(values=state.values * factor, covariance=covariance)
-
-

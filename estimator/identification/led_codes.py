@@ -13,18 +13,17 @@ that of the phase to sigma: an exposure that crosses a bit's edge counts less.
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
-from estimator.core import checks
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.checks import ImageError
-from estimator.core.jit import jit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import on_sphere
+from estimator.core import checks
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.jit import jit
 from estimator.core.types import Centroids
-
-
 
 GROSS = 7.0  # misfit of a gross error: one of a thousand
 # errors at first sight, and the greatest excess of their misfit
@@ -37,8 +36,13 @@ PHASES_PER_BIT = 8  # phases that a free-running receiver tries
 class LedCode:
     """The words of a dome's LEDs as the tracker knows them.
 
-    levels     : (N, B) part of its light that each LED shows in each bit, 0 to 1, in the order of the LED map
-    bit_time_s : of one bit, of a free-running clock of unknown phase; None if frame n shows bit n
+    Attributes
+    ----------
+    levels
+        (N, B) part of its light that each LED shows in each bit, 0 to 1, in the order of the
+        LED map
+    bit_time_s
+        Of one bit, of a free-running clock of unknown phase; None if frame n shows bit n
     """
 
     levels: Floats
@@ -103,7 +107,10 @@ class LedCode:
 def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> Floats:
     """(T, W) misfit of W templates (W, J) to each of T lights (T, J) with errors sigma; a NaN is no measurement.
 
-    spread : (W, J) error of a template by the unknown phase
+    Parameters
+    ----------
+    spread
+        (W, J) error of a template by the unknown phase
     """
     arrays = (np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread))
     out = np.empty((len(light), len(templates)))
@@ -188,8 +195,6 @@ def expected_misfit(measured: Floats | Ints) -> Floats:
     return measured / 2 + 3 * np.sqrt(measured / 2) + GROSS * np.maximum(1.0, measured / 6)
 
 
-
-
 # Lights followed from frame to frame, with the brightness of each in the last frames.
 
 
@@ -199,14 +204,24 @@ BORDER_PX = 30.0  # an LED nearer to the border of the sensor may be undetected
 class LightTracks:
     """The tracks of a field's lights; T of them, with the last J frames.
 
-    pupil_m   : (3,) of the camera from the bearing, in camera axes;  radius_m : of the sphere about the bearing
-    frames    : J
-    gate_px   : greatest distance of a light from its prediction
-    patience  : successive frames without its light after which a track ends
-    goes_dark : whether an LED without light says that its level is 0; it is unknown otherwise
-
-    light, sigma : (T, J) and their errors, NaN without a measurement; frame n is in column n modulo J
-    row          : (T,) row of each in the last frame's centroids, -1 without a light
+    Attributes
+    ----------
+    pupil_m
+        (3,) of the camera from the bearing, in camera axes
+    radius_m
+        Of the sphere about the bearing
+    frames
+        J
+    gate_px
+        Greatest distance of a light from its prediction
+    patience
+        Successive frames without its light after which a track ends
+    goes_dark
+        Whether an LED without light says that its level is 0; it is unknown otherwise
+    light, sigma
+        (T, J) and their errors, NaN without a measurement; frame n is in column n modulo J
+    row
+        (T,) row of each in the last frame's centroids, -1 without a light
     """
 
     def __init__(
@@ -247,8 +262,12 @@ class LightTracks:
     ) -> None:
         """Continue the tracks with a frame's lights, and begin new ones.
 
-        sigma : (N,) errors of the lights' brightness
-        now_from_then : cam(now) from cam(last frame), from a gyro
+        Parameters
+        ----------
+        sigma
+            (N,) errors of the lights' brightness
+        now_from_then
+            cam(now) from cam(last frame), from a gyro
         """
         self.column = (self.column + 1) % self.frames
         turn = now_from_then or Rotation.from_rotvec(self.rate_rad_s * elapsed_s)
@@ -323,5 +342,3 @@ def _mutual_nearest(predicted_px: Floats, seen_px: Floats, gate_px: float) -> In
     good = (distance.argmin(axis=0)[nearest] == track) & (distance[track, nearest] <= gate_px)
     row[good] = nearest[good]
     return row
-
-

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from math import exp, log, log10, pi, sqrt
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -25,8 +27,6 @@ from estimator.identification.chance import (
 )
 from estimator.identification.led_index import DomeIndex
 
-
-
 # part of the lights of any brightness: blends, reflections; per unit of logarithm
 STRAY = 0.01
 STRAY_DENSITY = 0.1
@@ -35,12 +35,27 @@ STRAY_DENSITY = 0.1
 class LedDetections(NamedTuple):
     """The detections of one frame, in camera axes.
 
-    ray     : (N, 3) unit;  tangent : (N, 2) x / z and y / z;  sigma : (N,) total standard deviation of each tangent
-    direction : (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the median LED radius
-    direction_per_m : (N, 3) derivative of `direction` with respect to that radius, 1 / m
-    log_flux  : (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not used
-    light_density : (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
-    focal_uncertainty : greatest relative error of the focal length; 0 for a calibrated camera
+    Attributes
+    ----------
+    ray
+        (N, 3) unit
+    tangent
+        (N, 2) x / z and y / z
+    sigma
+        (N,) total standard deviation of each tangent
+    direction
+        (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the
+        median LED radius
+    direction_per_m
+        (N, 3) derivative of `direction` with respect to that radius, 1 / m
+    log_flux
+        (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not
+        used
+    light_density
+        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED
+        or none
+    focal_uncertainty
+        Greatest relative error of the focal length; 0 for a calibrated camera
     """
 
     ray: Floats
@@ -96,7 +111,13 @@ def evaluate(
 
     R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match,
     or if the focal length is out of its range.
-    center : row of the LED whose neighborhood is matched;  focal_ratio : of the pair, if it is uncertain
+
+    Parameters
+    ----------
+    center
+        Row of the LED whose neighborhood is matched
+    focal_ratio
+        Of the pair, if it is uncertain
     """
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
     # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the
@@ -306,5 +327,3 @@ def _evidence(
             match_dex = min(match_dex, 1.0 if same_board == 1 else 0.3)
         total += match_dex
     return total + counts_dex(len(observed), missing)
-
-

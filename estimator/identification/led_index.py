@@ -9,15 +9,15 @@ question "is an LED near this direction" reads a few cells.
 from __future__ import annotations
 
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.catalog.pair_index import (PairIndex, build, k_vector)
-from estimator.core.checks import Floats
+from estimator.catalog.pair_index import PairIndex, build, k_vector
 from estimator.core.camera import Camera
-
-
+from estimator.core.checks import Floats
 
 # Fraction of the field in which an unmatched source counts as missing; the border may cut it off.
 INNER_FRACTION = 0.95
@@ -26,10 +26,16 @@ INNER_FRACTION = 0.95
 class DirectionGrid(NamedTuple):
     """LED directions in a square grid of side * side cells over their x and y components.
 
-    R_grid_from_lab : (3, 3) rotates the mean direction of the LEDs to +z
-    cell, side      : width of a cell, and number of cells along a side
-    first           : LEDs first[c] to first[c + 1] are in cell c
-    direction       : (N, 3) unit vectors of the LEDs in that order, in grid axes
+    Attributes
+    ----------
+    R_grid_from_lab
+        (3, 3) rotates the mean direction of the LEDs to +z
+    cell, side
+        Width of a cell, and number of cells along a side
+    first
+        LEDs first[c] to first[c + 1] are in cell c
+    direction
+        (N, 3) unit vectors of the LEDs in that order, in grid axes
     """
 
     R_grid_from_lab: Floats
@@ -42,17 +48,35 @@ class DirectionGrid(NamedTuple):
 class DomeIndex(NamedTuple):
     """The dome map prepared for the search. A named tuple, because numba can compile functions that take one.
 
-    pairs      : LED pairs by their angle about the bearing, scaled to the median radius (`scale_pair_angles`)
-    grid       : the LEDs by direction
-    position_m : (L, 3) LEDs in the lab frame;  radius_m : (L,) from the bearing;  median_radius_m : their median
-    pupil_m    : (3,) camera's entrance pupil from the bearing, in camera axes
-    scaling_error_rad : greatest error of a pair angle that results from the scaling to the median radius
-    field_tan  : (4,) tangents left, right, top, bottom inside which an LED is fully visible
-    field_area : of the sensor, in tangents squared
-    prior_volume : of attitudes that see the dome: steradians of boresight times 2 pi of roll
-    led_sigma, lever_sigma : standard deviations of LED positions and of the pupil, over their least distance
-    log_flux   : (L,) logarithm of each LED's flux per second; of length 0 if all are alike
-    flux_sigma : standard deviation of the logarithm of a measured flux
+    Attributes
+    ----------
+    pairs
+        LED pairs by their angle about the bearing, scaled to the median radius
+        (`scale_pair_angles`)
+    grid
+        The LEDs by direction
+    position_m
+        (L, 3) LEDs in the lab frame
+    radius_m
+        (L,) from the bearing
+    median_radius_m
+        Their median
+    pupil_m
+        (3,) camera's entrance pupil from the bearing, in camera axes
+    scaling_error_rad
+        Greatest error of a pair angle that results from the scaling to the median radius
+    field_tan
+        (4,) tangents left, right, top, bottom inside which an LED is fully visible
+    field_area
+        Of the sensor, in tangents squared
+    prior_volume
+        Of attitudes that see the dome: steradians of boresight times 2 pi of roll
+    led_sigma, lever_sigma
+        Standard deviations of LED positions and of the pupil, over their least distance
+    log_flux
+        (L,) logarithm of each LED's flux per second; of length 0 if all are alike
+    flux_sigma
+        Standard deviation of the logarithm of a measured flux
     """
 
     pairs: PairIndex
@@ -172,5 +196,3 @@ def cap_height(directions: Floats, margin_rad: float) -> float:
     mean = directions.mean(axis=0)
     nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))
-
-

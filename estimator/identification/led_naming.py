@@ -10,16 +10,16 @@ the codes at their word, and if most of the lights agree: one wrong name leads t
 from __future__ import annotations
 
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.attitude.solvers import rotation
-from estimator.core.checks import (Floats, Ints)
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.led_search import MARGIN_DEX
-
-
 
 REACH = 30.0  # names with a misfit that exceeds the best one's by more are left out
 STRANGER = 14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
@@ -32,8 +32,14 @@ CONTRADICTED = "codes: the names of the lights contradict their places"
 class NamedLights(NamedTuple):
     """T lights of a frame whose codes are known.
 
-    ray     : (T, 3) unit, in camera axes;  sigma : (T,) standard deviation of its tangents
-    misfit  : (T, N) of each LED's code
+    Attributes
+    ----------
+    ray
+        (T, 3) unit, in camera axes
+    sigma
+        (T,) standard deviation of its tangents
+    misfit
+        (T, N) of each LED's code
     """
 
     ray: Floats
@@ -44,8 +50,16 @@ class NamedLights(NamedTuple):
 class Sphere(NamedTuple):
     """LEDs and the camera about the bearing.
 
-    position_m : (N, 3) in the lab;  radius_m : (N,) from the bearing;  direction : (N, 3) position / radius
-    pupil_m    : (3,) in camera axes
+    Attributes
+    ----------
+    position_m
+        (N, 3) in the lab
+    radius_m
+        (N,) from the bearing
+    direction
+        (N, 3) position / radius
+    pupil_m
+        (3,) in camera axes
     """
 
     position_m: Floats
@@ -84,11 +98,16 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
 def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
     """Whether the names hold at one time of the codes' clock, and no other light of the frame speaks against them.
 
-    misfit : (P, T, N) of each LED's code at P phases of the clock, of the rows of `match.observed` among others
-    lights : number of lights with enough bits, also those that fit no code
-
     `identify` takes each light at its own best phase; the names together must be nearly as good at a common one. Two
     names that nothing else confirms count only where there is no other light; else half of the lights must have one.
+
+    Parameters
+    ----------
+    misfit
+        (P, T, N) of each LED's code at P phases of the clock, of the rows of `match.observed`
+        among others
+    lights
+        Number of lights with enough bits, also those that fit no code
     """
     count = len(match.observed)
     if count < lights / 2 or (count == 2 and lights > 2):
@@ -216,5 +235,3 @@ def _evaluate(
         star[star[:, light] == len(sphere.position_m), light] = -1
         named.append(light)
     return total, star
-
-

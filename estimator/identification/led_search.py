@@ -18,8 +18,10 @@ invariants: with each of them the pair makes a triangle, whose angles the quick 
 from __future__ import annotations
 
 from math import log10, pi, sqrt
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
@@ -39,10 +41,15 @@ from estimator.identification.chance import (
     required_matches,
     separation,
 )
-from estimator.identification.led_evidence import (STRAY, STRAY_DENSITY, LedDetections, LedHypothesis, evaluate, same_identification)
-from estimator.identification.led_index import (DirectionGrid, DomeIndex)
-
-
+from estimator.identification.led_evidence import (
+    STRAY,
+    STRAY_DENSITY,
+    LedDetections,
+    LedHypothesis,
+    evaluate,
+    same_identification,
+)
+from estimator.identification.led_index import DirectionGrid, DomeIndex
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = (
@@ -63,15 +70,23 @@ def identify(
 ) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
-    sigma_rad  : (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
-    max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
-    flux_s     : (N,) flux of the lights per second of exposure, for LEDs that differ in brightness; None: unknown
-    focal_uncertainty : greatest relative error of the focal length; `dome` must hold the pairs of the widest field
-
     Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
     After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
     rival that explains almost as much must contain one of the two pairs. If a rival comes within MARGIN_DEX, the
     pattern is ambiguous and no attitude is returned. Brightness counts only if the map's LEDs differ in it.
+
+    Parameters
+    ----------
+    sigma_rad
+        (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
+    max_checks
+        LED pairs tested, plus detections times LEDs compared, before giving up
+    flux_s
+        (N,) flux of the lights per second of exposure, for LEDs that differ in brightness;
+        None: unknown
+    focal_uncertainty
+        Greatest relative error of the focal length; `dome` must hold the pairs of the widest
+        field
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
@@ -246,7 +261,11 @@ def _test_pair(
 
     Candidates that cannot reach min_dex are skipped. Returns the updated best hypothesis and the evidence of its best
     rival.
-    checks : (1,) effort so far, increased in place
+
+    Parameters
+    ----------
+    checks
+        (1,) effort so far, increased in place
     """
     index = dome.pairs
     radius = dome.radius_m
@@ -450,5 +469,3 @@ def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
             if dx * dx + dy * dy + dz * dz < gate * gate:
                 return True
     return False
-
-

@@ -7,28 +7,43 @@ same keywords, of which each method uses its own, so that one can be put in the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-import numpy as np
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
 
+import numpy as np
+
+from estimator.core.checks import Floats, ImageError
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """Keyword arguments of an identifier. A method ignores those that it does not use.
 
-    stretch       : relative tolerance of an angle: stretch * angle is added to its tolerance
-    focal_unknown : the stretch is one unknown focal length, which each pattern measures; see `require_known_focal`
-    max_triangles, max_checks : observed patterns tried, and angles compared, before giving up; the latter bounds
-        the time, at a few to tens of nanoseconds each
-    base_stars    : number of brightest stars from which patterns are formed
-    missed_dex    : penalty for each catalog star that is predicted in the field and not observed, in powers of ten;
-        0 if the detection limit is unknown, greater if all sources are known to be on
-    field_tan     : (left, right, top, bottom) tangents of the field's edges, for missed_dex
-    magnitude     : (N,) of the observed stars, on the index's scale; None if unknown
-    epsilon_mag   : standard deviation of a magnitude
-    epsilon_sep_rad : standard deviation of an angle between two stars, for methods that use it
-    boresight_ref : (3,) unit vector, prior direction of the optical axis;  within_rad : its greatest error
+    Attributes
+    ----------
+    stretch
+        Relative tolerance of an angle: stretch * angle is added to its tolerance
+    focal_unknown
+        The stretch is one unknown focal length, which each pattern measures; see
+        `require_known_focal`
+    max_triangles, max_checks
+        Observed patterns tried, and angles compared, before giving up; the latter bounds the
+        time, at a few to tens of nanoseconds each
+    base_stars
+        Number of brightest stars from which patterns are formed
+    missed_dex
+        Penalty for each catalog star that is predicted in the field and not observed, in powers
+        of ten; 0 if the detection limit is unknown, greater if all sources are known to be on
+    field_tan
+        (left, right, top, bottom) tangents of the field's edges, for missed_dex
+    magnitude
+        (N,) of the observed stars, on the index's scale; None if unknown
+    epsilon_mag
+        Standard deviation of a magnitude
+    epsilon_sep_rad
+        Standard deviation of an angle between two stars, for methods that use it
+    boresight_ref
+        (3,) unit vector, prior direction of the optical axis
+    within_rad
+        Its greatest error
     """
 
     stretch: float = 0.0
@@ -60,5 +75,3 @@ class Options:
                 f"magnitudes {np.shape(self.magnitude)} of {count} observed stars; allowed: one for each"
             )
         return np.ascontiguousarray(self.magnitude, dtype=float)
-
-

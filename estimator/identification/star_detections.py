@@ -4,26 +4,39 @@ from __future__ import annotations
 
 from math import hypot, log10, sqrt
 from typing import NamedTuple
+
 import numpy as np
+
 from estimator.core import vectors
-from estimator.core.checks import Floats
 from estimator.core.camera import Distortion, undistorted
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.identification.chance import GATE_SIGMA
-
 
 
 class Detections(NamedTuple):
     """The detections of one frame. A named tuple, because numba can compile functions that take one.
 
-    tangent : (N, 2) x / z and y / z in camera axes, brightest first
-    sigma   : (N,) standard deviation of a tangent along the major axis of its error ellipse
-    weight  : (N, 3) inverse covariance of the tangents: xx, yy, xy
-    mag     : (N,) magnitudes on the catalog's scale, NaN if unknown;  mag_sigma : their standard deviation
-    field   : (4,) tangents left, right, top, bottom of the sensor's edges
-    focal_uncertainty : relative uncertainty of the focal length; 0 for a calibrated camera
-    limit_mag : to which every star should be seen: that of the median detection, as what shows faint false lights shows
-        the stars of their magnitude; NaN if unknown, and of a part of the detections
+    Attributes
+    ----------
+    tangent
+        (N, 2) x / z and y / z in camera axes, brightest first
+    sigma
+        (N,) standard deviation of a tangent along the major axis of its error ellipse
+    weight
+        (N, 3) inverse covariance of the tangents: xx, yy, xy
+    mag
+        (N,) magnitudes on the catalog's scale, NaN if unknown
+    mag_sigma
+        Their standard deviation
+    field
+        (4,) tangents left, right, top, bottom of the sensor's edges
+    focal_uncertainty
+        Relative uncertainty of the focal length; 0 for a calibrated camera
+    limit_mag
+        To which every star should be seen: that of the median detection, as what shows faint
+        false lights shows the stars of their magnitude; NaN if unknown, and of a part of the
+        detections
     """
 
     tangent: Floats
@@ -39,8 +52,12 @@ class Detections(NamedTuple):
 class Sensor(NamedTuple):
     """What turns centroids into detections: the camera's calibration, and the light's scale.
 
-    zero_point_mag, magnitude_sigma : as in `trackers.pipeline.Settings`; NaN if the zero point is unknown
-    field : see `Detections`
+    Attributes
+    ----------
+    zero_point_mag, magnitude_sigma
+        As in `trackers.pipeline.Settings`; NaN if the zero point is unknown
+    field
+        See `Detections`
     """
 
     focal_px: float
@@ -54,8 +71,12 @@ class Sensor(NamedTuple):
 class FlatCentroids(NamedTuple):
     """Centroids as compiled code takes them.
 
-    own_px, sigma_px : (N,) standard deviation of their own noise, and in total
-    spread_px2 : (N, 2, 2) covariance of the noise; (0, 2, 2) where it is the same in all directions
+    Attributes
+    ----------
+    own_px, sigma_px
+        (N,) standard deviation of their own noise, and in total
+    spread_px2
+        (N, 2, 2) covariance of the noise; (0, 2, 2) where it is the same in all directions
     """
 
     xy_px: Floats
@@ -153,5 +174,3 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
 @jit
 def field_area(detections: Detections) -> float:
     return (detections.field[1] - detections.field[0]) * (detections.field[3] - detections.field[2])
-
-

@@ -16,19 +16,25 @@ from __future__ import annotations
 
 from math import log, log10, pi, sqrt
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.catalog.pair_index import first_from
-from estimator.catalog.sky_index import (MAG_SMOOTHING, MAG_STEP, SkyIndex, nearest)
-from estimator.catalog.sky_index import (cell_of, edge_cell)
+from estimator.catalog.sky_index import (
+    MAG_SMOOTHING,
+    MAG_STEP,
+    SkyIndex,
+    cell_of,
+    edge_cell,
+    nearest,
+)
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.least_squares import CONVERGED_CHI2
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex
-from estimator.identification.star_detections import (Detections, field_area, gates_of, ray)
-
-
+from estimator.identification.star_detections import Detections, field_area, gates_of, ray
 
 # Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
 MAG_OUTLIER_FRACTION = 0.05
@@ -41,10 +47,18 @@ INNER_FRACTION = 0.97
 class Hypothesis(NamedTuple):
     """A hypothesis: candidate attitude, matches and evidence.
 
-    observed, star : (K,) rows of detections and of stars;  R_cam_from_ref : (3, 3)
-    focal_ratio: ratio of the true to the assumed focal length
-    info : (4, 4) Fisher information of the small rotation in camera axes and of log focal_ratio
-    dex  : log10 of the Bayes factor
+    Attributes
+    ----------
+    observed, star
+        (K,) rows of detections and of stars
+    R_cam_from_ref
+        (3, 3)
+    focal_ratio
+        Ratio of the true to the assumed focal length
+    info
+        (4, 4) Fisher information of the small rotation in camera axes and of log focal_ratio
+    dex
+        log10 of the Bayes factor
     """
 
     observed: NDArray[np.int64]
@@ -58,11 +72,22 @@ class Hypothesis(NamedTuple):
 class Solution(NamedTuple):
     """The solution from all detections and stars.
 
-    observed, star : (K,) rows of detections and of stars; empty if there is no solution
-    cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small rotation in camera axes
-    focal_ratio: ratio of the true to the assumed focal length;  rms : of the residuals, tangents
-    chi2 : squared Mahalanobis distances of the matches per degree of freedom
-    dex  : log10 of the Bayes factor
+    Attributes
+    ----------
+    observed, star
+        (K,) rows of detections and of stars; empty if there is no solution
+    cam_from_ref_xyzw
+        (4,)
+    covariance_rad2
+        (3, 3) of the small rotation in camera axes
+    focal_ratio
+        Ratio of the true to the assumed focal length
+    rms
+        Of the residuals, tangents
+    chi2
+        Squared Mahalanobis distances of the matches per degree of freedom
+    dex
+        log10 of the Bayes factor
     """
 
     observed: NDArray[np.int64]
@@ -113,12 +138,17 @@ def evaluate(
 ) -> Hypothesis:
     """Evaluate a candidate: match detections to stars, fit attitude and focal ratio (twice), compute the evidence.
 
-    gates : (N,) rad, matching radius of each detection in the first round; later rounds use GATE_SIGMA
     R_cam_from_ref is changed in place by the fit. Returns the empty hypothesis if fewer than
     MIN_EVIDENCE_MATCHES stars match, the focal ratio leaves its interval, or the evidence is below min_dex. The last
     test is made early with an upper bound of the evidence (exact matches, no missing star), which rejects most false
     candidates before the full evaluation. A fit that has converged is not
     repeated, nor are its matches.
+
+    Parameters
+    ----------
+    gates
+        (N,) rad, matching radius of each detection in the first round; later rounds use
+        GATE_SIGMA
     """
     R = R_cam_from_ref
     info = np.zeros((4, 4))
@@ -415,7 +445,11 @@ def _evidence(
     `_magnitude_ratio`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior
     volume (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches;
     each one above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
-    with_residuals : include the residuals; without them the result is an upper bound for these matches
+
+    Parameters
+    ----------
+    with_residuals
+        Include the residuals; without them the result is an upper bound for these matches
     """
     count = 4 if detections.focal_uncertainty > 0 else 3
     factor = info[:count, :count].copy()
@@ -510,5 +544,3 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         chi2,
         hypothesis.dex,
     )
-
-

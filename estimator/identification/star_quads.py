@@ -9,18 +9,17 @@ tried in the order of brightness: first those of the four brightest detections, 
 from __future__ import annotations
 
 import numpy as np
+
 from estimator.catalog import quad_index
 from estimator.catalog.quad_index import SIDE, QuadIndex
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
-from estimator.core.checks import (Floats, Ints)
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.identification.chance import GATE_SIGMA
 from estimator.identification import star_search
-from estimator.identification.star_detections import (Detections, changed, ray)
-from estimator.identification.star_evidence import (Hypothesis, Solution, evaluate, no_hypothesis)
-
-
+from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.star_detections import Detections, changed, ray
+from estimator.identification.star_evidence import Hypothesis, Solution, evaluate, no_hypothesis
 
 COMBINED = 24  # number of brightest detections that are combined to quads
 
@@ -37,8 +36,13 @@ def identify(
     """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
 
     The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
-    max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
-    calibrated : whether the focal length should be right (`search.fit_to_all`)
+
+    Parameters
+    ----------
+    max_checks
+        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+    calibrated
+        Whether the focal length should be right (`search.fit_to_all`)
     """
     count = min(max_detections, len(detections.sigma))
     searched = changed(detections, count, 1.0, detections.focal_uncertainty)
@@ -76,7 +80,10 @@ def _test_quad(
 ) -> Hypothesis:
     """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
 
-    checks : (1,) effort so far, increased in place
+    Parameters
+    ----------
+    checks
+        (1,) effort so far, increased in place
     """
     _longest_first(detections.tangent, quad)
     a = quad[0]
@@ -183,6 +190,6 @@ def _test_match(
     if not fits:
         return no_hypothesis()
     checks[0] += star_search.EVALUATION_COST
-    return evaluate(detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX)
-
-
+    return evaluate(
+        detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX
+    )

@@ -13,10 +13,11 @@ separation, and the rest of the field must confirm both.
 from __future__ import annotations
 
 from math import log10, pi, sqrt
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.sky_index import (SkyIndex, nearest)
-from estimator.catalog.sky_index import cell_of
+
+from estimator.catalog.sky_index import SkyIndex, cell_of, nearest
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -30,10 +31,17 @@ from estimator.identification.chance import (
     separation,
     squared_separation,
 )
-from estimator.identification.star_detections import (Detections, changed, field_area, gates_of, ray)
-from estimator.identification.star_evidence import (Hypothesis, Solution, build_solution, evaluate, focal_gain_dex, magnitude_density, no_hypothesis, prior_volume_dex)
-
-
+from estimator.identification.star_detections import Detections, changed, field_area, gates_of, ray
+from estimator.identification.star_evidence import (
+    Hypothesis,
+    Solution,
+    build_solution,
+    evaluate,
+    focal_gain_dex,
+    magnitude_density,
+    no_hypothesis,
+    prior_volume_dex,
+)
 
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
@@ -67,7 +75,11 @@ def lost_in_space(
     two must have twice the evidence, so that together they accept a chance match as rarely as one. The attitude found
     is then fitted to all detections. Returns an empty solution if the search finds nothing beyond
     chance, or if the full field keeps no more than half of its matches.
-    max_checks : bound on the effort (see `search`)
+
+    Parameters
+    ----------
+    max_checks
+        Bound on the effort (see `search`)
     """
     few = min(FEW, max_detections, len(detections.sigma))
     many = min(max_detections, len(detections.sigma))
@@ -105,8 +117,13 @@ def fit_to_all(
     unless the other has WRONG_FOCAL_DEX more evidence: with a wrong focal length a part of the stars may still match,
     at a wrong attitude. The solution is empty if the candidate has less than `accept_dex`, if it keeps no more than
     half of its matches, or if all detections together are not beyond chance.
-    detections : with the focal uncertainty of the free fit
-    whole : whether the candidate is the calibrated fit to all detections already
+
+    Parameters
+    ----------
+    detections
+        With the focal uncertainty of the free fit
+    whole
+        Whether the candidate is the calibrated fit to all detections already
     """
     chosen = detections
     full = no_hypothesis()
@@ -145,7 +162,11 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     few detections that MAX_MISSES covers them. Every attempt checks its candidates at another MAX_MISSES detections
     first: a fixed order would drop every true candidate of a frame in which these are all false. After an attitude
     reaches ACCEPT_DEX the search continues for rivals, with RIVAL_EFFORT times the effort so far.
-    max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+
+    Parameters
+    ----------
+    max_checks
+        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     """
     total = len(detections.sigma)
     length = _pair_lengths(detections)
@@ -254,8 +275,13 @@ def _test_pair(
     """Test two detections against every catalog pair of the same separation, in both orders.
 
     Returns the first hypothesis with ACCEPT_DEX that is another attitude than `previous`, else the best one.
-    start  : the other detections are looked up from this one on
-    checks : (1,) effort so far, increased in place
+
+    Parameters
+    ----------
+    start
+        The other detections are looked up from this one on
+    checks
+        (1,) effort so far, increased in place
     """
     gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
     in_cam = np.empty((3, 3))
@@ -329,7 +355,12 @@ def trial(
 ) -> tuple[Floats, NDArray[np.int64], int]:
     """What a quick check of an attitude by two detections takes: gates, the other detections, and matches required.
 
-    start : the other detections are looked up from this one on;  min_dex : least evidence of interest
+    Parameters
+    ----------
+    start
+        The other detections are looked up from this one on
+    min_dex
+        Least evidence of interest
     """
     gates = pair_gates(detections, a, b)
     order = other_detections(len(detections.sigma), a, b, start)
@@ -451,5 +482,3 @@ def quick_check(
         if count >= required:
             return step + 1, True
     return remaining, False
-
-

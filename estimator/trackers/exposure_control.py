@@ -15,15 +15,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.core import checks
-from estimator.core.checks import Ints
-from estimator.core.checks import ImageError
+from estimator.core.checks import ImageError, Ints
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
-
-
 
 # The camera's own range and increment (table 1).
 CAMERA_SHORTEST_S = 10e-6
@@ -35,13 +34,22 @@ INCREMENT_S = 1e-6
 class Control:
     """Parameters of the control. The defaults are the paper's; it does not state mean_dn.
 
-    mean_dn     : reference mean; a frame with a greater mean is saturated
-    longest_s   : 50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
-    min_stars : with fewer objects the flag no_stars is set
-    overexposed_objects, saturated_px : a frame is saturated if at least overexposed_objects objects have more than
-        saturated_px saturated pixels each
+    Attributes
+    ----------
+    mean_dn
+        Reference mean; a frame with a greater mean is saturated
+    longest_s
+        50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
+    min_stars
+        With fewer objects the flag no_stars is set
+    overexposed_objects, saturated_px
+        A frame is saturated if at least overexposed_objects objects have more than saturated_px
+        saturated pixels each
 
-    Raises ValueError for limits outside of the camera's range or for invalid numbers.
+    Raises
+    ------
+    ValueError
+        For limits outside of the camera's range or for invalid numbers.
     """
 
     mean_dn: float
@@ -78,9 +86,14 @@ class Control:
 class Observation:
     """Measurements of one frame for the exposure control.
 
-    mean_dn     : of all pixels
-    stars       : number of objects from centroiding
-    overexposed : number of objects with more than `Control.saturated_px` saturated pixels
+    Attributes
+    ----------
+    mean_dn
+        Of all pixels
+    stars
+        Number of objects from centroiding
+    overexposed
+        Number of objects with more than `Control.saturated_px` saturated pixels
     """
 
     mean_dn: float
@@ -113,10 +126,17 @@ def step(state: NextExposure, observation: Observation, control: Control) -> Nex
 def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:
     """Measure a frame for the exposure control.
 
-    image  : (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
-    saturation_dn : least value of a saturated pixel
+    Parameters
+    ----------
+    image
+        (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
+    saturation_dn
+        Least value of a saturated pixel
 
-    Raises ImageError for boxes outside of the image.
+    Raises
+    ------
+    ImageError
+        For boxes outside of the image.
     """
     checks.of_type("exposure: control", control, Control)
     check_pixel_type(image)
@@ -158,5 +178,3 @@ def _measure(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -
                 saturated += image[y, x] >= saturation_dn
         overexposed += saturated > allowed
     return total / image.size, overexposed
-
-

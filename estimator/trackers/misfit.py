@@ -12,24 +12,30 @@ from __future__ import annotations
 from dataclasses import replace
 from math import log, log10, sqrt
 from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
 from estimator.catalog.sky_index import SkyIndex
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
+from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
+from estimator.identification import star_evidence, star_search
 from estimator.identification.chance import GATE_SIGMA
-from estimator.identification import star_evidence
-from estimator.identification import star_search
-from estimator.identification.star_detections import (Detections, FlatCentroids, Sensor, changed, detections_of, gates_of, information_of)
+from estimator.identification.star_detections import (
+    Detections,
+    FlatCentroids,
+    Sensor,
+    changed,
+    detections_of,
+    gates_of,
+    information_of,
+)
 from estimator.identification.star_evidence import Solution
-from estimator.core.constants import ARCSEC_RAD
-from estimator.identification.star_detections import (Detections, information_of)
-
-
 
 TELLING = 1.5  # variance factor above which matches and lens are tried anew
 DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried, also where every centroid is matched
@@ -58,7 +64,12 @@ def widened(
 
     The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
     prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
-    detections : with the errors of the model, and the focal uncertainty with which the solution was found
+
+    Parameters
+    ----------
+    detections
+        With the errors of the model, and the focal uncertainty with which the solution was
+        found
     """
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
@@ -171,9 +182,16 @@ def residuals_too_great(solution: Solution) -> bool:
 class Refit(NamedTuple):
     """A solution with the errors and the lens that its residuals tell.
 
-    solution : with the covariance multiplied by `variance`
-    camera   : with the fitted lens;  variance : factor of the claimed variances
-    sheared  : whether the field is stretched or sheared, as by a rolling shutter: its attitude is none
+    Attributes
+    ----------
+    solution
+        With the covariance multiplied by `variance`
+    camera
+        With the fitted lens
+    variance
+        Factor of the claimed variances
+    sheared
+        Whether the field is stretched or sheared, as by a rolling shutter: its attitude is none
     """
 
     solution: Solution
@@ -193,9 +211,17 @@ def refit(
 ) -> Refit:
     """The solution matched, fitted and scaled anew by its residuals.
 
-    detections : with the errors of the model, and the focal uncertainty with which the solution was found
-    camera     : of the solution;  xy_px : (N, 2) centroids
-    variance   : factor of the variances if the solution has been matched anew (`widened`); else 0
+    Parameters
+    ----------
+    detections
+        With the errors of the model, and the focal uncertainty with which the solution was
+        found
+    camera
+        Of the solution
+    xy_px
+        (N, 2) centroids
+    variance
+        Factor of the variances if the solution has been matched anew (`widened`); else 0
     """
     if not variance:
         R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
@@ -293,8 +319,6 @@ def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
     return replace(camera, focal_px=focal_px, distortion=distortion)
 
 
-
-
 # Errors of catalog stars with a companion: a double star is not where its catalog entry is.
 
 
@@ -353,9 +377,13 @@ def prediction_by_others(
 ) -> tuple[Floats, Floats]:
     """(K, 2) residuals of stars from the attitude of all others, and (K, 2, 2) the covariances of what these predict.
 
-    residual, jacobian, information : (K, 2), (K, 2, 3) and (K, 2, 2) of the attitude that fits them all
     With the information N of the attitude and J' W J that of one star, the attitude without it moves by
     -(N - J' W J)^-1 J' W r.
+
+    Parameters
+    ----------
+    residual, jacobian, information
+        (K, 2), (K, 2, 3) and (K, 2, 2) of the attitude that fits them all
     """
     weighted = np.swapaxes(jacobian, 1, 2) @ information
     each = weighted @ jacobian
@@ -371,7 +399,10 @@ def prediction_by_others(
 def mean_information(information: Floats, residual: Floats, spread: Floats) -> Floats:
     """(K, 2, 2) mean inverse covariances of stars by their residuals (K, 2) from what the others predict.
 
-    information, spread : (K, 2, 2) of the centroid alone, and covariance of the prediction
+    Parameters
+    ----------
+    information, spread
+        (K, 2, 2) of the centroid alone, and covariance of the prediction
     """
     excess = ERROR_RAD[:, None, None, None] ** 2 * np.eye(2)
     covariance = np.linalg.inv(information) + excess
@@ -383,5 +414,3 @@ def mean_information(information: Floats, residual: Floats, spread: Floats) -> F
     return np.asarray(
         np.einsum("jk,jkim->kim", probability, np.linalg.inv(covariance)), dtype=float
     )
-
-

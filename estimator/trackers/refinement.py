@@ -9,25 +9,25 @@ predictions tell whether the camera model explains the whole field or only a par
 from __future__ import annotations
 
 from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import focal_error_px, with_focal_error
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification import star_evidence
+from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.star_evidence import Solution
-from estimator.trackers.pipeline import Settings, direction_sigma_rad
 from estimator.trackers import misfit
-
-
+from estimator.trackers.pipeline import Settings, direction_sigma_rad
 
 NO_MATCH = "no identification beyond chance"
 MISFIT_SHARE = 0.8  # near misses per match; centroid errors that are claimed three times too small give up to 0.75
@@ -42,11 +42,18 @@ CONVERGED_FALL = 1e-6
 class FieldMatcher:
     """Matches detections to the catalog stars that a candidate attitude predicts on the sensor.
 
-    camera   : on-board calibration
-    stars    : apparent directions and magnitudes
-    sky      : index of the same stars
-    patterns : number of patterns that were searched, for the expected number of chance matches
-    focal_uncertainty : relative; unless it is 0, the lens is fitted with the attitude
+    Attributes
+    ----------
+    camera
+        on-board calibration
+    stars
+        Apparent directions and magnitudes
+    sky
+        Index of the same stars
+    patterns
+        Number of patterns that were searched, for the expected number of chance matches
+    focal_uncertainty
+        Relative; unless it is 0, the lens is fitted with the attitude
     """
 
     def __init__(
@@ -265,5 +272,3 @@ def fit_camera(
         distortion=(k1, 0.0, 0.0, 0.0, 0.0),
     )
     return lens, Rotation.from_rotvec(found[:3]) * cam_from_ref
-
-

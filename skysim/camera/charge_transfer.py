@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import functools
 from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-
-
 
 BLOCK = 256  # columns processed together: a kilobyte or two of each row, which the processor reads ahead
 TAIL = 1e-6  # fraction of a packet that the table of delays does not resolve
@@ -23,11 +23,15 @@ TAIL = 1e-6  # fraction of a packet that the table of delays does not resolve
 def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
     """Spread charge above the full well along its column: half of each excess to either neighbor, until all fits.
 
-    anti_blooming : fraction of every pixel's excess that a drain removes first; the rest is conserved, except for
-        what leaves the ends of the column, which is lost.
     The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
     (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
     conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
+
+    Parameters
+    ----------
+    anti_blooming
+        Fraction of every pixel's excess that a drain removes first; the rest is conserved,
+        except for what leaves the ends of the column, which is lost.
     """
     columns = np.flatnonzero(electrons.max(axis=0) > full_well_e)
     if len(columns):
@@ -104,10 +108,14 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
     """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet:
     trailing tails.
 
-    cti_parallel, cti_serial : that fraction, the same for every charge (linear, no traps that fill).
     Of a packet that makes n transfers, C(n + k - 1, k) cti^k (1 - cti)^n arrives k pixels late: it takes k
     failures before the n-th success, the negative binomial law. What arrives later than the frame's last row or
     column is in the overscan and not in the frame; nothing else is lost.
+
+    Parameters
+    ----------
+    cti_parallel, cti_serial
+        That fraction, the same for every charge (linear, no traps that fill).
     """
     height, width = electrons.shape
     if cti_parallel > 0:
@@ -172,11 +180,15 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
     """Smear of a frame-transfer chip: rows shifted under light collect row_time / exposure of the light of every
     row passed.
 
-    light_e : light of the exposure; the smear is added in place. Dark current is the same in every row, so it
-        is not affected.
     The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
     shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
     So it passes every other row of its column once, with the same brightness as in the exposure.
+
+    Parameters
+    ----------
+    light_e
+        Light of the exposure; the smear is added in place. Dark current is the same in every
+        row, so it is not affected.
     """
     _smear(light_e, row_time_s / exposure_s)
 
@@ -186,8 +198,12 @@ def interline_smear(
 ) -> None:
     """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
 
-    light_e : light of the exposure; the smear is added in place. The register is clocked all the time, so
-        the register cell that takes over a pixel's charge has passed the rows above it and will pass those below.
+    Parameters
+    ----------
+    light_e
+        Light of the exposure; the smear is added in place. The register is clocked all the
+        time, so the register cell that takes over a pixel's charge has passed the rows above it
+        and will pass those below.
     """
     _smear(light_e, leak * row_time_s / exposure_s)
 
@@ -210,5 +226,3 @@ def _smear(light_e: NDArray[Any], fraction: float) -> None:
             ]  # contiguous for the compiler, which rows of a block of columns are not
             for x in range(len(row)):
                 row[x] = own * row[x] + smear[x]
-
-

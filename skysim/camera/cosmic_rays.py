@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import erf, sqrt
 from typing import Any
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+
 from skysim.camera.psf.splat import add_gaussian
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import ParticlesConfig
-
-
 
 STEP_PX = 0.25
 # Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometer, 4.9 electrons of 3.65 eV, over
@@ -138,5 +138,3 @@ def _fraction_inside(center: float, size: int, sigma_px: float) -> float:
     """Fraction of a Gaussian centered at `center` that is within an axis of so many pixels."""
     scale = 1 / (sigma_px * sqrt(2.0))
     return (erf((size - 0.5 - center) * scale) - erf((-0.5 - center) * scale)) / 2
-
-

@@ -7,20 +7,18 @@ read noise, nonlinearity and the converter. Each step is switched off by its par
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
-import numpy as np
-from numpy.typing import NDArray
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any, NamedTuple
+
 import numba
+import numpy as np
 from numba import float32, int32
 from numpy.random import Generator
-from skysim.camera import charge_transfer
-from skysim.camera import cosmic_rays
-from skysim.camera import noise
+from numpy.typing import NDArray
+
+from skysim.camera import charge_transfer, cosmic_rays, noise
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.types import SourceTruth
@@ -32,10 +30,6 @@ from skysim.scene.sections.camera import (
     Shutter,
 )
 from skysim.sources.photometry import snr
-
-
-
-
 
 # Pixels to which something other than light adds charge: smear of the shutter and particles, for
 # labelled frames.
@@ -71,9 +65,14 @@ ROWS = 16  # that share memory for their random numbers
 class Detector:
     """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
 
-    sensitivity     : (H, W) relative, mean 1: PRNU
-    dark_e_s        : (H, W) dark current at the chip's temperature, with DSNU and hot pixels
-    column_offset_e : (W,) offsets of the column amplifiers
+    Attributes
+    ----------
+    sensitivity
+        (H, W) relative, mean 1: PRNU
+    dark_e_s
+        (H, W) dark current at the chip's temperature, with DSNU and hot pixels
+    column_offset_e
+        (W,) offsets of the column amplifiers
     """
 
     config: DetectorConfig
@@ -140,10 +139,16 @@ def expose(
 ) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
-    light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
     clipped, for tests of the steps that follow.
-    added   : gets the mask of the particles' pixels
+
+    Parameters
+    ----------
+    light_e
+        (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`;
+        overwritten
+    added
+        Gets the mask of the particles' pixels
     """
     config = detector.config
     if not config.noise:
@@ -347,11 +352,16 @@ def add_snr_and_saturation(
 ) -> SourceTruth:
     """Which sources are expected to saturate, and the signal-to-noise ratio of each.
 
-    light_e : (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it
     Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
     expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation over the
     noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
     converter's rounding added to the read noise.
+
+    Parameters
+    ----------
+    light_e
+        (H, W) mean photo-electrons of the whole frame, smear included, before `expose`
+        overwrites it
     """
     config = detector.config
     x, y = sources.peak_xy.T
@@ -363,5 +373,3 @@ def add_snr_and_saturation(
     noise_e = np.sqrt(config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12)
     sources_snr = snr(sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e)
     return replace(sources, saturated=is_saturated, snr=sources_snr)
-
-

@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
 import numba
 import numpy as np
-from skysim.core.jit import jit
-from skysim.core.types import Floats
-from skysim.sources.body_discs import (DiscSurface, cell_light, inner_radius2)
-from collections.abc import Callable
-from typing import Any, NamedTuple
 from numpy.typing import NDArray
 from scipy import fft
+
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
-from skysim.camera.render import STEP, Window, draw, image_tracks, poses, project, sample_times
-from skysim.core.types import Floats, Mount, Trajectory
-from skysim.sources.dome.led import Emitter
+from skysim.camera.render import (
+    STEP,
+    OcclusionTest,
+    Window,
+    draw,
+    image_tracks,
+    in_view,
+    poses,
+    project,
+    render,
+    sample_times,
+)
+from skysim.core.jit import jit
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.bodies import BodyLight
+from skysim.sources.body_discs import DiscSurface, cell_light, disc_elements, inner_radius2
+from skysim.sources.dome.led import Emitter
 from skysim.sources.stars import steady_points
-from collections.abc import Sequence
-from dataclasses import fields
-from skysim.camera.render import OcclusionTest, in_view, poses, render
-from skysim.core.types import Floats, Sources, SourceTruth
-from skysim.sources.body_discs import disc_elements
-
-
-
-
 
 # The light of a disc on a lattice of sub-pixels, sampled several times a point where that is
 # needed.
@@ -47,8 +50,13 @@ def lattice_light(
 ) -> Floats:
     """(count, count) shares of the disc's light at the points of a lattice, [y, x], which zeros must surround.
 
-    axis_px : (count * subsamples,) even coordinates of the samples in both directions
-    shown   : (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where all are seen
+    Parameters
+    ----------
+    axis_px
+        (count * subsamples,) even coordinates of the samples in both directions
+    shown
+        (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where
+        all are seen
     """
     fine = len(axis_px)
     weights = sharing_weights(subsamples)
@@ -110,7 +118,10 @@ def _light_rows(
 ) -> None:
     """Light of each row of samples, shared among the lattice's columns, from the Sun and from the observer's side.
 
-    totals : (fine, 2) sums of the rows with what is hidden
+    Parameters
+    ----------
+    totals
+        (fine, 2) sums of the rows with what is hidden
     """
     count = sunlit.shape[1]
     subsamples = len(weights)
@@ -198,8 +209,12 @@ class Exposed(NamedTuple):
 class DiscOnChip(NamedTuple):
     """Where a disc lies on the chip at mid-exposure.
 
-    center_px       : (2,)
-    px_from_radius  : (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
+    Attributes
+    ----------
+    center_px
+        (2,)
+    px_from_radius
+        (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
     """
 
     center_px: Floats
@@ -231,10 +246,16 @@ def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
 class DisplacedImages(NamedTuple):
     """A point of the disc's full light at its center and displaced by sub-pixel phases.
 
-    patches   : (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
-    corner_px : (2,) chip's pixel (x, y) of a patch's first one
-    speed_px_s: (2,) velocity of the image at mid-exposure
-    streak_px : path length
+    Attributes
+    ----------
+    patches
+        (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
+    corner_px
+        (2,) chip's pixel (x, y) of a patch's first one
+    speed_px_s
+        (2,) velocity of the image at mid-exposure
+    streak_px
+        Path length
     """
 
     patches: Floats
@@ -528,5 +549,3 @@ def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
     return SourceTruth(
         **{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names}
     )
-
-

@@ -16,13 +16,13 @@ from __future__ import annotations
 from functools import lru_cache
 from math import exp, log, pi, sqrt
 from typing import Any, NamedTuple
+
 import numpy as np
 from numba import float32, float64, int32, int64, uint8, uint16, uint32, uint64
 from numpy.random import Generator
 from numpy.typing import NDArray
+
 from skysim.core.jit import jit
-
-
 
 BUCKETS = 1024  # ten bits; the rows of a dark frame's means then fit the L2 cache
 GUIDES_PER_E = 128  # guide tables per electron of mean
@@ -44,8 +44,18 @@ ROOT_HALF_BITS = 0x3F3504F3  # the single-precision number sqrt(1/2)
 class Scratch(NamedTuple):
     """Memory for one row at a time. A NamedTuple, because numba can compile functions that take one.
 
-    bits : 64-bit draws;  cell, late : a number for each pixel;  found : a byte for each pixel, and up to seven more
-    radius, exponent : a number for every other pixel;  normals, means : one for each
+    Attributes
+    ----------
+    bits
+        64-bit draws
+    cell, late
+        A number for each pixel
+    found
+        A byte for each pixel, and up to seven more
+    radius, exponent
+        A number for every other pixel
+    normals, means
+        One for each
     """
 
     bits: NDArray[np.uint64]
@@ -394,5 +404,3 @@ def _lengthen(radius: Any, words: Any, state: Any) -> Any:
             more, state = _uniform(state)
             radius[n] = sqrt(-2 * log((steps + more) * 2.0**-31))
     return state
-
-

@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from skysim.camera.optics import Optics, ScaledOptics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Mount, Sources
-from skysim.scene.sections.surroundings import (LinearTemperatureConfig, SineTemperatureConfig, SteadyTemperatureConfig, TemperatureTableConfig, ThermalConfig)
-
+from skysim.scene.sections.surroundings import (
+    LinearTemperatureConfig,
+    SineTemperatureConfig,
+    SteadyTemperatureConfig,
+    TemperatureTableConfig,
+    ThermalConfig,
+)
 
 
 def steady(config: SteadyTemperatureConfig, _hours: float) -> float:
@@ -79,5 +86,3 @@ def camera_at(
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
     scale = 1 + PPM * config.lens_ppm_k * difference_k
     return mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics
-
-

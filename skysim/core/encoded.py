@@ -7,25 +7,23 @@ does not open TIFF files of 64-bit floats, or uses the last of a repeated tag wh
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
-import os
-import sys
-from contextlib import contextmanager
-from math import prod
-from pathlib import Path
-import cv2
-from skysim.core.errors import InputError
 import io
+import os
+import struct
+import sys
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-
+from skysim.core.errors import InputError
 
 # Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same
 # structure.
@@ -125,8 +123,12 @@ def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
 class Exif(NamedTuple):
     """What a camera wrote beside the pixels (Exif 2.32, CIPA DC-008).
 
-    orientation : 1 to 8; 1 if the rows are stored as they are to be seen
-    focal_35mm  : FocalLengthIn35mmFilm, mm; None if unknown
+    Attributes
+    ----------
+    orientation
+        1 to 8; 1 if the rows are stored as they are to be seen
+    focal_35mm
+        FocalLengthIn35mmFilm, mm; None if unknown
     """
 
     orientation: int = 1
@@ -148,8 +150,6 @@ def read_exif_block(data: bytes) -> Exif:
         pass
     orientation = found.get(ORIENTATION_TAG, 1)
     return Exif(orientation if 1 <= orientation <= 8 else 1, found.get(FOCAL_35MM_TAG) or None)
-
-
 
 
 # What the readers of images share: limits on the size by the header, and C libraries that print
@@ -347,5 +347,3 @@ def upright(image: NDArray, orientation: int) -> NDArray:
         image = image.swapaxes(0, 1)
     rows, columns = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 0: (-1, 1)}[orientation % 4]
     return np.ascontiguousarray(image[::rows, ::columns])
-
-

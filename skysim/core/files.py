@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from skysim.core.errors import InputError
 import yaml
+from numpy.typing import NDArray
 
-
+from skysim.core.errors import InputError
 
 HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
@@ -116,7 +116,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def make_folder(path: Path) -> Path:
     """The folder, created if it does not exist, without temporary files of our processes that were killed.
 
-    Raises InputError if it cannot be created.
+    Raises
+    ------
+    InputError
+        If it cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -141,8 +144,13 @@ UNCOMPRESSED_TIFF = (
 def write_image(path: Path, image: NDArray) -> None:
     """Write an image in the format of the name's suffix.
 
-    Raises InputError if it cannot be encoded, OSError if it cannot be written. OpenCV encodes in memory, because it
-    would not report why a file cannot be written.
+    Raises
+    ------
+    InputError
+        If it cannot be encoded
+    OSError
+        If it cannot be written. OpenCV encodes in memory, because it would not report why a
+        file cannot be written.
     """
     try:
         encoded, data = cv2.imencode(
@@ -219,8 +227,6 @@ def to_json(data: Any) -> str:
     return json.dumps(without_nan(data), indent=1, allow_nan=False)
 
 
-
-
 # Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study
 # files.
 
@@ -253,5 +259,3 @@ def title_of(path: Path) -> str:
         return values["title"]
     base = path.with_name(f"{values.get('base', '').removesuffix('.yaml')}.yaml")
     return title_of(base) if "base" in values and base.is_file() and base != path else ""
-
-

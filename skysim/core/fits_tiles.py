@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 import warnings
+
 import numpy as np
 from astropy.io import fits
-
 
 
 def decode(path: str, number: str, out: str) -> None:
@@ -27,5 +27,3 @@ if __name__ == "__main__":
         raise
     except Exception as error:
         sys.exit(" ".join(str(error).split()))
-
-

@@ -15,8 +15,6 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-
-
 WALL_S = 15.0  # for a child that waits, or on a loaded machine
 MESSAGE_BYTES = 1000  # of a child's last words
 # One thread: the stacks and arenas of a pool for many cores would exceed the limit of memory.
@@ -26,7 +24,10 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) -> str:
     """Run a script to its end; return "" on success, else why it failed, in one line.
 
-    cpu_s : processor time, with start-up; memory_bytes : address space, with the libraries
+    Parameters
+    ----------
+    cpu_s
+        Processor time, with start-up; memory_bytes : address space, with the libraries
     """
     command = [
         sys.executable,
@@ -77,5 +78,3 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
-
-

@@ -16,22 +16,19 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, BinaryIO, NamedTuple
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skysim.core.errors import InputError
+
 from skysim.core import encoded
-from skysim.core.encoded import check_pixels
+from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
+from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
-from dataclasses import dataclass
-import cv2
-from skysim.core.encoded import (check_bytes, silent_opencv)
-
-
-
-
 
 # FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
 # row order and date.
@@ -69,11 +66,17 @@ TOP_DOWN = {
 class FitsImage(NamedTuple):
     """The first image of a file.
 
-    pixels   : (H, W), or (H, W, 3) in OpenCV's order blue, green, red; rows as stored
-    top_down : whether the first row is the highest, by ROWORDER; None without one: the lowest is, by the standard, but
-        programs that do not follow it leave the keyword out too
-    date_utc : DATE-OBS; None without a valid one
-    exposure_s, temperature_c : EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP; None without a number
+    Attributes
+    ----------
+    pixels
+        (H, W), or (H, W, 3) in OpenCV's order blue, green, red; rows as stored
+    top_down
+        Whether the first row is the highest, by ROWORDER; None without one: the lowest is, by
+        the standard, but programs that do not follow it leave the keyword out too
+    date_utc
+        DATE-OBS; None without a valid one
+    exposure_s, temperature_c
+        EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP; None without a number
     """
 
     pixels: NDArray
@@ -210,7 +213,10 @@ def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
 def channels_last(path: Path, pixels: NDArray) -> NDArray:
     """A color cube, (3, H, W) or (H, W, 3), red first, as (H, W, 3), blue first; a monochrome image as (H, W).
 
-    Raises InputError for any other shape.
+    Raises
+    ------
+    InputError
+        For any other shape.
     """
     shape = pixels.shape
     while pixels.ndim > 2 and pixels.shape[0] == 1:
@@ -260,12 +266,19 @@ LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in Op
 class ViewedImage:
     """An image as a person sees it: turned as EXIF says, the highest row first.
 
-    pixels          : (H, W) or (H, W, channels), blue first
-    date_utc        : DATE-OBS of a FITS file; None if unknown
-    focal_35mm      : focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
-    row_order_known : False for a FITS file without ROWORDER, whose last row is then taken for the highest, as the
-        standard recommends
-    exposure_s, temperature_c : of a FITS header; None if unknown
+    Attributes
+    ----------
+    pixels
+        (H, W) or (H, W, channels), blue first
+    date_utc
+        DATE-OBS of a FITS file; None if unknown
+    focal_35mm
+        Focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
+    row_order_known
+        False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
+        the standard recommends
+    exposure_s, temperature_c
+        Of a FITS header; None if unknown
     """
 
     pixels: NDArray
@@ -301,7 +314,11 @@ def read_picture(path: Path) -> ViewedImage:
 def read_image(path: Path) -> NDArray:
     """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as stored: (H, W) or (H, W, channels), blue first.
 
-    Raises InputError with one line for a file that is missing, truncated, not an image, or has too many pixels.
+    Raises
+    ------
+    InputError
+        With one line for a file that is missing, truncated, not an image, or has too many
+        pixels.
     """
     check_name(path)
     return check_numbers(
@@ -388,5 +405,3 @@ def grab_frame(source: str) -> NDArray:
     """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
     with contextlib.closing(LiveCamera(source)) as camera:
         return camera.frame()
-
-

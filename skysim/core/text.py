@@ -10,12 +10,12 @@ import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
+
 from skysim.core.errors import InputError, Where, printable
 from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
-
-
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
 MAX_EXCERPT = 40  # characters of a value in a message
@@ -139,10 +139,19 @@ def read_named_rows(
 ) -> tuple[list[str], Floats]:
     """Names and numbers of a CSV file whose first line names its columns; # begins a comment.
 
-    name, needed : columns that it must have, of the rows' names, each once, and of numbers
-    also    : columns of numbers that it may have, after `needed` in the result;  others are not used
-    refusal : of a file without these columns or rows
-    Raises InputError with one line.
+    Parameters
+    ----------
+    name, needed
+        Columns that it must have, of the rows' names, each once, and of numbers
+    also
+        Columns of numbers that it may have, after `needed` in the result;  others are not used
+    refusal
+        Of a file without these columns or rows
+
+    Raises
+    ------
+    InputError
+        With one line.
     """
     lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
     columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
@@ -203,5 +212,3 @@ def one_of(path: str | Path, metadata: dict[str, Line], key: str, allowed: Itera
             path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line)
         )
     return value.upper()
-
-

@@ -16,13 +16,13 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
+
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
+
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
-
-
 
 Files = list[tuple[Path, str]]  # paths and texts
 VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
@@ -415,5 +415,3 @@ def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
         line = entry[0].start_mark.line + 1
         node = entry[1]
     return depth, line
-
-

@@ -8,9 +8,15 @@ from __future__ import annotations
 import sys
 from functools import partial
 from typing import IO, Any
-from skysim.core.plugins import Respond, describe_error, serve
-from skysim.dynamics.controllers import (CONTROLLERS, ControllerInput, ControllerSetup, build_law, check_torque)
 
+from skysim.core.plugins import Respond, describe_error, serve
+from skysim.dynamics.controllers import (
+    CONTROLLERS,
+    ControllerInput,
+    ControllerSetup,
+    build_law,
+    check_torque,
+)
 
 
 def create(name: str, tree: dict[str, Any]) -> Respond:
@@ -30,5 +36,3 @@ def create(name: str, tree: dict[str, Any]) -> Respond:
 
 if __name__ == "__main__":
     serve(partial(create, sys.argv[1]))
-
-

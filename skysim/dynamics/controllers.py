@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Self
-import numpy as np
-from skysim.core.errors import printable
-from skysim.core.plugins import MAX_STATUS_CHARS, Floats, PluginKind, finite_array, to_lists
-from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED
 import json
 import shlex
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
 from skysim.core.errors import InputError, printable
 from skysim.core.plugins import (
     MAX_STATUS_CHARS,
+    PluginKind,
     Program,
     ProgramError,
     describe_error,
+    finite_array,
     host_command,
+    to_lists,
 )
 from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
-from skysim.scene.sections.motion import ControlConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED, ControlConfig
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-
 
 
 # The interface for external attitude controllers: set-up, input, torque, and discovery by entry
@@ -47,12 +46,21 @@ MAX_AUTHORITIES = (
 class ControllerSetup:
     """What a controller gets before the first control period.
 
-    period_s         : control period: time between two calls
-    inertia_kg_m2    : (3, 3) about the bearing, in body axes
-    authority_nm     : torque that the actuators can give in every direction; a larger one is limited by them
-    rate_limit_rad_s : rate above which the gyros saturate, with a margin; None if the controller does not use them
-    actuators, feedback, bandwidth_rad_s, damping, integral_rad_s, options : of the scene's `motion.control`
-    seed             : for a controller that draws random numbers
+    Attributes
+    ----------
+    period_s
+        Control period: time between two calls
+    inertia_kg_m2
+        (3, 3) about the bearing, in body axes
+    authority_nm
+        Torque that the actuators can give in every direction; a larger one is limited by them
+    rate_limit_rad_s
+        Rate above which the gyros saturate, with a margin; None if the controller does not use
+        them
+    actuators, feedback, bandwidth_rad_s, damping, integral_rad_s, options
+        Of the scene's `motion.control`
+    seed
+        For a controller that draws random numbers
     """
 
     period_s: float
@@ -83,13 +91,24 @@ class ControllerSetup:
 class ControllerInput:
     """What a controller gets at the start of a control period. Quaternions are unit, scalar last: v_lab = q v q*.
 
-    tick                     : number of the period, from 0;  t_s : seconds since the scene's start
-    lab_from_body_xyzw       : (4,) measured attitude;  rate_body_rad_s : (3,) measured rate in body axes. The source
-        of both is `motion.control.feedback`
-    lab_from_ref_xyzw        : (4,) commanded attitude
-    rate_ref_rad_s, acceleration_ref_rad_s2 : (3,) each, commanded, in the commanded attitude's own axes
-    momentum_nms             : (3,) stored in wheels and CMGs, in body axes
-    achieved_nm              : (3,) torque that the actuators gave for the last command; zeros at the first
+    Attributes
+    ----------
+    tick
+        Number of the period, from 0
+    t_s
+        Seconds since the scene's start
+    lab_from_body_xyzw
+        (4,) measured attitude
+    rate_body_rad_s
+        (3,) measured rate in body axes. The source of both is `motion.control.feedback`
+    lab_from_ref_xyzw
+        (4,) commanded attitude
+    rate_ref_rad_s, acceleration_ref_rad_s2
+        (3,) each, commanded, in the commanded attitude's own axes
+    momentum_nms
+        (3,) stored in wheels and CMGs, in body axes
+    achieved_nm
+        (3,) torque that the actuators gave for the last command; zeros at the first
     """
 
     tick: int
@@ -172,8 +191,12 @@ def _rotation(a_from_b_xyzw: Floats) -> Rotation:
 class ControllerSource(NamedTuple):
     """Where external controllers come from, beside entry points.
 
-    programs : commands by name, from the user's command line
-    factory  : the controller given to `skysim.simulate`, in place of the one that the scene names
+    Attributes
+    ----------
+    programs
+        Commands by name, from the user's command line
+    factory
+        The controller given to `skysim.simulate`, in place of the one that the scene names
     """
 
     programs: Mapping[str, str] = {}
@@ -191,8 +214,12 @@ NO_SOURCE = ControllerSource()
 class ExternalLaw:
     """An external controller with the methods of `attitude_control.Pid`. Stateful: one motion each.
 
-    answer : returns the checked torque for an input, or raises an exception
-    program: the running program, None for a callable in this process
+    Attributes
+    ----------
+    answer
+        Returns the checked torque for an input, or raises an exception
+    program
+        The running program, None for a callable in this process
     """
 
     def __init__(
@@ -284,5 +311,3 @@ def external_law(
 def scalar_last(a_from_b_wxyz: Floats) -> Floats:
     """(4,) xyzw of a quaternion wxyz."""
     return a_from_b_wxyz[[1, 2, 3, 0]]
-
-

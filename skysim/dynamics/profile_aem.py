@@ -12,16 +12,30 @@ from __future__ import annotations
 import datetime
 from dataclasses import replace
 from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError, Where
-from skysim.core.text import (Line, TextSegment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers)
+from skysim.core.text import (
+    Line,
+    TextSegment,
+    check_version,
+    excerpt,
+    keyword_value,
+    one_of,
+    seconds_since,
+    to_numbers,
+)
 from skysim.core.time import SCALES
 from skysim.core.types import Floats
-from skysim.dynamics.profile_samples import (REFERENCES, frame_of, icrs_from)
-from skysim.dynamics.profile_samples import (Samples, from_quaternions)
-
-
+from skysim.dynamics.profile_samples import (
+    REFERENCES,
+    Samples,
+    frame_of,
+    from_quaternions,
+    icrs_from,
+)
 
 VERSION = "CCSDS_AEM_VERS"
 VERSIONS = ("1.0", "2.0")
@@ -167,7 +181,10 @@ def to_icrs(samples: Samples, names: list[str]) -> Samples:
 def join(first: Samples, second: Samples) -> Samples:
     """Two adjoining segments as one. A sample that both have at the seam is taken once.
 
-    Raises InputError for segments of different frames, that overlap or that leave a gap.
+    Raises
+    ------
+    InputError
+        For segments of different frames, that overlap or that leave a gap.
     """
     if not len(first.t_s) or not len(second.t_s):
         return first if len(first.t_s) else second
@@ -201,5 +218,3 @@ def join(first: Samples, second: Samples) -> Samples:
         t_s=np.concatenate([first.t_s, second.t_s]),
         a_from_b=Rotation.concatenate([first.a_from_b, second.a_from_b]),
     )
-
-

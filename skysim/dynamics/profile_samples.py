@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError, Where
-from skysim.core.types import Floats
 from skysim.core.text import excerpt
 from skysim.core.time import J2000_JD
-
-
+from skysim.core.types import Floats
 
 # a not-a-knot cubic takes four
 MIN_SAMPLES = 4
@@ -29,12 +29,21 @@ MAX_STEP_DEG = 10.0
 class Samples:
     """N attitudes over time.
 
-    source   : file, or what else the samples come from, for messages
-    unit     : what `places` count: line of a file, or row of a table
-    places   : (N,) where each sample stands, from 1
-    t_s      : (N,) seconds from the scene's start if `absolute` (the samples have epochs), else from the file's zero
-    a, b     : frames of the rotations: one of icrs and lab, and one of body and cam, in any order
-    a_from_b : N rotations
+    Attributes
+    ----------
+    source
+        File, or what else the samples come from, for messages
+    unit
+        What `places` count: line of a file, or row of a table
+    places
+        (N,) where each sample stands, from 1
+    t_s
+        (N,) seconds from the scene's start if `absolute` (the samples have epochs), else from
+        the file's zero
+    a, b
+        Frames of the rotations: one of icrs and lab, and one of body and cam, in any order
+    a_from_b
+        N rotations
     """
 
     source: str
@@ -115,8 +124,6 @@ def check_samples(samples: Samples) -> Samples:
     return samples
 
 
-
-
 # Reference frames of attitude files by the names that CCSDS and STK give them.
 
 
@@ -154,5 +161,3 @@ def icrs_from(name: str) -> Rotation:
         return Rotation.identity()
     mean_from_icrs, _, _ = erfa.bp06(J2000_JD, 0.0)
     return Rotation.from_matrix(mean_from_icrs).inv()
-
-

@@ -10,12 +10,10 @@ from __future__ import annotations
 import datetime
 from dataclasses import replace
 from pathlib import Path
+
 from skysim.core.errors import InputError, Where, unknown_name
-from skysim.core.text import (Line, excerpt, to_numbers)
-from skysim.dynamics.profile_samples import (REFERENCES, icrs_from)
-from skysim.dynamics.profile_samples import (Samples, from_quaternions)
-
-
+from skysim.core.text import Line, excerpt, to_numbers
+from skysim.dynamics.profile_samples import REFERENCES, Samples, from_quaternions, icrs_from
 
 # Numbers of a data line with its time, and the columns of x, y, z, w.
 SECTIONS = {
@@ -156,5 +154,3 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
             "1 Jul 2005 12:00:00.00",
             where=Where(path, line),
         ) from None
-
-

@@ -15,16 +15,16 @@ import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
-from skysim.core.errors import InputError, Where, printable
+
 from skysim.core import files
-from skysim.core.text import (Line, excerpt, seconds_since, to_numbers)
+from skysim.core.errors import InputError, Where, printable
+from skysim.core.text import Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
-from skysim.dynamics.profile_samples import (Samples, from_quaternions)
+from skysim.dynamics.profile_samples import Samples, from_quaternions
 from skysim.sources.stars import cam_from_icrs
-
-
 
 QUATERNIONS = (
     "lab_from_body",
@@ -217,5 +217,3 @@ def to_samples(
 def stack(columns: Mapping[str, Any], names: Sequence[str]) -> Floats:
     """(N, K) numbers of some columns."""
     return np.column_stack([columns[name] for name in names])
-
-

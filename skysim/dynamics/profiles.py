@@ -5,20 +5,17 @@ from __future__ import annotations
 import datetime
 from pathlib import Path
 from typing import Any
+
 from skysim.core.errors import InputError
 from skysim.core.text import read_lines
 from skysim.core.time import in_utc
 from skysim.core.types import Mount
-from skysim.dynamics import profile_aem
-from skysim.dynamics import profile_stk
-from skysim.dynamics import profile_table
-from skysim.dynamics.profile_samples import (Samples, check_samples)
-from skysim.dynamics.reference_curves import (AttitudeSpline, fit_spline)
+from skysim.dynamics import profile_aem, profile_stk, profile_table
+from skysim.dynamics.profile_samples import Samples, check_samples
+from skysim.dynamics.reference_curves import AttitudeSpline, fit_spline
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import ProfileConfig
-
-
 
 TABLE = "profile"  # source of a table given in Python
 
@@ -26,8 +23,16 @@ TABLE = "profile"  # source of a table given in Python
 def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[AttitudeSpline, ...]:
     """The profiles of a scene's maneuvers, in their order.
 
-    given : astropy Table, pandas DataFrame or mapping of columns in place of the first profile's file
-    Raises InputError that begins with the key.
+    Parameters
+    ----------
+    given
+        Astropy Table, pandas DataFrame or mapping of columns in place of the first profile's
+        file
+
+    Raises
+    ------
+    InputError
+        That begins with the key.
     """
     profiles: list[AttitudeSpline] = []
     for n, element in enumerate(scene.motion.maneuver):
@@ -44,7 +49,10 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
 def read_profile(source: Any, start: datetime.datetime, rotation: str | None = None) -> Samples:
     """The samples of a file, whose format its content tells, or of a table. Raises InputError.
 
-    start : the scene's start in UTC, from which epochs are counted
+    Parameters
+    ----------
+    start
+        The scene's start in UTC, from which epochs are counted
     """
     if not isinstance(source, Path):
         return profile_table.from_table(source, TABLE, start, rotation)
@@ -91,5 +99,3 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
         lab_from_body,
         samples.absolute,
     )
-
-

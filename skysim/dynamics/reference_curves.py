@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from skysim.core.jit import jit
-import numpy as np
-from skysim.core import quaternion
-from skysim.core.types import Floats
 from dataclasses import dataclass
+
+import numpy as np
+
+from skysim.core import quaternion
+from skysim.core.jit import jit
+from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import Samples
-
-
 
 AngleProfile = Callable[[float], tuple[float, float, float]]
 Derivatives = tuple[float, float, float]  # a value and its first two derivatives by time
@@ -107,8 +107,6 @@ def log_sweep(
     return modulated_sine(amplitude_rad, envelope(t_s, duration_s, rise_s, fall_s), phase)
 
 
-
-
 # Attitude during a smooth change of the rate, during which its axis may move: rate + change (3x^2 -
 # 2x^3).
 
@@ -182,8 +180,6 @@ def rate_change_state(
     )
 
 
-
-
 # Attitude samples interpolated by a C2 spline: attitude, rate and acceleration are continuous.
 
 
@@ -191,10 +187,16 @@ def rate_change_state(
 class AttitudeSpline:
     """Attitudes over time.
 
-    source       : where the samples come from, for messages
-    t_s          : (N,) sample times, ascending. They count from the scene's start if `absolute`, else from the start
-                   of the maneuver
-    coefficients : (N - 1, 4, 4) of the steps' cubics in t - t_s[k], from the third power down, of w, x, y, z
+    Attributes
+    ----------
+    source
+        Where the samples come from, for messages
+    t_s
+        (N,) sample times, ascending. They count from the scene's start if `absolute`, else from
+        the start of the maneuver
+    coefficients
+        (N - 1, 4, 4) of the steps' cubics in t - t_s[k], from the third power down, of w, x, y,
+        z
     """
 
     source: str
@@ -261,5 +263,3 @@ def spline_states(t_s: Floats, coefficients: Floats, at_s: Floats) -> tuple[Floa
     for n in range(len(at_s)):
         attitude[n], rate[n], acceleration[n] = spline_state(t_s, coefficients, at_s[n])
     return attitude, rate, acceleration
-
-

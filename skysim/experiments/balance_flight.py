@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
 import numpy as np
-from estimator.calibration.mass_dynamics import (LabConstants, Prior, inertia_six)
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.mass_dynamics import (
+    BearingRecord,
+    LabConstants,
+    MassEstimate,
+    Prior,
+    inertia_six,
+)
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
 from skysim.core.units import quantities_within
-from skysim.dynamics import imu
+from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.multibody import VehicleModel
-from skysim.scene.scene import Scene
-from collections.abc import Sequence
-from estimator.calibration.mass_dynamics import (BearingRecord, MassEstimate, Prior)
-import math
-from collections.abc import Callable
-from scipy.spatial.transform import Rotation
-from estimator.calibration.mass_dynamics import BearingRecord
-from skysim.dynamics import guidance, multibody
 from skysim.experiments.tracker_comparison import with_config
+from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
 from skysim.simulation.flight import Flight, open_flight
-
-
-
-
 
 # What is assumed of a vehicle before it is balanced, and how uncertain it is.
 
@@ -54,11 +54,18 @@ RANGES = {
 class Uncertainty:
     """Standard deviations of what is assumed, all Gaussian.
 
-    inertia_sigma : of each moment of inertia, relative to their mean; products have half of it
-    offset_sigma_m : of the center of mass along each axis, assumed at the bearing's center
-    wheel_sigma   : of each wheel's axial inertia, relative
-    mount_sigma_rad : of the tracker's axes in the body, about each axis, assumed as known
-    tacho_sigma_rad_s : of every reading of a wheel's speed
+    Attributes
+    ----------
+    inertia_sigma
+        Of each moment of inertia, relative to their mean; products have half of it
+    offset_sigma_m
+        Of the center of mass along each axis, assumed at the bearing's center
+    wheel_sigma
+        Of each wheel's axial inertia, relative
+    mount_sigma_rad
+        Of the tracker's axes in the body, about each axis, assumed as known
+    tacho_sigma_rad_s
+        Of every reading of a wheel's speed
     """
 
     inertia_sigma: float
@@ -89,9 +96,14 @@ def parse_uncertainty(
 class Assumptions:
     """What the lab assumes of a vehicle with its trim masses at zero.
 
-    prior : of the parameters (`estimator.calibration.mass_properties`)
-    lab   : gravity, the Earth's rate, wheel axes, level of the random torque
-    wheel_inertia_kg_m2 : (n,) assumed axial inertias
+    Attributes
+    ----------
+    prior
+        Of the parameters (`estimator.calibration.mass_properties`)
+    lab
+        Gravity, the Earth's rate, wheel axes, level of the random torque
+    wheel_inertia_kg_m2
+        (n,) assumed axial inertias
     """
 
     prior: Prior
@@ -143,8 +155,6 @@ def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> 
     )
 
 
-
-
 # Which mass properties a flight has not shown well enough, what was missing, and how much more
 # would do.
 
@@ -163,8 +173,14 @@ def check_observed(
 ) -> None:
     """Raise InputError, in one line, if moments of inertia or the moment are less certain than asked.
 
-    inertia_bar : standard deviation of a moment of inertia over its value;  moment_bar_kg_m : (3,) standard deviations
     of the components of the moment
+
+    Parameters
+    ----------
+    inertia_bar
+        Standard deviation of a moment of inertia over its value
+    moment_bar_kg_m
+        (3,) standard deviations
     """
     values = estimate.values
     sigma = estimate.sigma
@@ -240,7 +256,10 @@ ProgressCallback = Callable[[float, float], None]
 class BalanceFlight:
     """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
 
-    frames, solved, after_contact : numbers of frames
+    Attributes
+    ----------
+    frames, solved, after_contact
+        Numbers of frames
     """
 
     record: BearingRecord
@@ -414,5 +433,3 @@ def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> 
     turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[:, None]
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
     return np.asarray(jitter_s**2 * rate[:, :, None] * rate[:, None, :])
-
-

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+
 import numpy as np
-from estimator.calibration.mass_properties import estimate_with_noise
-from estimator.calibration.mass_dynamics import (MOMENT, BearingRecord, MassEstimate)
-from estimator.calibration.mass_properties import filter_mass
+
+from estimator.calibration.mass_dynamics import MOMENT, BearingRecord, MassEstimate
+from estimator.calibration.mass_properties import estimate_with_noise, filter_mass
 from estimator.core.checks import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -20,12 +21,14 @@ from skysim.core.units import quantity
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments import balance_flight
-from skysim.experiments.balance_flight import (Assumptions, Uncertainty, draw_assumptions)
-from skysim.experiments.balance_flight import BalanceFlight
+from skysim.experiments.balance_flight import (
+    Assumptions,
+    BalanceFlight,
+    Uncertainty,
+    draw_assumptions,
+)
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
-
-
 
 CONFIDENCE = 2.0  # standard deviations that the estimated torque must stay below the bar
 MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
@@ -35,9 +38,18 @@ MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
 class BalancePlan:
     """How a vehicle is balanced.
 
-    excite      : wheels or swing;  tilt_deg : of the excitation
-    torque_bar_nm : residual gravity torque;  max_flights : to try
-    moves       : False: estimate from one flight only
+    Attributes
+    ----------
+    excite
+        Wheels or swing
+    tilt_deg
+        Of the excitation
+    torque_bar_nm
+        Residual gravity torque
+    max_flights
+        To try
+    moves
+        False: estimate from one flight only
     """
 
     excite: str
@@ -51,7 +63,10 @@ class BalancePlan:
 class Bars:
     """What must be reached: residual torque, and standard deviations of inertia (relative) and offset.
 
-    offset_m : None: half of the residual torque over the vehicle's weight
+    Attributes
+    ----------
+    offset_m
+        None: half of the residual torque over the vehicle's weight
     """
 
     torque_nm: float
@@ -92,8 +107,12 @@ def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
 class Iteration:
     """One flight and the estimate from all flights so far.
 
-    estimate : of the vehicle with its trim masses at zero
-    next_m   : (n,) where the trim masses go next; where they are if they stay
+    Attributes
+    ----------
+    estimate
+        Of the vehicle with its trim masses at zero
+    next_m
+        (n,) where the trim masses go next; where they are if they stay
     """
 
     flight: BalanceFlight
@@ -132,7 +151,10 @@ def balance(
 ) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 
-    Raises InputError for a vehicle that cannot be balanced so.
+    Raises
+    ------
+    InputError
+        For a vehicle that cannot be balanced so.
     """
     balance_flight.check_scene(scene)
     vehicle = multibody.build(scene.vehicle)
@@ -219,5 +241,3 @@ def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene
             f" {1e6 * excess_kg_m:.3g} g mm",
         )
     return np.asarray(position_m)
-
-

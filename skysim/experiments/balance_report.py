@@ -5,29 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.calibration.mass_dynamics import (INERTIA, MOMENT, MassEstimate, inertia_six)
+
+from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
 from skysim.core import files
 from skysim.core.types import Floats
-from skysim.experiments.balance_flight import Assumptions
-from skysim.experiments.balance_flight import BalanceFlight
-from skysim.experiments.balance_flight import largest_tilt_deg
-from skysim.experiments.balance_procedure import (Iteration, BalancePlan, filtered)
-from skysim.results.report import (
+from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
+from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Column,
     Facts,
     Figure,
-    Report,
     Section,
     Table,
     Text,
     Verdict,
 )
-
-
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -235,5 +233,3 @@ def write_all(
     report = balance_report(statistics, picture.read_bytes(), command)
     report.save(folder / "report.html")
     return report
-
-

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
-from skysim.camera.detector import (PARTICLES, SMEAR, AddedCharge)
+from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
 from skysim.core.jit import jit
 from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
@@ -20,10 +22,8 @@ from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.scene.scene import Scene
 from skysim.simulation.timing import exposure_window
-from skysim.tracking.onboard_model import assumed_camera
 from skysim.tracking.factory import assumed_settings
-
-
+from skysim.tracking.onboard_model import assumed_camera
 
 SATURATED = "saturated"
 MASKS = (SATURATED, PARTICLES, SMEAR)
@@ -52,7 +52,14 @@ SOURCE = np.dtype(
 class Extents(NamedTuple):
     """The rectangle about each source's image, along its streak.
 
-    center_px : (N, 2);  along : (N, 2) unit vector of the streak;  half_px : (N, 2) half-length and half-width
+    Attributes
+    ----------
+    center_px
+        (N, 2)
+    along
+        (N, 2) unit vector of the streak
+    half_px
+        (N, 2) half-length and half-width
     """
 
     center_px: Floats
@@ -67,10 +74,17 @@ class Extents(NamedTuple):
 class LabelledFrame(NamedTuple):
     """A frame with its labels.
 
-    sources    : (N,) of dtype SOURCE, brightest first
-    extents    : the rectangle about each image
-    unmatched_px : (M, 2) detections that are no source of the frame: noise, particles, hot pixels
-    masks      : by name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is left out
+    Attributes
+    ----------
+    sources
+        (N,) of dtype SOURCE, brightest first
+    extents
+        The rectangle about each image
+    unmatched_px
+        (M, 2) detections that are no source of the frame: noise, particles, hot pixels
+    masks
+        By name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is
+        left out
     """
 
     frame: Frame
@@ -84,8 +98,12 @@ class LabelledFrame(NamedTuple):
 class Labeller(NamedTuple):
     """What the labels of all frames of one scene take.
 
-    camera, settings : what its tracker assumes
-    threshold_e      : least charge that something else than light adds to a pixel of a mask
+    Attributes
+    ----------
+    camera, settings
+        What its tracker assumes
+    threshold_e
+        Least charge that something else than light adds to a pixel of a mask
     """
 
     camera: Camera
@@ -103,7 +121,10 @@ def labeller(scene: Scene) -> Labeller:
 def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> LabelledFrame:
     """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
 
-    by : of the setup's scene, if there is one already
+    Parameters
+    ----------
+    by
+        Of the setup's scene, if there is one already
     """
     scene = setup.lab.scene
     by = by or labeller(scene)
@@ -216,7 +237,10 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
 def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
     """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code.
 
-    least : of an image, the least value of a pixel that is set
+    Parameters
+    ----------
+    least
+        Of an image, the least value of a pixel that is set
     """
     rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
     y, x = np.nonzero(mask[rows] >= least)
@@ -232,5 +256,3 @@ def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
     lengths = np.diff(ends, prepend=0)
     rest = mask.size - int(ends[-1])
     return [*lengths.tolist(), *([rest] if rest else [])]
-
-

@@ -7,37 +7,41 @@ command continues: frames that are made again have the same bytes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-from skysim.core.errors import OVERRIDES, InputError, unknown_name
-from skysim.core.yaml_reader import (check_version, parse_yaml, read_yaml)
-from skysim.core.random_streams import random_stream
-from skysim.experiments.study import study_file
-from skysim.experiments.study.execution.setups import (scene_hash, seed_of)
-from skysim.experiments.study.factors import (Factor, Settings, Value)
-from skysim.experiments.study.plan import TRIAL, Plan, TrialSpec, digest, resolve_point
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
+
 from skysim.core import __version__
-from skysim.core.errors import InputError
+from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.random_streams import random_stream
+from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
 from skysim.experiments import dataset_shards
-from skysim.experiments.dataset_labels import (LabelledFrame, label_frame, labeller)
-from skysim.experiments.dataset_shards import (TarWriter, shard_name)
-from skysim.experiments.dataset_shards import Storage
+from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
+from skysim.experiments.dataset_shards import Storage, TarWriter, shard_name
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
 from skysim.experiments.study.execution.runner import Progress
-from skysim.experiments.study.execution.setups import (TrialSetup, code_version, prepared_setup)
+from skysim.experiments.study.execution.setups import (
+    TrialSetup,
+    code_version,
+    prepared_setup,
+    scene_hash,
+    seed_of,
+)
 from skysim.experiments.study.execution.trials import Segment
-from skysim.experiments.study.plan import resolve_trial
-
-
-
-
+from skysim.experiments.study.factors import Factor, Settings, Value
+from skysim.experiments.study.plan import (
+    TRIAL,
+    Plan,
+    TrialSpec,
+    digest,
+    resolve_point,
+    resolve_trial,
+)
 
 # What a dataset is: a scene, the random values of each frame, and how frames are divided into
 # shards.
@@ -58,7 +62,10 @@ FORMATS = ("webdataset", "zarr", "coco")
 class DatasetPlan:
     """A dataset that can be made on any worker.
 
-    spec : scene, seed, settings and trial of all frames
+    Attributes
+    ----------
+    spec
+        Scene, seed, settings and trial of all frames
     """
 
     spec: TrialSpec
@@ -140,7 +147,12 @@ def load(
 ) -> DatasetPlan:
     """The plan of a dataset. Raises InputError with one line.
 
-    scene : name or path;  vary : file with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
+    Parameters
+    ----------
+    scene
+        Name or path
+    vary
+        File with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
     """
     for name, count in (("frames", frames), ("frames_per_shard", frames_per_shard)):
         if count < 1:
@@ -392,5 +404,3 @@ def run(
         folders_of(plan)
     )  # workers of a killed run may have been writing when this one began
     return progress
-
-

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import IO, Any
-from skysim.core.errors import InputError
-from skysim.core.files import (atomic_file, make_folder)
 import io
 import itertools
 import json
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.core.types import ra_dec_roll_rad
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file, make_folder
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.experiments.dataset_labels import (MASKS, Extents, LabelledFrame)
+from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-
-
-
-
 
 # The folder of a dataset: any URL that fsspec knows. A local file appears whole or not at all, as
 # an object does.
@@ -431,5 +429,3 @@ def write_zarr(storage: Storage, first: int, images: list[NDArray[Any]], shard: 
                 "one size, or webdataset",
             )
     array[first : first + len(images)] = np.stack(images)
-
-

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import io as std_io
 from collections.abc import Callable, Sequence
-from typing import Any
 from dataclasses import dataclass
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Floats, SourceTruth
 from skysim.sources.satellites import light_name
-
-
 
 DPI = 120
 # Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
@@ -88,8 +88,6 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
     return fig, stack
 
 
-
-
 # Draw markers and captions on frames: truth, detections and identified sources.
 
 
@@ -126,9 +124,13 @@ def to_8bit(
 ) -> NDArray[np.uint8]:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
-    levels_dn : black and white levels, for example of another frame; by default those of `display_levels`
-
     A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
+
+    Parameters
+    ----------
+    levels_dn
+        Black and white levels, for example of another frame; by default those of
+        `display_levels`
     """
     low, high = levels_dn or display_levels(image)
     top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
@@ -306,5 +308,3 @@ def pixel_positions(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
     if xy_px is None:
         return []
     return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]
-
-

@@ -1,28 +1,36 @@
-"""A report: its title, the command that repeats it, and its blocks; printed as a self-contained HTML page, as Markdown with its figures beside it, as text on a terminal."""
+"""A report: its title, the command that repeats it, and its blocks.
+
+It prints as a self-contained HTML page, as Markdown with its figures beside it, and as text on a terminal.
+"""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
-from skysim.results.report_blocks import (Block, Cell, Code, Facts, Figure, Items, Section, Table, Text, Verdict, figure_files)
 import base64
 import math
-from skysim.results.report_blocks import (Block, Cell)
+import re
 import textwrap
-from collections.abc import Callable, Sequence
-from typing import Any
-from skysim.core.errors import printable
-from skysim.results.report_blocks import (Block, Cell, Code, Facts, Items, Section, Table, Text, Verdict)
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
+
 from skysim.core import __version__
-from skysim.core.errors import InputError, unknown_name
-from skysim.results.report_blocks import (Block, Cell, Column, Section, Verdict, figure_files, filled)
-
-
-
-
+from skysim.core.errors import InputError, printable, unknown_name
+from skysim.results.report_blocks import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    figure_files,
+    filled,
+)
 
 # A report as a Markdown page. Its figures are files beside it.
 
@@ -94,8 +102,6 @@ def inline(text: str) -> str:
     return TAG.sub("&lt;", " ".join(text.split()))
 
 
-
-
 # A report as one self-contained HTML page: images embedded, texts escaped, nothing loaded from
 # elsewhere.
 
@@ -104,7 +110,7 @@ def html_page(title: str, command: str, version: str, blocks: Sequence[Block]) -
     """The page of a report (`page.html`)."""
     from jinja2 import Environment, PackageLoader
 
-    loader = PackageLoader("skysim.results", "report")
+    loader = PackageLoader("skysim", "results")
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
     environment.tests["cell"] = lambda one: isinstance(one, Cell)
@@ -130,8 +136,6 @@ def embed(image: bytes, kind: str = "png") -> str:
 def sort_key(cell: Cell) -> str:
     """What a column is sorted by, for the page's script: a number, or nothing for NaN."""
     return "" if cell.key is None or math.isnan(cell.key) else str(cell.key)
-
-
 
 
 # Blocks of a report on the terminal: tables that fit into it, wrapped sentences, no figures.
@@ -244,7 +248,10 @@ def styled(cell: Cell, style: str) -> Any:
 def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
     """Print a text in lines of a width, by default the terminal's.
 
-    first, others : what the first line and the others begin with
+    Parameters
+    ----------
+    first, others
+        What the first line and the others begin with
     """
     width = width or max(terminal_width(), NARROW)
     print(
@@ -300,8 +307,13 @@ LOOKS = (
 class Report:
     """What a run, a study or a measurement says to people.
 
-    blocks  : the answer and what must be known with it, then sections; those that hold nothing are left out
-    command : the command that repeats it
+    Attributes
+    ----------
+    blocks
+        The answer and what must be known with it, then sections; those that hold nothing are
+        left out
+    command
+        The command that repeats it
     """
 
     title: str
@@ -342,9 +354,16 @@ class Report:
     def save(self, path: str | Path, pictures: str = "") -> Path:
         """Write a page in the format of the suffix: .html, .md or .json. Returns the path.
 
-        pictures : what the paths of a Markdown page's figures begin with; by default a folder of the page's name
+        Parameters
+        ----------
+        pictures
+            What the paths of a Markdown page's figures begin with; by default a folder of the
+            page's name
 
-        Raises InputError for another suffix.
+        Raises
+        ------
+        InputError
+            For another suffix.
         """
         from skysim.core import files
 
@@ -380,5 +399,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, Column):
         return {"title": value.title, "unit": value.unit}
     return [plain(one) for one in value] if isinstance(value, list | tuple) else value
-
-

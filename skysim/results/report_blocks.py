@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
-
-
 Tone = Literal["", "good", "warning", "bad", "marked"]
 Kind = Literal["number", "text", "aside"]
 MISSING = "–"
@@ -20,8 +18,12 @@ MISSING = "–"
 class Cell(NamedTuple):
     """A text of a table or of facts.
 
-    key  : number by which a column is sorted; NaN comes last, None sorts by the text
-    link : id of a section ("#results") or a file beside the report
+    Attributes
+    ----------
+    key
+        Number by which a column is sorted; NaN comes last, None sorts by the text
+    link
+        Id of a section ("#results") or a file beside the report
     """
 
     text: str
@@ -33,8 +35,13 @@ class Cell(NamedTuple):
 class Column(NamedTuple):
     """Head of a table's column.
 
-    format : of its numbers, such as ".3f"
-    kind   : numbers are aligned to the right; an aside is a longer text, on a terminal a line below the table
+    Attributes
+    ----------
+    format
+        Of its numbers, such as ".3f"
+    kind
+        Numbers are aligned to the right; an aside is a longer text, on a terminal a line below
+        the table
     """
 
     title: str
@@ -102,7 +109,10 @@ class Facts(Block):
 class Table(Block):
     """Rows of values under columns: cells, texts, numbers, or None for what is missing.
 
-    optional : groups of columns that are left out on a narrow terminal, the first group first
+    Attributes
+    ----------
+    optional
+        Groups of columns that are left out on a narrow terminal, the first group first
     """
 
     columns: Sequence[Column]
@@ -139,7 +149,12 @@ class Code(Block):
 class Section(Block):
     """A heading with its blocks, which may be sections again.
 
-    id : of the heading, for links;  folded : closed until a reader opens it
+    Attributes
+    ----------
+    id
+        Of the heading, for links
+    folded
+        Closed until a reader opens it
     """
 
     title: str
@@ -175,5 +190,3 @@ def figures(blocks: Sequence[Block]) -> Iterator[Figure]:
             yield one
         elif isinstance(one, Section):
             yield from figures(one.blocks)
-
-

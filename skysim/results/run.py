@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import html
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
+
 import numpy as np
-from skysim.core.files import (make_folder, write_image, write_table)
+
+from skysim.core.files import make_folder, write_image, write_table
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
 from skysim.results import run_report, scoring, telemetry_report
+from skysim.results.files.recording import remove_results, write_frame
 from skysim.results.plots import annotate_truth
-from skysim.results.files.recording import (remove_results, write_frame)
 from skysim.results.report import Report
-from skysim.results.scoring import Score
-from skysim.simulation.checks import Check
-from skysim.simulation.lab import StarCamera
-import html
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, overload
-from skysim.core.types import FrameRow, Telemetry
-from skysim.results import scoring
 from skysim.results.scoring import Score, image_tag
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
 from skysim.simulation.flight import Flight, Shot
-from skysim.simulation.lab import (Lab, StarCamera)
+from skysim.simulation.lab import Lab, StarCamera
 
 if TYPE_CHECKING:
     import pandas as pd
     from astropy.table import Table
-
-
 
 
 # Write a run to a folder, frame by frame, so that a long run need not be kept in memory.
@@ -45,7 +38,12 @@ SHORT_S = 1.0  # the report of a single frame after a shorter motion has no plot
 class Recorder:
     """The files of one camera. Files of an earlier run in the folder are removed first.
 
-    seconds : of all frames, by stage;  shown : the last solved frame, or the first if none was solved
+    Attributes
+    ----------
+    seconds
+        Of all frames, by stage
+    shown
+        The last solved frame, or the first if none was solved
     """
 
     folder: Path
@@ -71,7 +69,10 @@ class Recorder:
     def write(self, frame: Frame, truth: Truth, preview: bool = False) -> Path:
         """Write one frame with its truth; return the path of its FITS file.
 
-        preview : also write frame_NNNN.preview.png, an 8-bit image with the truth marked
+        Parameters
+        ----------
+        preview
+            Also write frame_NNNN.preview.png, an 8-bit image with the truth marked
         """
         write_frame(self.folder, frame, truth, self.camera.scene)
         path = self.folder / f"frame_{frame.index:04d}.fits"
@@ -91,7 +92,10 @@ class Recorder:
     ) -> tuple[dict[str, Any], Report]:
         """Write tables, annotated image and report. Returns the report, and before it what `skysim run --json` prints.
 
-        pictures : image files of the laboratory
+        Parameters
+        ----------
+        pictures
+            Image files of the laboratory
         """
         scene = self.camera.scene
         names = scoring.angle_names(scene)
@@ -142,11 +146,19 @@ class Recorder:
 class Run(Sequence[Score]):
     """The result of one camera in a flight: a sequence of scored shots.
 
-    camera      : the lab's camera that took them
-    scores      : one entry per frame, in order; empty if the frames were written and not kept
-    telemetry   : motion of the vehicle, and measurements and commands of its computer, sampled at the control rate
-    imu_samples : every sample of the IMU; None without one
-    heads       : the runs of the scene's further star cameras, by name
+    Attributes
+    ----------
+    camera
+        The lab's camera that took them
+    scores
+        One entry per frame, in order; empty if the frames were written and not kept
+    telemetry
+        Motion of the vehicle, and measurements and commands of its computer, sampled at the
+        control rate
+    imu_samples
+        Every sample of the IMU; None without one
+    heads
+        The runs of the scene's further star cameras, by name
     """
 
     lab: Lab
@@ -254,7 +266,10 @@ class FlightRecorder:
     ) -> list[tuple[dict[str, Any], Report]]:
         """Write tables, images and reports; return statistics and report of each camera.
 
-        draw : makes pictures of the laboratory for the main camera's report
+        Parameters
+        ----------
+        draw
+            Makes pictures of the laboratory for the main camera's report
         """
         main = run_of(self.flight, [() for _ in self.recorders])
         pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
@@ -269,5 +284,3 @@ class FlightRecorder:
                 recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown)
             )
         return finished
-
-

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_DEG, ARCSEC_RAD, RPM_RAD_S
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics.imu import Increments, tilt_rad
-from skysim.results.plots import (figure_png, stacked_axes)
+from skysim.results.plots import figure_png, stacked_axes
 
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")

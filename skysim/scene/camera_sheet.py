@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from skysim.core.errors import InputError
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
-from collections.abc import Iterator, Mapping
+
 import yaml
+
 from skysim.core.errors import InputError, printable
-
-
 
 # Parsers of the answers, from a typed text to a value of the file. Each raises InputError with what
 # is allowed.
@@ -108,8 +105,6 @@ def rounded(value: float, digits: int = 4) -> float:
     return plain(float(f"{value:.{digits}g}"))
 
 
-
-
 # The numbers of a data sheet: how they are asked, where they are stated, and what is assumed if
 # they are not.
 
@@ -130,12 +125,21 @@ class AssumedValue(NamedTuple):
 class Question(NamedTuple):
     """One number of a data sheet.
 
-    keys        : of the section `camera` that the answer gives
-    where       : where a data sheet states it
-    parse       : from the typed text to the value of the file, several for several keys; raises InputError
-    assume      : from the values known so far to the assumption; None if the key is then left out
-    consequence : of not knowing it; empty if it must be given
-    skipped     : why it is not asked, by the values known so far; empty if it is
+    Attributes
+    ----------
+    keys
+        Of the section `camera` that the answer gives
+    where
+        Where a data sheet states it
+    parse
+        From the typed text to the value of the file, several for several keys; raises
+        InputError
+    assume
+        From the values known so far to the assumption; None if the key is then left out
+    consequence
+        Of not knowing it; empty if it must be given
+    skipped
+        Why it is not asked, by the values known so far; empty if it is
     """
 
     keys: tuple[str, ...]
@@ -440,7 +444,7 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
     """Validate the camera. Raises InputError of the first wrong answer."""
     from pydantic import ValidationError
 
-    from skysim.core.yaml_reader import (fault_of, yaml_keys)
+    from skysim.core.yaml_reader import fault_of, yaml_keys
     from skysim.scene.sections.camera import CameraConfig
 
     tree = tree_of(sheet.lines)
@@ -511,5 +515,3 @@ def yaml_lines(camera: list[SheetLine]) -> list[str]:
         written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
         lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")
     return lines
-
-

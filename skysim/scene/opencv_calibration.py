@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
 import yaml
+
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import (StrictLoader, excerpt, parse_yaml)
-
-
+from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 # Allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square.
@@ -24,9 +24,14 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 class OpencvCalibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
-    focal_px   : focal length (strictly, the image distance) over the pixel pitch
-    center_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
-    distortion : k1, k2, p1, p2, k3 in OpenCV's order
+    Attributes
+    ----------
+    focal_px
+        Focal length (strictly, the image distance) over the pixel pitch
+    center_px
+        Principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
+    distortion
+        k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int
@@ -204,5 +209,3 @@ def number_text(value: float) -> str:
     """The number with a decimal point, without which YAML reads 1e-07 as a string."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"
-
-

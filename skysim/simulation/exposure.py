@@ -17,17 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import thermal_motion
-from skysim.camera.detector import AddedCharge
-from skysim.camera.detector import (add_snr_and_saturation, expose, saturation_dn, smear)
-from skysim.camera.discs import (concatenated, render_bodies)
-from skysim.camera.glow import background
+from skysim.camera.detector import AddedCharge, add_snr_and_saturation, expose, saturation_dn, smear
+from skysim.camera.discs import concatenated, render_bodies
+from skysim.camera.glow import background, stray
 from skysim.camera.render import Window, in_view, project, render
-from skysim.camera.glow import stray
-from skysim.camera.glow import stray
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
-from skysim.simulation.lights.light import (Beam, Exposure, Lit, Seeds, any_of, beam_of)
+from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
 from skysim.simulation.timing import (
     MARGIN_S,
     exposure_window,
@@ -50,7 +47,11 @@ def render_frame(
     """Render one frame and its truth, both for mid-exposure of the middle row.
 
     They depend only on the camera, its motion, the index and the window (the scene's if left out), not on other frames.
-    added : gets the masks of smear and particles
+
+    Parameters
+    ----------
+    added
+        Gets the masks of smear and particles
     """
     clock = clock or Clock()
     scene = camera.scene
@@ -89,7 +90,10 @@ def exposure_of(
 ) -> Exposure:
     """An exposure of a camera, whose mount and lens are as error and temperature have them at mid-exposure.
 
-    seeds : None for the expectation, see `Exposure`
+    Parameters
+    ----------
+    seeds
+        None for the expectation, see `Exposure`
     """
     mount = camera.mount
     optics = camera.optics
@@ -118,7 +122,10 @@ def expected_exposure(
 ) -> Exposure:
     """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
 
-    t_s : middle of the first row's exposure; NaN for that of the first frame
+    Parameters
+    ----------
+    t_s
+        Middle of the first row's exposure; NaN for that of the first frame
     """
     config = camera.scene.exposure
     middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s

@@ -3,51 +3,48 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError
-from skysim.core.yaml_reader import is_file
-from skysim.dynamics.controllers import ControllerSource
-from skysim.dynamics.controllers import Factory
-from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
-from skysim.tracking import factory
-from skysim.tracking.external_tracker import FunctionTracker
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
+from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
+from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
+from skysim.dynamics.controllers import ControllerSource, Factory
 from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
+from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.scene.sections.motion import PointingConfig
+from skysim.scene.sections.motion import (
+    PRESCRIBED,
+    ControlConfig,
+    MotionConfig,
+    PointingConfig,
+    ProfileConfig,
+)
 from skysim.simulation import timing
-from skysim.simulation.lights.light import (KnownLight, Light, Seeds)
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import KnownLight, Light, LightPlan, Seeds
 from skysim.simulation.lights.registry import build_lights
-from skysim.sources import (stars)
-from skysim.sources import catalog
+from skysim.sources import catalog, stars
+from skysim.sources.camera_orbit import CameraOrbit, Viewpoint, build_orbit
 from skysim.sources.dome.layouts.led_list import led_list
-from skysim.sources.camera_orbit import (CameraOrbit, build_orbit)
-from skysim.sources.camera_orbit import Viewpoint
 from skysim.sources.photometry import Band
+from skysim.tracking import factory
+from skysim.tracking.external_tracker import FunctionTracker
 from skysim.tracking.tracker_interface import TRACKERS
-
-
-
-
 
 # A scene with parts that are given in Python: a controller, a star tracker, or an attitude profile.
 
@@ -59,10 +56,17 @@ GIVEN_TABLE = "(table)"  # in place of a profile's file
 class UserParts:
     """What a user gives in place of the scene's own parts.
 
-    programs   : commands of external trackers and controllers by name; only the user's command line sets them
-    controller : makes the control law
-    tracker    : of the main camera
-    profile    : table of attitudes, in place of the file of the first maneuver of kind profile
+    Attributes
+    ----------
+    programs
+        Commands of external trackers and controllers by name; only the user's command line sets
+        them
+    controller
+        Makes the control law
+    tracker
+        Of the main camera
+    profile
+        Table of attitudes, in place of the file of the first maneuver of kind profile
     """
 
     programs: Mapping[str, str] = field(default_factory=dict)
@@ -88,7 +92,10 @@ def with_parts(
 ) -> tuple[Scene, UserParts]:
     """The scene that names these parts in place of its own, and the parts; see `results.simulate.simulate`.
 
-    Raises InputError for a part of another type.
+    Raises
+    ------
+    InputError
+        For a part of another type.
     """
     motion = scene.motion
     law = None
@@ -163,14 +170,23 @@ MAIN = "main"  # name of the camera of the scene's section `camera`
 class StarCamera:
     """A camera of the lab: its hardware and the light that reaches it, without time, motion or results.
 
-    name    : "main" for the camera of the scene's section `camera`, else that of the head
-    scene   : as this camera sees it, see `Scene.of_head`
-    canvas  : (H, W) array in which every frame's light is drawn; float64 where noise is off, since such a frame
-              is the expectation itself, and float32 otherwise
-    lights  : in this camera's band, from the farthest to the lens, see `simulation.lights`
-    orbit   : about the Earth; None for a camera on the ground
-    run_seed    : of what all cameras share in a run; what is drawn for this camera has its scene's seed
-    mount_error : rotation of the real camera from the assumed mount; None for none
+    Attributes
+    ----------
+    name
+        "main" for the camera of the scene's section `camera`, else that of the head
+    scene
+        As this camera sees it, see `Scene.of_head`
+    canvas
+        (H, W) array in which every frame's light is drawn; float64 where noise is off, since
+        such a frame is the expectation itself, and float32 otherwise
+    lights
+        In this camera's band, from the farthest to the lens, see `simulation.lights`
+    orbit
+        About the Earth; None for a camera on the ground
+    run_seed
+        Of what all cameras share in a run; what is drawn for this camera has its scene's seed
+    mount_error
+        Rotation of the real camera from the assumed mount; None for none
     """
 
     name: str
@@ -210,9 +226,14 @@ class StarCamera:
 class Lab:
     """What is in the laboratory: the vehicle and its cameras. It has no time and no results; a `Flight` moves it.
 
-    cameras  : the main one first, then the scene's heads in their order
-    start    : lab_from_body at t = 0
-    profiles : attitude profiles of the maneuvers of that kind, in their order
+    Attributes
+    ----------
+    cameras
+        The main one first, then the scene's heads in their order
+    start
+        lab_from_body at t = 0
+    profiles
+        Attitude profiles of the maneuvers of that kind, in their order
     """
 
     scene: Scene
@@ -278,10 +299,17 @@ class Lab:
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     """Build the vehicle and the cameras of a scene.
 
-    parts : what the user gives in place of the scene's own. A table of attitudes replaces the file of the first
-        maneuver of kind profile; of the others only the names are checked
-    Raises InputError for wrong names of algorithms, trackers, controllers or catalogs and for an unreadable PSF or
-    profile, before any long work.
+    Parameters
+    ----------
+    parts
+        What the user gives in place of the scene's own. A table of attitudes replaces the file
+        of the first maneuver of kind profile; of the others only the names are checked
+
+    Raises
+    ------
+    InputError
+        For wrong names of algorithms, trackers, controllers or catalogs and for an unreadable
+        PSF or profile, before any long work.
     """
     check_hardware(scene, parts.programs, parts.tracker is None)
     if scene.motion.control:
@@ -397,8 +425,9 @@ def build_tracker(
 ) -> factory.Estimator:
     """The star tracker of a camera, with the hardware parameters that it assumes (see tracking/factory.py).
 
-    programs : commands of external trackers by name
+    Parameters
+    ----------
+    programs
+        Commands of external trackers by name
     """
     return factory.build_tracker(camera.scene, camera.mount, camera.sources, programs)
-
-

@@ -3,38 +3,31 @@
 from __future__ import annotations
 
 import math
-import numpy as np
-from skysim.core.errors import InputError
-from skysim.core.types import Floats
-from skysim.dynamics import guidance, multibody
-from skysim.dynamics.flight_computer import controlling_actuator, usage
-from skysim.dynamics.multibody.actuators import build_actuators
-from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import ControlConfig
-from skysim.scene.sections.vehicle import VehicleConfig
 from collections.abc import Sequence
+
+import numpy as np
 from scipy.spatial.transform import Rotation
+
 from skysim.camera import thermal_motion
-from skysim.core.types import Floats, Mounting, Telemetry
-from skysim.dynamics.flight_computer import FlightComputer
-from skysim.dynamics.guidance import Reference
-from skysim.dynamics.multibody import Simulation
-from skysim.dynamics.multibody.cmgs import CmgActuator
-from skysim.simulation.lab import StarCamera
-from skysim.tracking.navigation import Navigation
+from skysim.core.errors import InputError
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Floats, Mounting, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
+from skysim.dynamics.flight_computer import FlightComputer, controlling_actuator, usage
+from skysim.dynamics.guidance import Reference
 from skysim.dynamics.jitter import Vibration
+from skysim.dynamics.multibody import Simulation
 from skysim.dynamics.multibody.actuator_kind import ControlInput
+from skysim.dynamics.multibody.actuators import build_actuators
+from skysim.dynamics.multibody.cmgs import CmgActuator
+from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import ControlConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import timing
-from skysim.simulation.lab import Lab
-
-
-
-
+from skysim.simulation.lab import Lab, StarCamera
+from skysim.tracking.navigation import Navigation
 
 # Refuse a maneuver that asks for more than the vehicle can do: tilt, and for profiles and chirps
 # rate and torque.
@@ -279,7 +272,9 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     """
     error = camera.mount_error or Rotation.identity()
     config = camera.scene.thermal
-    turned = [(thermal_motion.turned(config, t) if config else Rotation.identity()) * error for t in t_s]
+    turned = [
+        (thermal_motion.turned(config, t) if config else Rotation.identity()) * error for t in t_s
+    ]
     return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
 
 
@@ -290,9 +285,17 @@ def rotation(wxyz: Floats) -> Rotation:
 class Motion:
     """The motion of a lab's vehicle. Stateful: use one instance for one motion.
 
-    duration_s : at most; may be infinite with `kept_s`
-    kept_s     : how long past states and IMU samples are kept; None: all of them
-    Raises InputError for a maneuver that the vehicle cannot follow, and for too fast vibration.
+    Attributes
+    ----------
+    duration_s
+        At most; may be infinite with `kept_s`
+    kept_s
+        How long past states and IMU samples are kept; None: all of them
+
+    Raises
+    ------
+    InputError
+        For a maneuver that the vehicle cannot follow, and for too fast vibration.
     """
 
     def __init__(
@@ -350,7 +353,10 @@ class Motion:
         The order is: attitude and rate as the controller gets them, controls, disturbance torques, integration, IMU.
         The controls are held over the period.
 
-        torque_nm : (3,) in body axes, in place of the controller's
+        Parameters
+        ----------
+        torque_nm
+            (3,) in body axes, in place of the controller's
         """
         simulation = self.simulation
         flight_computer = self.flight_computer
@@ -434,5 +440,3 @@ def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:
     return Navigation(
         lab.scene, mounts, lab.start, position_m, lab.vehicle.gravity_m_s2, stream, kept_s
     )
-
-

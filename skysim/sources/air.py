@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-import numpy as np
-from scipy import special
-from scipy.interpolate import RectBivariateSpline
-from skysim.core.types import Floats
 import datetime
 from dataclasses import dataclass, replace
+from functools import lru_cache
+
 import erfa
+import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import RectBivariateSpline
+
 from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.surroundings import (AirConfig, HorizonConfig)
+from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.refraction import (Refraction, Weather, standard_pressure_hpa, standard_temperature_c)
+from skysim.sources.bodies import ALBEDO, BodyLight
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
-from skysim.sources.bodies import BodyLight
-from skysim.sources.bodies import ALBEDO
-
-
-
-
+from skysim.sources.refraction import (
+    Refraction,
+    Weather,
+    standard_pressure_hpa,
+    standard_temperature_c,
+)
 
 # How much stars twinkle, for any aperture and exposure, in weak turbulence.
 
@@ -146,10 +147,16 @@ def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
 class Air:
     """The air of a scene.
 
-    site       : with a longitude
-    refraction : for its weather and the camera's band
-    star_id, b_v : (N,) ascending numbers of the catalog's stars, and their colors
-    wavelength_m : of scintillation: the mean of a G2 star's photo-electrons
+    Attributes
+    ----------
+    site
+        With a longitude
+    refraction
+        For its weather and the camera's band
+    star_id, b_v
+        (N,) ascending numbers of the catalog's stars, and their colors
+    wavelength_m
+        Of scintillation: the mean of a G2 star's photo-electrons
     """
 
     config: AirConfig
@@ -231,9 +238,7 @@ class Sky:
         place = body.place._replace(direction=direction, toward_sun=along / np.linalg.norm(along))
         blue, visual = ALBEDO[body.name][:2]
         b_v = SUN[0] - 2.5 * np.log10(blue / visual)
-        passed = transmission(
-            self.air_mass(direction[None]), self.air.extinction_mag(b_v)
-        )
+        passed = transmission(self.air_mass(direction[None]), self.air.extinction_mag(b_v))
         return replace(body, place=place, flux_e_s_m2=body.flux_e_s_m2 * float(passed[0]))
 
     def seeing_px(self, boresight: Floats, focal_px: float) -> float:
@@ -297,5 +302,3 @@ def mean_wavelength_m(band: Band) -> float:
         band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
         / total
     )
-
-

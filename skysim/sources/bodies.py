@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-import numpy as np
-from skysim.core.types import Floats
-from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
+
+import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
-from skysim.sources.photometry import Band
-from skysim.sources.body_discs import (LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, DiscSurface)
-from skysim.sources.body_discs import (earthshine_fraction, magnitude)
-from skysim.sources.ephemeris import ObserverPlace
-from skysim.sources.ephemeris import (Place, place)
-
-
-
-
+from skysim.sources.body_discs import (
+    LAMBERT,
+    LIMB_DARKENED,
+    LOMMEL_SEELIGER,
+    DiscSurface,
+    earthshine_fraction,
+    magnitude,
+)
+from skysim.sources.ephemeris import ObserverPlace, Place, place
+from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
 
 # Photo-electrons of reflected sunlight, by the albedo of a body at four wavelengths.
 
@@ -116,8 +117,16 @@ NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
 
-    radius_rad : of its disc;  flux_e_s_m2 : photo-electrons at the aperture;  earthshine : see `Surface`
-    chromatic  : (4,) a row of `Sources.chromatic`
+    Attributes
+    ----------
+    radius_rad
+        Of its disc
+    flux_e_s_m2
+        photo-electrons at the aperture
+    earthshine
+        See `Surface`
+    chromatic
+        (4,) a row of `Sources.chromatic`
     """
 
     name: str
@@ -192,5 +201,3 @@ def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))
     colors = reflected_chromatic(ALBEDO[name], band)
     return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine, colors)
-
-

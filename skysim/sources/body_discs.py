@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from functools import lru_cache
 from math import cos, sin, sqrt
 from typing import Any, NamedTuple
+
 import numpy as np
-from skysim.core.jit import jit
-from skysim.core.types import Floats
-import math
-from collections.abc import Callable
+
 from skysim.core.constants import AU_KM, JULIAN_YEAR_DAY, SUN_V_MAG
+from skysim.core.jit import jit
 from skysim.core.time import J2000_JD
+from skysim.core.types import Floats
 from skysim.sources.ephemeris import Place
-
-
 
 # laws of `brightness`
 LIMB_DARKENED = 0
@@ -32,10 +32,16 @@ PHASE_STEP_DEG = (
 def brightness(law: int, mu: float, mu0: float) -> float:
     """Relative brightness of a surface.
 
-    LIMB_DARKENED   : the Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical Quantities)
-    LOMMEL_SEELIGER : a dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981, JGR 86,
-                      3039). The full disc is uniform, as the full Moon's is; the maria are left out.
-    LAMBERT         : a bright cloud deck, in which light is scattered many times: mu0
+    Returns
+    -------
+    LIMB_DARKENED
+        The Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical
+        Quantities)
+    LOMMEL_SEELIGER
+        A dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981,
+        JGR 86, 3039). The full disc is uniform, as the full Moon's is; the maria are left out.
+    LAMBERT
+        A bright cloud deck, in which light is scattered many times: mu0
     """
     if law == LIMB_DARKENED:
         return 0.30 + 0.93 * mu - 0.23 * mu**2
@@ -47,8 +53,12 @@ def brightness(law: int, mu: float, mu0: float) -> float:
 class DiscSurface(NamedTuple):
     """How a disc shines.
 
-    law        : of `brightness`
-    earthshine : light of the disc as lit from the observer's side, over that of the sunlit one
+    Attributes
+    ----------
+    law
+        Of `brightness`
+    earthshine
+        Light of the disc as lit from the observer's side, over that of the sunlit one
     """
 
     law: int
@@ -59,8 +69,12 @@ class DiscSurface(NamedTuple):
 def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     """Shares of the disc's light at the points of a square lattice that covers it; they add up to 1.
 
-    axis : (n,) the lattice's even coordinates in both directions, in units of the disc's radius
     Returns (n, n), [y, x].
+
+    Parameters
+    ----------
+    axis
+        (n,) the lattice's even coordinates in both directions, in units of the disc's radius
     """
     sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
     _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
@@ -152,9 +166,9 @@ def _elements(law: int, phase_steps: int, earthshine: float) -> DiscElements:
     weighted = (light, light * axis, light * axis[:, None])
     share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)
     lit = share > 0
-    return DiscElements(np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None], share[lit])
-
-
+    return DiscElements(
+        np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None], share[lit]
+    )
 
 
 # V magnitudes of the Sun, the Moon and the planets by distance and phase.
@@ -283,5 +297,3 @@ def latitudes_rad(name: str, place: Place) -> Floats:
         for vector in (place.from_sun_km, place.to_body_km)
     ]
     return np.arcsin(sines)
-
-

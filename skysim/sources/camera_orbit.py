@@ -6,23 +6,32 @@ import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
-import numpy as np
-from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
-from skysim.core.errors import InputError
-from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import (CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig)
-from skysim.sources.orbit_elements import (MeanElements, gcrs_states, read_elements)
-from skysim.sources.orbit_elements import (OrbitEphemeris, read_oem)
-from skysim.sources.ephemeris import GcrsState
-from skysim.core.time import tt_jd
-from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.ephemeris import (GcrsState, ObserverPlace, observe_at, site_in_gcrs)
-import erfa
-from numpy.typing import NDArray
-from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
-from skysim.sources.bodies import BODIES
-from skysim.sources.ephemeris import load_ephemeris
 
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.constants import DAY_S, EARTH_FLATTENING, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.errors import InputError
+from skysim.core.time import tt_jd
+from skysim.core.types import Floats
+from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.bodies import BODIES
+from skysim.sources.ephemeris import (
+    GcrsState,
+    ObserverPlace,
+    load_ephemeris,
+    observe_at,
+    site_in_gcrs,
+)
+from skysim.sources.orbit_elements import (
+    MeanElements,
+    OrbitEphemeris,
+    gcrs_states,
+    read_elements,
+    read_oem,
+)
 
 
 class CameraOrbit(Protocol):
@@ -147,8 +156,6 @@ def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
     return ORBITS[config.kind](config, start) if config else None
 
 
-
-
 # Where a scene's camera is, on the turning Earth or in its orbit, at any time.
 
 
@@ -156,9 +163,14 @@ def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
 class Viewpoint:
     """The camera's place from the scene's start on.
 
-    start : UTC at t = 0
-    site  : on the ground; a site without a longitude is the Earth's center
-    orbit : None on the ground
+    Attributes
+    ----------
+    start
+        UTC at t = 0
+    site
+        On the ground; a site without a longitude is the Earth's center
+    orbit
+        None on the ground
     """
 
     start: datetime.datetime
@@ -179,8 +191,6 @@ class Viewpoint:
     def observer_at(self, t_s: float) -> ObserverPlace:
         """The state among the bodies of the solar system at a time since the start."""
         return observe_at(self.time_at(t_s), self.state_at(t_s))
-
-
 
 
 # The Earth as an ellipsoid: what it hides, and how much of the Sun it leaves to a satellite.
@@ -245,5 +255,3 @@ def to_astronomical(direction: Floats) -> tuple[float, float]:
     """Right ascension and declination of a vector, degrees."""
     ra, dec = erfa.c2s(direction)
     return float(np.degrees(ra)) % 360, float(np.degrees(dec))
-
-

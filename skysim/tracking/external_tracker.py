@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.core.errors import InputError
-from skysim.core.plugins import ProgramError, host_command
+from skysim.core.plugins import ProgramError, describe_error, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.sections.light import StarsConfig
 from skysim.tracking import tracker_interface
-from skysim.tracking.tracker_interface import (FAILED, OWN, TRACKERS, Answer, Leds, Picture, Setup, Stars)
-import time
-from collections.abc import Callable
-from typing import Any
-from numpy.typing import NDArray
-from estimator.trackers.pipeline import Report
-from skysim.core.plugins import describe_error
-from skysim.core.types import Frame
-from skysim.tracking.tracker_interface import (FAILED, OWN, SOLVED, Answer, check_answer)
-
+from skysim.tracking.tracker_interface import (
+    FAILED,
+    OWN,
+    SOLVED,
+    TRACKERS,
+    Answer,
+    Leds,
+    Picture,
+    Setup,
+    Stars,
+    check_answer,
+)
 
 
 class ExternalTracker:
@@ -51,11 +58,15 @@ class ExternalTracker:
         if name in commands:
             arguments, image_format = tracker_interface.split_command(name, commands[name])
             return cls(
-                tracker_interface.TrackerProgram(name, arguments, image_format, setup, config.time_limit_s)
+                tracker_interface.TrackerProgram(
+                    name, arguments, image_format, setup, config.time_limit_s
+                )
             )
         host, environment = host_command("skysim.tracking.tracker_host", name)
         return cls(
-            tracker_interface.TrackerProgram(name, host, None, setup, config.time_limit_s, environment)
+            tracker_interface.TrackerProgram(
+                name, host, None, setup, config.time_limit_s, environment
+            )
         )
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
@@ -116,8 +127,6 @@ def to_report(answer: Answer) -> Report:
     return Report(attitude, Centroids(xy_px, unmeasured, unmeasured), seconds)
 
 
-
-
 # A Python function as a star tracker: in this process, from a frame's image to an attitude.
 
 
@@ -127,8 +136,11 @@ NO_ATTITUDE = "no attitude"  # status where the function returned None
 class FunctionTracker:
     """A tracker that is a function. Every failure there becomes the status of a frame.
 
-    function : takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or as a unit
-        quaternion (4,) scalar last, or None for no attitude
+    Attributes
+    ----------
+    function
+        Takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or
+        as a unit quaternion (4,) scalar last, or None for no attitude
     """
 
     def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
@@ -160,5 +172,3 @@ def to_answer(value: Any) -> Any:
     if isinstance(value, np.ndarray | list | tuple):
         return Answer(SOLVED, value)
     return value
-
-

@@ -9,40 +9,45 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
+
 from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.attitude.solvers import SOLVERS
+from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core.checks import ImageError
+from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS
+from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import IDENTIFIERS as NEAR_IDENTIFIERS
-from estimator.trackers.pipeline import Settings
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
+from estimator.trackers.pipeline import Report, Settings
+from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
-from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
-from estimator.catalog import catalog
-from estimator.core.checks import ImageError
-from estimator.core.types import Attitude, Centroids, RateEstimate
-from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
-from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.pipeline import Report
-from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError
 from skysim.core.types import Frame, Mount, Sources
-from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.dome import display
 from skysim.tracking import external_tracker
-from skysim.tracking.external_tracker import ExternalTracker
-from skysim.tracking.external_tracker import FunctionTracker
+from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
+from skysim.tracking.onboard_model import (
+    OrbitStarTracker,
+    assumed_air,
+    assumed_camera,
+    assumed_code,
+    assumed_dome,
+    assumed_lever,
+    assumed_observer,
+    assumed_orbit,
+    onboard_catalog,
+    surveyed_dome,
+    with_brightness,
+)
 from skysim.tracking.tracker_interface import OWN
-from skysim.tracking.onboard_model import (assumed_air, assumed_camera, assumed_code, assumed_dome, assumed_lever, onboard_catalog, surveyed_dome, with_brightness)
-from skysim.tracking.onboard_model import (OrbitStarTracker, assumed_observer, assumed_orbit)
-import numpy as np
-from estimator.core.types import FramePriors
-from estimator.trackers.exposure_control import (Control, NextExposure, Observation, observe, step)
-from skysim.core.types import Frame
-
-
 
 # Settings of the tracker from a scene; the names of algorithms are checked here.
 
@@ -123,8 +128,15 @@ def build_tracker(
     """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
     else the true ones.
 
-    programs : commands of external trackers by name, for `tracker.name`
-    Raises InputError for a dome or a catalog that the tracker cannot use.
+    Parameters
+    ----------
+    programs
+        Commands of external trackers by name, for `tracker.name`
+
+    Raises
+    ------
+    InputError
+        For a dome or a catalog that the tracker cannot use.
     """
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
@@ -171,8 +183,12 @@ def solve_frame(
 ) -> Report:
     """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
-    streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
-    rate      : of the camera, if a gyro measures it; external trackers get streak_px only
+    Parameters
+    ----------
+    streak_px
+        (dx, dy) that lights move in the exposure, if a gyro measures it
+    rate
+        Of the camera, if a gyro measures it; external trackers get streak_px only
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
@@ -195,15 +211,16 @@ def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: floa
     return estimator.solve_centroids(centroids)
 
 
-
-
 # Automatic exposure: set the next exposure time from the last frame.
 
 
 class ExposureController:
     """The camera's exposure controller: sets the next exposure time from the last frame.
 
-    exposure_s : of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    Attributes
+    ----------
+    exposure_s
+        Of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -244,5 +261,3 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
         return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(frame.image_dn, box_px, settings.saturation, control)
-
-

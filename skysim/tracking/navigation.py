@@ -7,28 +7,23 @@ multiplicative extended Kalman filter (`estimator.filter.mekf`). Each star-track
 from __future__ import annotations
 
 import math
-import numpy as np
-from estimator.core.types import RateEstimate
-from skysim.camera.render import Window
-from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM
-from skysim.core.types import Mount
-from skysim.dynamics.imu import Increments
-from skysim.scene.sections.vehicle import ImuConfig
 from collections.abc import Sequence
+
+import numpy as np
 from scipy.spatial.transform import Rotation
-from estimator.core.types import Attitude
+
+from estimator.core.types import Attitude, RateEstimate
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import (GyroModel, JumpModel, TrackerModel)
+from estimator.filter.states import GyroModel, JumpModel, TrackerModel
+from skysim.camera.render import Window
 from skysim.core import quaternion
-from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
+from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, HOUR_S, PPM
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import imu
+from skysim.dynamics.imu import Increments
 from skysim.scene.scene import Scene
 from skysim.scene.sections.tracker import FilterConfig
-
-
-
-
+from skysim.scene.sections.vehicle import ImuConfig
 
 # The gyro's rate of a frame, for the star tracker: mean of the IMU's samples over the frame's
 # exposure.
@@ -39,7 +34,10 @@ def rate_of_frame(
 ) -> RateEstimate | None:
     """Rate of the camera in its own axes, with the covariance of the data sheet; None without samples, or saturated.
 
-    window, rows : exposure of a sensor of so many rows, to the end of its last row
+    Parameters
+    ----------
+    window, rows
+        Exposure of a sensor of so many rows, to the end of its last row
     """
     begin_s = window.open_s
     end_s = window.close_s(rows)
@@ -76,11 +74,18 @@ def latest(samples: list[Increments], kept_s: float) -> list[Increments]:
 class Navigation:
     """The vehicle's attitude estimates: integrated gyros, and the filter that the star tracker corrects.
 
-    scene : with `vehicle.imu`, and optionally `filter`
-    mounts : of the cameras, as assumed; the main one's first
-    lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
-    position_body_m, gravity_m_s2 : of the accelerometers
-    kept_s : how long IMU samples are kept, for `imu_samples`
+    Attributes
+    ----------
+    scene
+        With `vehicle.imu`, and optionally `filter`
+    mounts
+        Of the cameras, as assumed; the main one's first
+    lab_from_body_wxyz
+        (4,) the true attitude at the start, when the navigator is zeroed
+    position_body_m, gravity_m_s2
+        Of the accelerometers
+    kept_s
+        How long IMU samples are kept, for `imu_samples`
     """
 
     def __init__(
@@ -262,5 +267,3 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1
         config.considered,
         cameras,
     )
-
-

@@ -4,37 +4,36 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
-from estimator.identification.led_codes import LedCode
-from skysim.camera.optics import Optics
-from skysim.core.errors import InputError
-from skysim.core.types import Mount, Sources
-from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
-from skysim.scene.sections.light import (DomeConfig, StarsConfig)
-from skysim.sources.air import weather_of
-from skysim.sources.catalog import require_catalog
-from skysim.sources.dome.layouts import led_list, registry
-from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.dome import surface
-from skysim.sources.dome import survey_errors
-from skysim.sources.dome.codebooks import (codebook, light_levels)
-from skysim.sources.photometry import Band
-from skysim.tracking import dome_map_file
-from typing import Any
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, RateEstimate
+from estimator.identification.led_codes import LedCode
 from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.types import Floats
-from skysim.sources.camera_orbit import (CameraOrbit, build_orbit, state_at)
-
+from skysim.camera.optics import Optics
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Mount, Sources
+from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.sources.air import weather_of
+from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
+from skysim.sources.catalog import require_catalog
+from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome.codebooks import codebook, light_levels
+from skysim.sources.dome.layouts import led_list, registry
+from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
+from skysim.sources.photometry import Band
+from skysim.tracking import dome_map_file
 
 
 def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
@@ -197,14 +196,15 @@ def calibration(camera: CameraConfig) -> Camera:
 def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
     """The tracker's star catalog, a name in data/catalogs/ or a file, by the estimator's own reader.
 
-    key : the scene's key or the option that gives it, for the message of InputError
+    Parameters
+    ----------
+    key
+        The scene's key or the option that gives it, for the message of InputError
     """
     try:
         return catalog.read(require_catalog(key, name))
     except ImageError as error:
         raise InputError(key, error) from None
-
-
 
 
 # A star tracker in orbit that gets the camera's velocity from the vehicle's navigation.
@@ -268,5 +268,3 @@ def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observe
     if orbit is None:
         return observer
     return replace(observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s)
-
-

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import datetime
 from typing import Any
+
 import numpy as np
+
 from skysim.core.constants import JULIAN_YEAR_DAY
 from skysim.core.time import in_utc
-from skysim.tracking.tracker_interface import (SOLVED, Answer, Picture, Setup)
-
-
+from skysim.tracking.tracker_interface import SOLVED, Answer, Picture, Setup
 
 FIELD_MARGIN = 1.1  # field of the pattern database over that of the camera
 OPTIONS = ("fast", "sigma", "brightest", "limit_mag")
@@ -99,5 +99,3 @@ def camera_model(tetra3rs: Any, setup: Setup) -> Any:
         crpix=(np.array(setup.center_px) - image_center_px(setup)).tolist(),
         distortion=distortion if any(setup.distortion) else None,
     )
-
-

@@ -10,10 +10,19 @@ import time
 from dataclasses import replace
 from functools import partial
 from typing import IO, Any
-import numpy as np
-from skysim.core.plugins import Respond, describe_error, serve
-from skysim.tracking.tracker_interface import (FAILED, TRACKERS, Answer, Picture, Setup, Tracker, check_answer)
 
+import numpy as np
+
+from skysim.core.plugins import Respond, describe_error, serve
+from skysim.tracking.tracker_interface import (
+    FAILED,
+    TRACKERS,
+    Answer,
+    Picture,
+    Setup,
+    Tracker,
+    check_answer,
+)
 
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
@@ -61,5 +70,3 @@ def create(name: str, setup: dict[str, Any]) -> Respond:
 
 if __name__ == "__main__":
     serve(partial(create, sys.argv[1]))
-
-

@@ -6,28 +6,31 @@ a crash there becomes a failed answer and does not end the run; docs/howto/exter
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from importlib import metadata
-from importlib.util import find_spec
-from typing import Any, Literal, Protocol, Self
-import numpy as np
-from numpy.typing import NDArray
-from skysim.core.errors import printable
-from skysim.core.plugins import MAX_STATUS_CHARS, PluginKind, finite_array, to_lists
 import json
 import re
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
-from skysim.core.errors import InputError
-from skysim.core.plugins import FOLDER, Program, ProgramError
+from typing import Any, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError, printable
+from skysim.core.plugins import (
+    FOLDER,
+    MAX_STATUS_CHARS,
+    PluginKind,
+    Program,
+    ProgramError,
+    finite_array,
+    to_lists,
+)
 from skysim.dynamics.controllers import CONTROLLERS
-
-
 
 OWN = "own"  # the name of skysim's own estimator
 TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
@@ -50,8 +53,13 @@ Floats = NDArray[np.float64]
 class Stars:
     """The star catalog given to the tracker, brightest first.
 
-    id : (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame at the scene's date
     (proper motion, parallax, aberration); magnitude : (N,) V
+
+    Attributes
+    ----------
+    id
+        (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame
+        at the scene's date
     """
 
     id: NDArray[np.int64]
@@ -63,8 +71,12 @@ class Stars:
 class Leds:
     """The surveyed dome. The vehicle rotates about the lab's origin; the camera is offset from it.
 
-    id : (N,); position_m : (N, 3) in the lab
-    camera_body_m : (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
+    Attributes
+    ----------
+    id
+        (N,); position_m : (N, 3) in the lab
+    camera_body_m
+        (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
     """
 
     id: NDArray[np.int64]
@@ -77,14 +89,23 @@ class Leds:
 class Setup:
     """What a tracker gets before the first frame: the hardware as the scene's tracker assumes it.
 
-    reference  : frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
-    time_utc   : ISO 8601, when t_s is 0
-    width_px, height_px, focal_px, center_px : a pinhole in camera axes, +x right, +y down, +z boresight;
-        the center of the first pixel is (0, 0)
-    distortion : k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
-    stars, leds: the map; one of them is None
-    seed       : for a tracker that draws random numbers
-    options    : the scene's `tracker.options`
+    Attributes
+    ----------
+    reference
+        Frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
+    time_utc
+        ISO 8601, when t_s is 0
+    width_px, height_px, focal_px, center_px
+        A pinhole in camera axes, +x right, +y down, +z boresight; the center of the first pixel
+        is (0, 0)
+    distortion
+        k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
+    stars, leds
+        The map; one of them is None
+    seed
+        For a tracker that draws random numbers
+    options
+        The scene's `tracker.options`
     """
 
     reference: Literal["icrs", "lab"]
@@ -126,9 +147,14 @@ class Setup:
 class Picture:
     """One frame as a tracker gets it.
 
-    image_dn   : (height_px, width_px), uint16; float64 from a camera without noise
-    frame      : its number; t_s : mid-exposure since the scene's start; exposure_s
-    streak_px  : (dx, dy) that lights move in the exposure, if a gyro measures it; else None
+    Attributes
+    ----------
+    image_dn
+        (height_px, width_px), uint16; float64 from a camera without noise
+    frame
+        Its number; t_s : mid-exposure since the scene's start; exposure_s
+    streak_px
+        (dx, dy) that lights move in the exposure, if a gyro measures it; else None
     """
 
     image_dn: NDArray[Any]
@@ -142,11 +168,19 @@ class Picture:
 class Answer:
     """A tracker's solution of a frame.
 
-    status             : "solved", or why there is no attitude
-    cam_from_ref_xyzw  : (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if solved
-    covariance_rad2    : (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
-    centroids_px       : (N, 2) x and y of the lights found, optional
-    seconds            : processing time; if None, the time from sending the frame to its answer
+    Attributes
+    ----------
+    status
+        "solved", or why there is no attitude
+    cam_from_ref_xyzw
+        (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if
+        solved
+    covariance_rad2
+        (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
+    centroids_px
+        (N, 2) x and y of the lights found, optional
+    seconds
+        Processing time; if None, the time from sending the frame to its answer
     """
 
     status: str
@@ -245,8 +279,6 @@ def missing_extra(point: metadata.EntryPoint) -> str:
     return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
 
 
-
-
 # Programs, and the one that is an external tracker: it answers each frame with a line of JSON.
 
 
@@ -320,9 +352,19 @@ WRITERS: dict[str, Callable[[Path, Picture], None]] = {"png": write_png, "fits":
 class TrackerProgram(Program):
     """An external tracker program. After a failure it is restarted for the next frame, up to MAX_FAILURES in a row.
 
-    arguments, image_format : of `split_command`;  limit_s : time limit per frame
-    environment : in place of this process's
-    Raises InputError where it cannot be started or refuses the set-up.
+    Attributes
+    ----------
+    arguments, image_format
+        Of `split_command`
+    limit_s
+        Time limit per frame
+    environment
+        In place of this process's
+
+    Raises
+    ------
+    InputError
+        Where it cannot be started or refuses the set-up.
     """
 
     def __init__(
@@ -375,7 +417,10 @@ class TrackerProgram(Program):
     def frame_message(self, picture: Picture) -> list[bytes]:
         """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian.
 
-        Raises ProgramError where the program has made its folder unusable.
+        Raises
+        ------
+        ProgramError
+            Where the program has made its folder unusable.
         """
         header: dict[str, Any] = {
             "frame": picture.frame,
@@ -401,5 +446,3 @@ class TrackerProgram(Program):
         height, width = picture.image_dn.shape
         header |= {"width_px": width, "height_px": height, "dtype": dtype, "bytes": len(pixels)}
         return [(json.dumps(header) + "\n").encode(), pixels]
-
-

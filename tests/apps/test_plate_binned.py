@@ -14,8 +14,8 @@ from estimator.catalog import catalog
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.apps import plate_solver
-from skysim.apps.plate_solver import retries
 from skysim.apps.plate_solver import picture as plate_picture
+from skysim.apps.plate_solver import retries
 from skysim.core import images
 from skysim.core.files import CATALOGS
 from tests.helpers import photographs

@@ -23,9 +23,8 @@ from estimator.trackers.pipeline import Clock
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solver
-from skysim.apps.plate_solver import solver
-from skysim.core.errors import InputError
 from skysim.core import images
+from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
 from skysim.results.files import recording
 from skysim.scene import loader
@@ -165,7 +164,9 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     gray: NDArray, focal_35mm: int, orientation: int
 ) -> None:
     """By the longer side (36 mm over 6.52 mm) it is 138 mm. Turned, the field is that of the shorter side."""
-    seen = images.ViewedImage(np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm)
+    seen = images.ViewedImage(
+        np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm
+    )
     unknown = plate_solver.make_solver(None, None)
     outcome = plate_solver.solve_picture(seen, unknown, None)
     assert outcome.report.attitude.solved

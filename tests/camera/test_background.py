@@ -10,7 +10,19 @@ from pydantic import TypeAdapter
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import (BACKGROUNDS, NANOLAMBERT_V0, fill, glow_map, moonlight_nl, nodes_px, pixel_directions, scattering, transmittance, unproject, viewing_geometry)
+from skysim.camera.glow.background import (
+    BACKGROUNDS,
+    NANOLAMBERT_V0,
+    fill,
+    glow_map,
+    moonlight_nl,
+    nodes_px,
+    pixel_directions,
+    scattering,
+    transmittance,
+    unproject,
+    viewing_geometry,
+)
 from skysim.camera.optics import Optics
 from skysim.scene.sections import light
 from skysim.scene.sections.camera import CameraConfig

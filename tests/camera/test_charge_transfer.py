@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skysim.camera.charge_transfer import (bloom, delayed_fractions, frame_transfer_smear, interline_smear, transfer_loss)
+from skysim.camera.charge_transfer import (
+    bloom,
+    delayed_fractions,
+    frame_transfer_smear,
+    interline_smear,
+    transfer_loss,
+)
 
 WELL = 1000.0
 

@@ -21,7 +21,6 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import build_lab
 from skysim.simulation.lights.light import beam_of
-from skysim.sources.satellites import (as_sources, moving_light)
 from skysim.sources.photometry import (
     Band,
     black_body_v0,
@@ -31,6 +30,7 @@ from skysim.sources.photometry import (
     star_chromatic,
     temperature_k,
 )
+from skysim.sources.satellites import as_sources, moving_light
 
 # B-V and V-I
 A0 = (0.0, 0.004)

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.cosmic_rays import (MAX_TANGENT, STEP_PX, TRACK, add_particles, deposit, draw_tracks)
+from skysim.camera.cosmic_rays import (
+    MAX_TANGENT,
+    STEP_PX,
+    TRACK,
+    add_particles,
+    deposit,
+    draw_tracks,
+)
 from skysim.core.errors import InputError
 from skysim.scene.sections.camera import ParticlesConfig
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skysim.camera.glow import earth_glow
-from skysim.camera.glow.earth_glow import (LAYER, earth_radiance)
+from skysim.camera.glow.earth_glow import LAYER, earth_radiance
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.scene import loader
 from skysim.scene.sections.surroundings import EarthConfig

@@ -4,15 +4,21 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from skysim.camera.glow.background import glow_map
-from skysim.camera.glow.background import (CURVATURE, LATITUDE_DEG, LN_LIGHT, SLOPE, faint_starlight_s10, galactic_latitude_deg)
+from skysim.camera.glow.background import (
+    CURVATURE,
+    LATITUDE_DEG,
+    LN_LIGHT,
+    SLOPE,
+    faint_starlight_s10,
+    galactic_latitude_deg,
+    glow_map,
+)
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.scene.sections.light import (FaintStarsGlowConfig, SkyGlowConfig)
-from skysim.sources import catalog
-from skysim.sources import star_archives
+from skysim.scene.sections.light import FaintStarsGlowConfig, SkyGlowConfig
+from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
 from skysim.sources.stars import cam_from_icrs
 
@@ -91,7 +97,9 @@ def test_latitudes_are_those_of_astropy() -> None:
 
     ra, dec = np.random.default_rng(3).uniform([0, -90], [360, 90], (50, 2)).T
     expected = SkyCoord(ra, dec, unit="deg").galactic.b.deg
-    np.testing.assert_allclose(galactic_latitude_deg(star_archives.directions(ra, dec)), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        galactic_latitude_deg(star_archives.directions(ra, dec)), expected, atol=1e-5
+    )
 
 
 def test_the_glow_of_a_field_is_that_of_a_sky_of_the_same_magnitude() -> None:

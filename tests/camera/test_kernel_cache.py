@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.psf.kernel import (Kernel, build_kernel)
+from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, sharpness_px, source_kernels
 from skysim.core.errors import InputError
 from skysim.scene.sections.camera import CameraConfig

@@ -11,7 +11,14 @@ import pytest
 from scipy import special
 from scipy.signal import fftconvolve
 
-from skysim.camera.psf.kernel import (HARMONIC_FLOOR, Kernel, bandwidth, build_kernel, pack_table, round_kernel)
+from skysim.camera.psf.kernel import (
+    HARMONIC_FLOOR,
+    Kernel,
+    bandwidth,
+    build_kernel,
+    pack_table,
+    round_kernel,
+)
 from skysim.camera.psf.otf import (
     EXTENT,
     PSFS,

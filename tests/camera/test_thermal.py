@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
-from skysim.camera.thermal_motion import (camera_at, leds_at, temperature_c)
+from skysim.camera.thermal_motion import camera_at, leds_at, temperature_c
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.scene import loader

@@ -20,14 +20,11 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
+from skysim.core import files, images, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core import files
-from skysim.core import images
-from skysim.core import yaml_reader
-from skysim.core.files import (HOST, TEMPORARY_NAME)
+from skysim.core.files import HOST, TEMPORARY_NAME
 from skysim.core.types import BodyTruth, Frame, Truth
-from skysim.results.files import run_export
-from skysim.results.files import recording
+from skysim.results.files import recording, run_export
 from skysim.scene import loader, scene
 from skysim.simulation.flight import simulate_motion
 

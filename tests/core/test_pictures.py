@@ -17,12 +17,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from skysim.core.errors import InputError
-from skysim.core import encoded
-from skysim.core import encoded
-from skysim.core import images
-from skysim.core import encoded
+from skysim.core import encoded, images
 from skysim.core import images as fits_images
+from skysim.core.errors import InputError
 
 RNG = np.random.default_rng(4)
 GRAY = np.kron(

@@ -13,8 +13,7 @@ import pytest
 
 from benchmarks import AREAS
 from skysim.core.files import ROOT
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
+from skysim.experiments.study import plan, study_file
 
 DOME = (ROOT / "docs/findings/dome.md").read_text(encoding="utf-8")
 ESTIMATOR = (ROOT / "estimator/README.md").read_text(encoding="utf-8")

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.cmgs import (STEERING, CmgSet)
-from skysim.dynamics.multibody.fans import (Desaturator, FanSet)
+from skysim.dynamics.multibody.cmgs import STEERING, CmgSet
+from skysim.dynamics.multibody.fans import Desaturator, FanSet
 from skysim.dynamics.multibody.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
 from tests.helpers.interpreted import interpreted

@@ -15,14 +15,12 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.dynamics import multibody
+from skysim.dynamics.multibody import mjcf_export, scene_picture
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody import mjcf_export
-from skysim.dynamics.multibody import scene_picture
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
-from skysim.sources import (dome)
-from skysim.sources import catalog
+from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
 from skysim.sources.photometry import Band

@@ -12,7 +12,6 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.dynamics.multibody import mjcf
-from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.multibody.mjcf import xml_root
 
 BUS = '<body name="bus"><camera name="star_camera"/><geom size=".1"/></body>'

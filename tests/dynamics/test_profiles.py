@@ -10,12 +10,12 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from skysim.core import text
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core import text
 from skysim.dynamics.guidance import plan, profile_start
+from skysim.dynamics.profile_samples import MAX_SAMPLES, Samples, check_samples
 from skysim.dynamics.profiles import read_profile
-from skysim.dynamics.profile_samples import (MAX_SAMPLES, Samples, check_samples)
 from skysim.dynamics.reference_curves import fit_spline
 from skysim.results.files import run_export
 from skysim.scene.sections.motion import MotionConfig, ProfileConfig

@@ -20,9 +20,7 @@ from estimator import (
 )
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.calibration import (dome_survey, home_position)
-from estimator.calibration import star_field
-from estimator.calibration import star_field
+from estimator.calibration import dome_survey, home_position, star_field
 from estimator.calibration.star_field import StarFrame
 from estimator.catalog import catalog
 from estimator.core.types import FramePriors

@@ -11,16 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from estimator.calibration.mass_dynamics import (BearingRecord, MassEstimate, Prior)
+from estimator.calibration.mass_dynamics import BearingRecord, MassEstimate, Prior
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.experiments import balance_flight
-from skysim.experiments import balance_report
-from skysim.experiments import balance_flight
-from skysim.experiments import balance_flight
-from skysim.experiments import balance_procedure
+from skysim.experiments import balance_flight, balance_procedure, balance_report
 from skysim.experiments.balance_procedure import BalancePlan
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader

@@ -14,20 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.catalog import (catalog)
-from estimator.catalog import published_catalogs
+from estimator.catalog import catalog, published_catalogs
 from estimator.core.checks import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import sinks
 from skysim.camera.psf import otf
-from skysim.core import units
+from skysim.core import images, units, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core import images
-from skysim.core import yaml_reader
 from skysim.dynamics.controllers import torque_of_reply
 from skysim.dynamics.multibody import mjcf
-from skysim.dynamics.profiles import read_profile
 from skysim.dynamics.profile_samples import check_samples
+from skysim.dynamics.profiles import read_profile
 from skysim.dynamics.reference_curves import fit_spline
 from skysim.experiments.characterize.frame_files import read_settings
 from skysim.experiments.dome_survey import survey_images
@@ -36,17 +33,14 @@ from skysim.experiments.study.execution import store
 from skysim.results.files import recording
 from skysim.results.files.parts import read_prices
 from skysim.results.report import print_table
-from skysim.results.report_blocks import (Column, Table)
-from skysim.scene import (loader)
-from skysim.scene import opencv_calibration
+from skysim.results.report_blocks import Column, Table
+from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
-from skysim.sources.dome.layouts import listed
 from skysim.sources.dome import point_cloud
-from skysim.sources.orbit_elements import (gcrs_states, read_elements)
-from skysim.sources.orbit_elements import read_oem
-from skysim.tracking import dome_map_file
-from skysim.tracking import tracker_interface
+from skysim.sources.dome.layouts import listed
+from skysim.sources.orbit_elements import gcrs_states, read_elements, read_oem
+from skysim.tracking import dome_map_file, tracker_interface
 
 START = datetime.datetime(2016, 12, 31)
 GZIP_MAGIC = b"\x1f\x8b"
@@ -184,7 +178,9 @@ def answers(data: bytes) -> None:
         return
     statuses: list[str] = []
     if rejects(
-        lambda: statuses.append(tracker_interface.check_answer(tracker_interface.Answer.of_tree(tree)).status),
+        lambda: statuses.append(
+            tracker_interface.check_answer(tracker_interface.Answer.of_tree(tree)).status
+        ),
         ValueError,
     ):
         return

@@ -21,15 +21,12 @@ from hypothesis import strategies as some
 from PIL import Image
 
 from skysim.camera.psf.otf import read_cells
+from skysim.core import encoded, images, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core import encoded
-from skysim.core import encoded
-from skysim.core import images
-from skysim.core import yaml_reader
 from skysim.scene import loader
 from skysim.sources import photometry
-from skysim.sources.dome.layouts import listed
 from skysim.sources.dome import point_cloud
+from skysim.sources.dome.layouts import listed
 from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from tests.fuzz.targets import TARGETS, rejects
 from tests.helpers.hostile_files import promise

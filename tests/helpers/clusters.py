@@ -14,8 +14,7 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 
 from skysim.core.files import ROOT
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import workers
 
 STUDY = """

@@ -16,7 +16,7 @@ from estimator.filter.mekf import AttitudeFilter, GyroModel
 from skysim.results.metrics import normalized_error_squared
 from skysim.scene.loader import load_scene
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 NO_GYRO = GyroModel(1e-5, 0.0, np.inf)

@@ -37,9 +37,8 @@ from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
-from skysim.tracking import onboard_model
+from skysim.tracking import external_tracker, onboard_model
 from skysim.tracking import factory as tracker_settings
-from skysim.tracking import external_tracker
 from skysim.tracking import tetra3rs as tetra3rs_tracker
 from skysim.tracking.tracker_interface import Stars
 
@@ -344,7 +343,9 @@ def tetra3rs(name: str) -> Solve | None:
     settings = tracker_settings.assumed_settings(scene)
     nothing = np.zeros(0)
     tracker = tetra3rs_tracker.Tetra3rs(
-        external_tracker.build_setup(scene, camera, settings, Stars(nothing.astype(int), nothing, nothing))
+        external_tracker.build_setup(
+            scene, camera, settings, Stars(nothing.astype(int), nothing, nothing)
+        )
     )
     pixels = lattice(camera.width_px, camera.height_px) - tracker.image_center_px
 

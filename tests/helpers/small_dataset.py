@@ -30,7 +30,12 @@ hardware: [camera.detector.hardware_seed]
 
 def small(vary: Path | None = None, frames: int = 5, **more: Any) -> dataset_run.DatasetPlan:
     """A dataset of small frames in shards of two."""
-    more = {"seed": 3, "frames_per_shard": 2, "formats": dataset_run.FORMATS, "overrides": SMALL} | more
+    more = {
+        "seed": 3,
+        "frames_per_shard": 2,
+        "formats": dataset_run.FORMATS,
+        "overrides": SMALL,
+    } | more
     return dataset_run.load("shefex2", vary, frames, **more)
 
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import (engines, store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import engines, runner, store
 
 STRAYS = """
 schema: 1

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.dynamics.profiles import read_profile
 from skysim.results.files import run_export
@@ -64,7 +64,9 @@ def test_it_is_valid_and_says_what_was_meant(
 
 def test_their_reader_refuses_what_ours_never_writes() -> None:
     """So that the tests above can fail."""
-    good = run_export.message("x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2))
+    good = run_export.message(
+        "x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2)
+    )
     for old, new in (
         ("REF_FRAME_A = LAB\n", ""),
         ("= QUATERNION", "= QUATRNION"),

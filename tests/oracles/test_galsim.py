@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.psf.kernel import (Kernel, build_kernel)
+from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
     AiryPsfConfig,

@@ -17,12 +17,7 @@ import pytest
 
 from skysim.core.time import tt_jd
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources import camera_orbit
-from skysim.sources import orbit_elements
-from skysim.sources import satellites
-from skysim.sources import body_discs
-from skysim.sources import ephemeris
-from skysim.sources import ephemeris
+from skysim.sources import body_discs, camera_orbit, ephemeris, orbit_elements, satellites
 
 LIMIT_ARCSEC = 0.1
 LIMIT_MAG = 0.001
@@ -52,7 +47,9 @@ def skyfield() -> Skyfield:
     return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
 
 
-def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[ephemeris.ObserverPlace, Any, Any]]:
+def observers(
+    skyfield: Skyfield, on_ground: bool
+) -> Iterator[tuple[ephemeris.ObserverPlace, Any, Any]]:
     """Random times, and sites if on the ground: our observer, Skyfield's and its time."""
     rng = np.random.default_rng(26)
     for _ in range(COUNT):

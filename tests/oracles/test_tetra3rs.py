@@ -18,9 +18,9 @@ from skysim.core.files import ROOT
 from skysim.results import scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import (build_lab, build_tracker)
-from skysim.tracking import tracker_interface
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import tetra3rs as tetra3rs_tracker
+from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import Setup
 
 tetra3rs = pytest.importorskip("tetra3rs")

@@ -21,15 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import wcs
 from skysim.camera.optics import Optics
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results import (scoring)
-from skysim.results import plots
-from skysim.results.files import recording
-from skysim.results.files import run_export
-from skysim.results.files import run_export
-from skysim.results.files import recording
+from skysim.results import plots, scoring
+from skysim.results.files import recording, run_export
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks import check
@@ -207,7 +203,9 @@ def test_a_message_is_what_the_notation_allows() -> None:
     assert (np.sum(rows[1:] * rows[:-1], axis=1) > 0.9).all()
     for epochs in ([], [START, START]):
         with pytest.raises(InputError):
-            run_export.message("x", [], (run_export.LAB, run_export.BODY), epochs, spin[: len(epochs)])
+            run_export.message(
+                "x", [], (run_export.LAB, run_export.BODY), epochs, spin[: len(epochs)]
+            )
 
 
 # Tables

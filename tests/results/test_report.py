@@ -12,8 +12,21 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.results.report import (Block, Cell, Code, Column, Facts, Figure, Items, Report, Section, Table, Text, Verdict)
 from skysim.results import report
+from skysim.results.report import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Report,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 
 HOSTILE = "<script>alert(1)</script> & \"quotes\" 'and' </td></table> <!-- -->"
 PICTURE = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()

@@ -13,10 +13,10 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.results.files import templates
-from skysim.results.files.templates import (Drawing, SheetText, to_dxf)
+from skysim.results.files.templates import Drawing, SheetText, to_dxf
 from skysim.scene import loader
-from skysim.simulation.lab import (Lab, build_lab)
-from skysim.sources.dome.surface import (Ellipsoid, Plane)
+from skysim.simulation.lab import Lab, build_lab
+from skysim.sources.dome.surface import Ellipsoid, Plane
 
 RADIUS_M = 1.2
 SPHERE = Ellipsoid(np.zeros(3), np.full(3, RADIUS_M))

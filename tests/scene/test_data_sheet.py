@@ -10,8 +10,7 @@ import yaml
 
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.scene.camera_sheet import (QUESTIONS, REQUIRED)
-from skysim.scene.camera_sheet import (PLACEHOLDERS, fill, outstanding, text)
+from skysim.scene.camera_sheet import PLACEHOLDERS, QUESTIONS, REQUIRED, fill, outstanding, text
 
 STATED = {
     "pixels": "1936 x 1216",

@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 
 from skysim.apps import plate_solver
 from skysim.camera.optics import Optics
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.results.files import recording
-from skysim.scene import (loader)
-from skysim.scene import opencv_calibration
+from skysim.scene import loader, opencv_calibration
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.simulation.flight import simulate_motion
 
-TOLD = OpencvCalibration(1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25))
+TOLD = OpencvCalibration(
+    1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25)
+)
 
 
 def by_opencv(path: Path, **more: Any) -> Path:
@@ -60,7 +61,9 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
         st.tuples(*[numbers] * 5),
     )
 )
-def test_every_digit_comes_back_by_opencv_and_by_us(tmp_path: Path, told: OpencvCalibration) -> None:
+def test_every_digit_comes_back_by_opencv_and_by_us(
+    tmp_path: Path, told: OpencvCalibration
+) -> None:
     path = tmp_path / "camera.yml"
     files.write_text(path, opencv_calibration.text(told))
     assert opencv_calibration.looks_like_calibration(path)

@@ -23,8 +23,7 @@ from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.cmgs import STEERING
 from skysim.scene import loader, scene
-from skysim.scene.sections import (camera, leds, motion, vehicle)
-from skysim.scene.sections import light
+from skysim.scene.sections import camera, leds, light, motion, vehicle
 from skysim.scene.sections.layouts import Layout
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.tracker import FilterConfig

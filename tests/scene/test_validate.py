@@ -13,12 +13,12 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim.apps.cli import (main)
+from skysim.apps.cli import main
 from skysim.apps.cli.commands import validate
 from skysim.apps.cli.commands.validate import check_file
-from skysim.core.errors import InputError
 from skysim.core import yaml_reader
-from skysim.core.files import (DATA, ROOT, SCENES)
+from skysim.core.errors import InputError
+from skysim.core.files import DATA, ROOT, SCENES
 from skysim.experiments.study import study_file
 from skysim.scene import opencv_calibration
 from skysim.scene.loader import load, load_camera

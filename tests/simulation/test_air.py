@@ -10,8 +10,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.simulation.lights.atmosphere import (AirEffects, Skyline)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lights.atmosphere import AirEffects, Skyline
 from skysim.simulation.lights.light import find_light
 from skysim.sources import air
 from skysim.tracking.factory import solve_frame
@@ -111,9 +111,7 @@ def test_stars_twinkle_by_frame_and_star() -> None:
     camera = lab.scene.camera
     exposure_s = lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = air.variance(
-        mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9
-    )[0]
+    variance = air.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 

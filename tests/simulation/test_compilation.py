@@ -7,7 +7,7 @@ import pytest
 from skysim.core.files import SCENES
 from skysim.scene import loader
 from skysim.simulation.compilation import synthetic_frame
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
 
 SYMMETRIC = {

@@ -16,18 +16,20 @@ from scipy.spatial.transform import Rotation
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
-from skysim.dynamics.controllers import (ControllerInput, ControllerSetup, check_torque, torque_of_reply)
+from skysim.dynamics.controllers import (
+    ControllerInput,
+    ControllerSetup,
+    check_torque,
+    torque_of_reply,
+)
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation.checks import check
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import build_lab
-from skysim.simulation.lab import UserParts
+from skysim.simulation.lab import UserParts, build_lab
 from skysim.tracking import tracker_interface
 
 PD = '''

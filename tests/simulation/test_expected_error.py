@@ -12,16 +12,14 @@ from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import metrics
 from skysim.results.simulate import render_at
 from skysim.scene import loader
-from skysim.simulation.checks import (beliefs, detection, expected_error)
-from skysim.simulation.checks import attitudes
-from skysim.simulation.checks import sampling
+from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, sampling
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, fit_loss, timing_sigma_s
 from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure, render_frame
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.simulation.lights.light import (Exposure, Lit, beam_of)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lights.light import Exposure, Lit, beam_of
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory

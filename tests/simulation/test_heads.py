@@ -14,7 +14,7 @@ from skysim.scene.loader import load_scene
 from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight, simulate_motion
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from tests.helpers.head_pairs import gain, measured_pairs
 
 SIDE = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}

@@ -24,10 +24,9 @@ from skysim.scene.sections.light import LightConfig
 from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights import registry
-from skysim.simulation.lights.light import (Exposure, Light, Lit, Obstacle, Occluder)
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import Exposure, Light, LightPlan, Lit, Obstacle, Occluder
 from skysim.simulation.lights.registry import register
 from skysim.sources.photometry import led_strength_e_s_sr
 

@@ -11,9 +11,8 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.sources import (stars)
-from skysim.sources import catalog
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.sources import catalog, stars
 from skysim.sources.camera_orbit import state_at
 from skysim.sources.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame

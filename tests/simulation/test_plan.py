@@ -16,17 +16,13 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import (check, detection, facts)
-from skysim.simulation.checks import attitudes
-from skysim.simulation.checks import sampling
+from skysim.simulation.checks import attitudes, check, detection, facts, sampling, sky_warnings
 from skysim.simulation.checks import check as plan
 from skysim.simulation.checks.facts import Fact
 from skysim.simulation.checks.sampling import CheckedSamples
-from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import sky_warnings
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 SPHERE = "{kind: sphere, apex: 1.2 m, radius: 1.2 m}"
@@ -62,7 +58,9 @@ def samples_of(lab: Lab) -> tuple[detection.Context, CheckedSamples]:
     context = detection.context_of(lab)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
-    return context, CheckedSamples(sampling.sampled(frames, context), sampling.sampled(reach, context))
+    return context, CheckedSamples(
+        sampling.sampled(frames, context), sampling.sampled(reach, context)
+    )
 
 
 # Attitudes

@@ -10,17 +10,12 @@ import pytest
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import (findings)
-from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.detection import Context, context_of
-from skysim.simulation.checks import dome_warnings
+from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
 from skysim.simulation.checks.check import check
-from skysim.simulation.checks.sampling import (CheckedSamples, sampled)
-from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import sky_warnings
+from skysim.simulation.checks.detection import Context, context_of
+from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources.satellites import MIRRORED
 from skysim.tracking.factory import solve_frame
 
@@ -101,7 +96,11 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
         dip_deg - 30, abs=0.15
     )  # the pole's radius is 21 km less
     assert (
-        list(sky_warnings.exclusion(*plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)))
+        list(
+            sky_warnings.exclusion(
+                *plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)
+            )
+        )
         == []
     )
 

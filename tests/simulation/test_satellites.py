@@ -14,7 +14,7 @@ from skysim.core.types import SourceTruth
 from skysim.results.files.recording import write_frame
 from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
 

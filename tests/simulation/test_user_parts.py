@@ -16,8 +16,7 @@ import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
 from skysim.dynamics.guidance import plan
-from skysim.results.files import recording
-from skysim.results.files import run_export
+from skysim.results.files import recording, run_export
 from skysim.results.run import Run
 from skysim.scene import loader
 from skysim.simulation.checks.check import broken_assumptions

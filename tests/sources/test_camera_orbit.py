@@ -11,9 +11,9 @@ import pytest
 from skysim.core.constants import EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import (CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig)
+from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
 from skysim.sources import orbit_elements
-from skysim.sources.camera_orbit import (CircularOrbit, build_orbit, state_at)
+from skysim.sources.camera_orbit import CircularOrbit, build_orbit, state_at
 
 START = datetime.datetime(2024, 4, 10, 3)
 VANGUARD = (

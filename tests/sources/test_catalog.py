@@ -7,8 +7,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.files import CATALOGS
-from skysim.sources import catalog
-from skysim.sources import star_archives
+from skysim.sources import catalog, star_archives
 from skysim.sources.catalog import Catalog
 
 COMMITTED = CATALOGS / "hipparcos_hp6.5.ecsv"
@@ -174,7 +173,9 @@ def test_astropy_reads_the_file_too(stars: Catalog) -> None:
 def test_info_counts_and_tells_where_it_comes_from(stars: Catalog) -> None:
     told = catalog.info("hipparcos_hp6.5")
     assert told["stars"] == len(stars)
-    supplied = np.sum((stars.hip > star_archives.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727]))
+    supplied = np.sum(
+        (stars.hip > star_archives.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727])
+    )
     assert told["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
     assert supplied == len(star_archives.supplement_rows())
     assert told["brighter_than"][5] == np.sum(stars.v_mag < 5)

@@ -14,17 +14,15 @@ from skysim.core.errors import InputError
 from skysim.core.types import Frame, Sources, Truth
 from skysim.scene import loader
 from skysim.scene.sections import layouts
-from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
-from skysim.sources import (dome)
-from skysim.sources import catalog
+from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import display
+from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome import surface
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
 FOOT_M = 0.3048

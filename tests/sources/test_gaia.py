@@ -12,9 +12,8 @@ from skysim.core.errors import InputError
 from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.lab import (build_lab, build_tracker)
-from skysim.sources import catalog
-from skysim.sources import star_archives
+from skysim.simulation.lab import build_lab, build_tracker
+from skysim.sources import catalog, star_archives
 from skysim.sources.catalog import Catalog
 from skysim.sources.stars import varied
 

@@ -16,11 +16,8 @@ from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
-from skysim.sources import (dome)
-from skysim.sources import catalog
-from skysim.sources.dome.layouts import spreads
-from skysim.sources.dome.layouts import fisher
-from skysim.sources.dome.layouts import optimize
+from skysim.sources import catalog, dome
+from skysim.sources.dome.layouts import fisher, optimize, spreads
 from skysim.sources.dome.layouts.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 

@@ -15,9 +15,8 @@ from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import build_lab
 from skysim.sources import dome
-from skysim.sources.dome import display
+from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome import surface
 from skysim.sources.photometry import Band
 
 BAND = Band.from_efficiency(0.5)

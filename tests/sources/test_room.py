@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study import search
-from skysim.experiments.study.execution import (engines, store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import study_file as study_loader
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.scene import loader
 from skysim.scene.sections import light
-from skysim.scene.sections.light import (DomeConfig, RoomConfig)
+from skysim.scene.sections.light import DomeConfig, RoomConfig
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
 from skysim.sources import dome

@@ -16,11 +16,9 @@ from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources import camera_orbit
-from skysim.sources import orbit_elements
-from skysim.sources import satellites
+from skysim.sources import camera_orbit, orbit_elements, satellites
+from skysim.sources.ephemeris import GcrsState, site_in_gcrs
 from skysim.sources.satellites import ExposureView
-from skysim.sources.ephemeris import (GcrsState, site_in_gcrs)
 
 # Satellite 00005 of Vallado et al. 2006 (AIAA 2006-6753), and its TEME states of tcppver.out, km and km/s.
 VANGUARD = (
@@ -216,7 +214,9 @@ def test_a_path_is_that_of_places_at_its_times(low_orbits: orbit_elements.MeanEl
             assert np.degrees(off) * 3600 < 0.1
 
 
-def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: orbit_elements.MeanElements) -> None:
+def test_satellites_of_the_field_are_those_that_cross_it(
+    low_orbits: orbit_elements.MeanElements,
+) -> None:
     """From a place beside each sunlit satellite, looking at it: found, with its range, and nothing where it is dark."""
     place_m, velocity_m_s, _ = orbit_elements.gcrs_states(low_orbits, DATE, np.zeros(1))
     lit = camera_orbit.sunlit_fraction(place_m[:, 0], camera_orbit.sun_m(tt_jd(DATE)))

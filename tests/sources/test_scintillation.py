@@ -14,9 +14,7 @@ ZENITH = np.ones(1)
 
 
 def one(air_mass: float, aperture_m: float, exposure_s: float, height_m: float = 0.0) -> float:
-    return float(
-        air.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0]
-    )
+    return float(air.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0])
 
 
 def profile() -> tuple[Floats, Floats, Floats]:
@@ -112,11 +110,7 @@ def test_waves_through_a_screen_scintillate_by_the_spectrum() -> None:
     assert np.mean(point) == pytest.approx(rytov, rel=0.06)
     s = np.geomspace(0.1, 500, 2000)
     spectrum = air.SPECTRUM * RED_M**-2 * layer * 2 * np.pi * s ** (-5 / 3)
-    law = (
-        spectrum
-        * np.sin(np.pi * RED_M * distance_m * s**2) ** 2
-        * air.airy(0.06 * s) ** 2
-    )
+    law = spectrum * np.sin(np.pi * RED_M * distance_m * s**2) ** 2 * air.airy(0.06 * s) ** 2
     assert np.mean(averaged) == pytest.approx(np.sum(law) * np.log(s[1] / s[0]), rel=0.06)
 
 

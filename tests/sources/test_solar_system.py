@@ -15,14 +15,9 @@ from astropy.utils import iers
 from skysim.core.time import J2000_JD, TT_MINUS_TAI_S, tai_minus_utc_s, tt_jd
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources import bodies, body_discs, ephemeris
+from skysim.sources.bodies import BODIES, bodies_from
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
-from skysim.sources import bodies
-from skysim.sources import body_discs
-from skysim.sources import ephemeris
-from skysim.sources import body_discs
-from skysim.sources import ephemeris
-from skysim.sources import ephemeris
-from skysim.sources.bodies import (BODIES, bodies_from)
 
 GEOCENTER = SiteConfig()
 ARCSEC_RAD = erfa.DAS2R
@@ -247,7 +242,9 @@ def test_a_lambert_sphere_has_lambert_s_phase_and_center(phase_deg: float) -> No
     assert share @ xy == pytest.approx([(light * x).sum() / light.sum(), 0.0], abs=2e-3)
 
 
-def lattice(surface: body_discs.DiscSurface, across: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lattice(
+    surface: body_discs.DiscSurface, across: int = 200
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     axis = (np.arange(across) + 0.5) * (2 / across) - 1
     x, y = np.meshgrid(axis, axis)
     return x, y, body_discs.light_map(surface, axis)
@@ -258,7 +255,9 @@ def test_the_full_moon_is_uniform_and_the_half_moon_ends_at_the_terminator() -> 
     inside = np.hypot(x, y) < 0.98
     assert np.ptp(share[inside]) < 1e-9 * share.max()
     for phase_deg in (60.0, 90.0, 120.0):
-        x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.radians(phase_deg)))
+        x, y, share = lattice(
+            body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.radians(phase_deg))
+        )
         terminator = -np.cos(np.radians(phase_deg)) * np.sqrt(np.maximum(1 - y**2, 0))
         assert (share[x < terminator - 0.01] == 0).all()
         assert (share[(x > terminator + 0.01) & (np.hypot(x, y) < 0.99)] > 0).all()

@@ -15,7 +15,7 @@ from skysim.dynamics.multibody import mjcf_export
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
-from skysim.sources.dome.surface import (SURFACES, Radial, Surface, build_surface)
+from skysim.sources.dome.surface import SURFACES, Radial, Surface, build_surface
 
 INCH_M = 0.0254
 UP = np.array([[0.0, 0.0, 1.0]])

@@ -16,10 +16,9 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.sources.dome import surface
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.surface import Surface
-from skysim.sources.dome import survey_errors
 from skysim.tracking import factory
 
 RARE = 1e-6  # of a sum of squares that is outside: the seeds are fixed, so it fails for a wrong law alone

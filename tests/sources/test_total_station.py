@@ -16,10 +16,8 @@ from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
-from skysim.simulation.lab import (build_lab, build_tracker)
-from skysim.sources.dome import surface
-from skysim.sources.dome import survey_errors
-from skysim.sources.dome import survey_errors
+from skysim.simulation.lab import build_lab, build_tracker
+from skysim.sources.dome import surface, survey_errors
 
 ARCSEC = np.pi / 180 / 3600
 STATION = {

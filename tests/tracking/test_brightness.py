@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 LEVELS = {

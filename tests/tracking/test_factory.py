@@ -17,13 +17,12 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
-from skysim.simulation.checks import check
-from skysim.simulation.checks import dome_warnings
+from skysim.simulation.checks import check, dome_warnings
 from skysim.simulation.flight import Flight, simulate_motion
-from skysim.simulation.lab import (build_lab, build_tracker)
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.factory import ExposureController
-from skysim.tracking.navigation import (Navigation, build_filter)
+from skysim.tracking.navigation import Navigation, build_filter
 
 PERFECT = (
     "gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, misalignment_arcsec: 0,"

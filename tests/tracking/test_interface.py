@@ -27,9 +27,7 @@ from skysim.core.files import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
@@ -37,8 +35,7 @@ from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
 from skysim.tracking import tracker_interface
-from skysim.tracking import tracker_interface
-from skysim.tracking.tracker_interface import (Answer, Leds, Picture, Setup, Stars, check_answer)
+from skysim.tracking.tracker_interface import Answer, Leds, Picture, Setup, Stars, check_answer
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
@@ -108,7 +105,9 @@ READY = "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('
 FRAMES = READY + "for line in g:\n    h = json.loads(line); p = g.read(h['bytes'])\n    "
 
 
-def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> tracker_interface.TrackerProgram:
+def program(
+    text: str, limit_s: float = 5.0, kind: str | None = None
+) -> tracker_interface.TrackerProgram:
     parts = [sys.executable, "-c", text, "{folder}"]
     return tracker_interface.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
@@ -524,7 +523,9 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         (lost / str(n)).write_text("".join(rows))
     (lost / str(len(POINTED))).write_text("attitude_known 0\n")
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
-    runs = tracker_interface.TrackerProgram("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
+    runs = tracker_interface.TrackerProgram(
+        "lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0
+    )
     answers = [
         check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
         for n in range(len(POINTED) + 1)

@@ -23,11 +23,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+
+from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -40,8 +41,6 @@ from estimator.identification.direct_match import (
     triple,
 )
 from estimator.identification.solver_options import Options
-
-
 
 MAG_GATE_SIGMA = (
     3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
@@ -68,12 +67,21 @@ class MagnitudeMatch(StarMatch):
 class FialhoOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance_rad, stretch : tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
-    gate_mag     : tolerance of a magnitude
-    triangles, checks, base : as in `Options`: limits of observed triangles and of angles compared, number of stars
-    min_fraction : fraction of the observed stars that must match
-    optimized    : assemble the lists from neighbors
-    x, y, z, chord2 : prior boresight, and the greatest squared chord of a candidate from it
+    Attributes
+    ----------
+    tolerance_rad, stretch
+        Tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the
+        angle
+    gate_mag
+        Tolerance of a magnitude
+    triangles, checks, base
+        As in `Options`: limits of observed triangles and of angles compared, number of stars
+    min_fraction
+        Fraction of the observed stars that must match
+    optimized
+        Assemble the lists from neighbors
+    x, y, z, chord2
+        Prior boresight, and the greatest squared chord of a candidate from it
     """
 
     tolerance_rad: float
@@ -95,7 +103,10 @@ def search_options(
 ) -> FialhoOptions:
     """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive.
 
-    retries : try other observed triangles if the first fails
+    Parameters
+    ----------
+    retries
+        Try other observed triangles if the first fails
     """
     if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
@@ -156,12 +167,19 @@ def fialho_4(
 ) -> MagnitudeMatch | None:
     """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
-        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that angle of it, which must
-        therefore include half the field's diagonal beside the error of the prior
     Returns None if too few stars match, or if the match is not significant (1e-5 expected by chance).
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options
+        Those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
+        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that
+        angle of it, which must therefore include half the field's diagonal beside the error of
+        the prior
     """
     match = fialho_3(vectors_cam, index, tolerance_rad, **options)
     if match is None:
@@ -210,9 +228,13 @@ def search(
 ) -> DirectMatch:
     """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
-    rays, magnitudes : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
     chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
+
+    Parameters
+    ----------
+    rays, magnitudes
+        (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
     min_side_rad = MIN_SIDE_FRACTION * index.max_angle_rad
@@ -413,5 +435,3 @@ def _test_lists(
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
                     return match
     return no_match()
-
-

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from math import sqrt
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.pair_index import (PairIndex, first_neighbor, magnitude_range)
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+
+from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -27,7 +28,6 @@ from estimator.identification.direct_match import (
     to_star_match,
 )
 from estimator.identification.solver_options import Options
-
 
 
 class MasterStarOptions(NamedTuple):
@@ -45,13 +45,22 @@ def master_star(
 ) -> StarMatch | None:
     """NPS's master-star method: find the catalog star that has most of the brightest star's angles to the others.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first;  tolerance_rad : of a direction
-    masters       : number of brightest stars to try as master. NPS's single master fails if it is false or not in the
-        catalog, or if another star is as bright (the thesis's criticism)
-    options       : those of `Options`; with magnitudes, candidates are within the magnitude gate of the master
     The candidates are ranked by how many of the observed angles they have. Each candidate with as many as the best, or
     one less, is tested by direct match: its angle to a second star determines an attitude. Returns None if the match
     is not significant, or if a contradicting match is nearly as good, as on a lattice.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction
+    masters
+        Number of brightest stars to try as master. NPS's single master fails if it is false or
+        not in the catalog, or if another star is as bright (the thesis's criticism)
+    options
+        Those of `Options`; with magnitudes, candidates are within the magnitude gate of the
+        master
     """
     settings = Options(**options)
     settings.require_known_focal("master_star")
@@ -170,5 +179,3 @@ def _best_match(
             if match.log10_chance < best.log10_chance:
                 best = match
     return best
-
-

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from math import sqrt
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.pair_index import (PairIndex, first_neighbor, pair_range)
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+
+from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -28,12 +29,15 @@ from estimator.identification.direct_match import (
 from estimator.identification.solver_options import Options
 
 
-
 class PyramidOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex : as in `Options`
-    left, right, top, bottom : tangents of the sensor's edges from the boresight
+    Attributes
+    ----------
+    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex
+        As in `Options`
+    left, right, top, bottom
+        Tangents of the sensor's edges from the boresight
     """
 
     tolerance: float
@@ -54,13 +58,19 @@ def pyramid(
 ) -> StarMatch | None:
     """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`; magnitudes are not used
     The three catalog stars are from different groups of the index (patch boards). Observed triangles are tried in the
     paper's `smart` order, which changes all three stars soon, so that one false star costs little. A pyramid is only a
     hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
     this good are expected by chance. Otherwise returns None. Raises ImageError unless the tolerance is positive.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options
+        Those of `Options`; magnitudes are not used
     """
     settings = Options(**options)
     if not tolerance_rad > 0:
@@ -243,5 +253,3 @@ def _count_in_field(
         )
         count += z > 0 and inside
     return count
-
-

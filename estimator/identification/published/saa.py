@@ -8,26 +8,21 @@ significant and no contradicting assumption is nearly as good. `saa_search` has 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.sky_index import (Cells, within)
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.jit import jit
-from estimator.identification.direct_match import angle
-from collections.abc import Iterator
-from typing import Any
+
 from estimator.attitude.solvers import quest
-from estimator.catalog.pair_index import (PairCatalog, candidates)
-from estimator.catalog.pair_index import (PairIndex, pair_range)
-from estimator.core.checks import ImageError
+from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
+from estimator.catalog.sky_index import Cells, within
+from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identification.direct_match import angle
 from estimator.identification.solver_options import Options
-
-
-
-
 
 # SAA's steps 3 to 7, compiled: every assumption of a primary pair, and the direct match of each.
 # See `saa`.
@@ -41,7 +36,10 @@ UNMATCHED_COST = 16.0
 class Gates(NamedTuple):
     """Standard deviations of an angle between stars, a direction, and a magnitude. A gate is three of them.
 
-    stretch : stretch * angle is added to the gate of an angle
+    Attributes
+    ----------
+    stretch
+        Stretch * angle is added to the gate of an angle
     """
 
     separation_rad: float
@@ -53,9 +51,14 @@ class Gates(NamedTuple):
 class SearchInput(NamedTuple):
     """The observed stars, brightest first, the catalog, and the gates.
 
-    vectors_cam, vectors     : (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
-    magnitude_cam, magnitude : (N,), (M,) their magnitudes, NaN if unknown
-    cells                    : spatial grid of the catalog's directions
+    Attributes
+    ----------
+    vectors_cam, vectors
+        (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
+    magnitude_cam, magnitude
+        (N,), (M,) their magnitudes, NaN if unknown
+    cells
+        Spatial grid of the catalog's directions
     """
 
     vectors_cam: Floats
@@ -69,11 +72,22 @@ class SearchInput(NamedTuple):
 class Primary(NamedTuple):
     """The primary pair A, B, and the geometry of the X other stars about it.
 
-    rows, triad : (2,) rows of the observed stars;  (3, 3) see `triad`;  midpoint : (3,) unit vector halfway
-    others      : (X,) rows;  corner_rad, gate_rad : (2, X) their angles from A and from B, and the gates of these
-    sigma_rad, radius_rad : (X,) standard deviation of the predicted position and its gate
-    area_sr     : (X,) area inside all gates
-    reach_rad   : greatest angle of an observed star from the midpoint, with a gate added
+    Attributes
+    ----------
+    rows, triad
+        (2,) rows of the observed stars;  (3, 3) see `triad`
+    midpoint
+        (3,) unit vector halfway
+    others
+        (X,) rows
+    corner_rad, gate_rad
+        (2, X) their angles from A and from B, and the gates of these
+    sigma_rad, radius_rad
+        (X,) standard deviation of the predicted position and its gate
+    area_sr
+        (X,) area inside all gates
+    reach_rad
+        Greatest angle of an observed star from the midpoint, with a gate added
     """
 
     rows: Ints
@@ -292,7 +306,10 @@ def add_contradictions(
 ) -> None:
     """Accumulate the assumptions that identify an observed star differently from the best one.
 
-    contradictions: (3,) their number, the sum of their matches and their least cost, updated in place
+    Parameters
+    ----------
+    contradictions
+        (3,) their number, the sum of their matches and their least cost, updated in place
     """
     for n in range(len(cost)):
         for m in range(len(best)):
@@ -314,15 +331,22 @@ def saa(
 ) -> StarMatch | None:
     """SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2): two bright stars, all pairs like them, all other stars.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    index         : pairs in buckets, or a k-vector index
-    tolerance_rad : of a direction, 3 epsilon_position
-    options       : those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
-        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
     Steps 2 to 8 of 2.4.2, except that the search does not stop at the first assumption that passes: with the
     assumptions of ten more pairs, the best must be significant (1e-5), and 1e5 times as likely as the next one that
     identifies a star differently. Otherwise returns None. A lattice of LEDs that is not in the catalog is sometimes
     identified as one that is.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    index
+        Pairs in buckets, or a k-vector index
+    tolerance_rad
+        Of a direction, 3 epsilon_position
+    options
+        Those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
+        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
     """
     settings = Options(**options)
     settings.require_known_focal("saa")
@@ -435,9 +459,9 @@ def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: 
     budget = min(settings.max_checks // len(stars.vectors_cam), MAX_ASSUMPTIONS)
     max_rad = index.max_rad if isinstance(index, PairCatalog) else index.max_angle_rad
     find_pairs = candidates if isinstance(index, PairCatalog) else pair_range
-    for a, b, angle in _primary_pairs(stars, settings.base_stars, max_rad):
-        gate = gate_rad(stars.gates, angle)
-        begin, end = find_pairs(index, angle - gate, angle + gate)
+    for a, b, angle_rad in _primary_pairs(stars, settings.base_stars, max_rad):
+        gate = gate_rad(stars.gates, angle_rad)
+        begin, end = find_pairs(index, angle_rad - gate, angle_rad + gate)
         if remaining == 0 or pool.count + end - begin > budget:
             break
         remaining -= 1
@@ -491,5 +515,3 @@ def _chance_statistics(
     cap_sr = 2 * np.pi * (1 - np.cos(primary.reach_rad))
     p = float(np.mean(1 - np.exp(-similar * primary.area_sr / cap_sr)))
     return p, max(int(field.sum()) - int((star >= 0).sum()), 0)
-
-

@@ -7,11 +7,12 @@ wide gate for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 0.0
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from estimator.catalog.pair_index import (PairIndex, first_neighbor, pair_range)
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+
+from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -25,8 +26,6 @@ from estimator.identification.direct_match import (
 )
 from estimator.identification.solver_options import Options
 
-
-
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
 # Least angle between base stars, and from them, in tolerances: smaller angles carry little information.
 MIN_SIDE_TOLERANCES = 6.0
@@ -35,7 +34,11 @@ MIN_SIDE_TOLERANCES = 6.0
 class ShefexOptions(NamedTuple):
     """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
-    accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
+    Attributes
+    ----------
+    accept
+        log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a
+        fourth star
     """
 
     cos_error: float
@@ -67,12 +70,19 @@ def shefex(
 ) -> StarMatch | None:
     """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
-    tolerance_rad : of a direction;  options : those of `Options`; magnitudes are not used
     All triangles are tried in the order of brightness: the base triangle's stars are found with the k-vector, a fourth
     star and then every other star by its three angles to them. Three tests are added to the paper's: the handedness of
     the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
     match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first; the paper has 15 at most
+    tolerance_rad
+        Of a direction
+    options
+        Those of `Options`; magnitudes are not used
     """
     settings = Options(**options)
     settings.require_known_focal("shefex")
@@ -288,5 +298,3 @@ def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floa
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)
     return least
-
-

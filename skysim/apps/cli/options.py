@@ -7,8 +7,9 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
-from skysim.core.errors import InputError
+
 from skysim.core.errors import OVERRIDES, InputError, Where
 from skysim.scene.camera_sheet import QUESTIONS
 
@@ -93,8 +94,11 @@ def load(
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.
 
-    trackers : names of all trackers that will solve its frames, the scene's own first; an override must have an effect
-        for one of them
+    Parameters
+    ----------
+    trackers
+        Names of all trackers that will solve its frames, the scene's own first; an override
+        must have an effect for one of them
     """
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import unused
@@ -182,8 +186,6 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
         raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
-
-
 # What errors name by key, as a user of the command line typed it: options, and `--set`.
 
 
@@ -230,7 +232,10 @@ OPTIONS = {  # by the key of a function's parameter
 def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
     """The error with the option at fault in place of its key, and the place of a key that was checked after loading.
 
-    loaded : name and overrides of the scene, by default those of the last one
+    Parameters
+    ----------
+    loaded
+        Name and overrides of the scene, by default those of the last one
     """
     error = with_place(error, loaded or (LOADED[-1] if LOADED else None))
     if error.where == OVERRIDES:
@@ -262,5 +267,3 @@ def with_location(finding: str, loaded: Loaded | None = None) -> str:
     """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
     key, _, text = finding.partition(": ")
     return str(as_typed(InputError(key, text), loaded)) if text else finding
-
-

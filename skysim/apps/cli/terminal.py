@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
 from skysim.core.errors import printable
-from skysim.results.report import (print_blocks, print_table, print_wrapped)
-from skysim.results.report_blocks import (Cell, Column, Facts, Items, Table, Text)
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
-from skysim.results.report import print_wrapped
-from collections.abc import Callable
-from typing import Any
-from skysim.results.report import (print_table, print_wrapped)
-from skysim.results.report_blocks import (Column, Table)
+from skysim.results.report import print_blocks, print_table, print_wrapped
+from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -29,9 +23,9 @@ if TYPE_CHECKING:
     from skysim.simulation.checks.facts import Fact
     from skysim.simulation.lab import Lab
 if TYPE_CHECKING:
-    from skysim.experiments.study.worst import WorstTrial
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
+    from skysim.experiments.study.worst import WorstTrial
 
 
 T = TypeVar("T")
@@ -251,15 +245,15 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:
-        files.write_image(image_path, scene_picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
+        files.write_image(
+            image_path, scene_picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1]
+        )
         shown = progress(scene_picture.film(mjcf, states), len(states), "rendering the animation")
         scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
     except scene_picture.NoPicture as error:
         print_error(str(error))
         return []
     return [image_path, animation_path]
-
-
 
 
 # Terminal output of `skysim study` but for its report: progress and provenance, worst and replayed
@@ -311,7 +305,12 @@ def print_worst(
 ) -> None:
     """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
 
-    levels : of each trial's point;  instead : the command to give if no trial counts for the response
+    Parameters
+    ----------
+    levels
+        Of each trial's point
+    instead
+        The command to give if no trial counts for the response
     """
     if not found:
         print(f"no trial counts for {response}; rank them by an error: {instead}")
@@ -337,8 +336,6 @@ def print_replay(replay: dict[str, Any]) -> None:
         print(replay["error"])
     for path in replay["pictures"][:10]:
         print(path)
-
-
 
 
 # Terminal output of `skysim survey --plan` and `--repeat`: the attitudes to hold, predicted and
@@ -397,5 +394,3 @@ PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {
     "plan": print_plan,
     "repeat": print_comparison,
 }
-
-

@@ -5,18 +5,18 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import gc
-import time
-from skysim.apps.gui.views.overlay import FRAMES
 import hmac
 import re
 import secrets
 import signal
+import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from posixpath import normpath
 from typing import Any
 from urllib.parse import quote
+
 import nicegui
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
@@ -30,17 +30,14 @@ from starlette.responses import (
     StreamingResponse,
 )
 from starlette.routing import Route, Router
-from skysim.apps.gui.page.tab import Tab
+
 from skysim.apps.gui.page.photo_panel import LIMIT_BYTES
-from skysim.apps.gui.views.overlay import (FRAMES, display_of)
+from skysim.apps.gui.page.tab import Tab
+from skysim.apps.gui.views.overlay import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
-
-
-
-
 
 # Garbage collection of the server, while no page gets a frame.
 
@@ -206,10 +203,16 @@ def is_plain_file(scope: Any) -> bool:
 class Guard:
     """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
 
-    hosts : allowed Host headers ("*": any). This stops DNS rebinding: another site's name that resolves to this
-        server comes with its own Host header.
-    token : required; `/?token=...` stores it in a cookie
-    port : of the server. Browsers send a host's cookies to all its ports, so the cookie's name has the port
+    Attributes
+    ----------
+    hosts
+        Allowed Host headers ("*": any). This stops DNS rebinding: another site's name that
+        resolves to this server comes with its own Host header.
+    token
+        Required; `/?token=...` stores it in a cookie
+    port
+        Of the server. Browsers send a host's cookies to all its ports, so the cookie's name has
+        the port
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
@@ -381,10 +384,15 @@ def serve(
 ) -> None:
     """Serve until Ctrl-C.
 
-    token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
-        empty
-    cameras : live cameras that the page may watch, see `skysim.core.images`
-    workers : greatest number of worker processes; further pages wait for one
+    Parameters
+    ----------
+    token
+        Required of browsers, also of this machine, where other users and other sites' pages
+        are; a random one if empty
+    cameras
+        Live cameras that the page may watch, see `skysim.core.images`
+    workers
+        Greatest number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)
@@ -409,5 +417,3 @@ def serve(
         if host in LOOPBACK
         else partial(GZipMiddleware, compresslevel=1),
     )
-
-

@@ -21,7 +21,7 @@ from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import (FIELD_SEARCH, Solver, best_attitude, solve_centroids)
+from skysim.apps.plate_solver.solver import FIELD_SEARCH, Solver, best_attitude, solve_centroids
 
 # expected in a field: hardly solvable below, safe above
 MIN_CATALOG_STARS = 6.0
@@ -52,7 +52,10 @@ EFFORTS = 3  # searches of the mirrored picture: its diagnosis should not take a
 class Refusal:
     """A monochrome image that was refused: its centroids, and the solvers that were tried.
 
-    row_order_known : False if both row orders were tried, and with them the mirrored sky
+    Attributes
+    ----------
+    row_order_known
+        False if both row orders were tried, and with them the mirrored sky
     """
 
     image: NDArray

@@ -9,21 +9,29 @@ from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
-from skysim.apps.plate_solver.solver import (PlateSolution, annotated_image, solution_fields)
-from skysim.apps.plate_solver.solver import (FOV_LIMITS_DEG, Solver, kept_solver, make_solver, solve_array, validated_date)
+from skysim.apps.plate_solver.solver import (
+    FOV_LIMITS_DEG,
+    PlateSolution,
+    Solver,
+    annotated_image,
+    kept_solver,
+    make_solver,
+    solution_fields,
+    solve_array,
+    validated_date,
+)
+from skysim.core import files, images
 from skysim.core.errors import InputError, printable
-from skysim.core import files
-from skysim.core import images
-
-
 
 ANNOTATED = ".annotated.png"
 # The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's
@@ -61,13 +69,22 @@ def solve(
 ) -> PlateSolution:
     """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
-    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 2 to
-        100 degrees
-    camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
-    time_utc : when the image was taken; the FITS header's date if left out
-    catalog  : name or file of a deeper star catalog, for fields of a few degrees
+    Parameters
+    ----------
+    fov_deg
+        Horizontal field of view to 5 %; if neither it nor `camera` is given, the field that
+        EXIF tells, and 2 to 100 degrees
+    camera
+        A scene, a camera file or an OpenCV calibration in place of fov_deg
+    time_utc
+        When the image was taken; the FITS header's date if left out
+    catalog
+        Name or file of a deeper star catalog, for fields of a few degrees
 
-    Raises InputError with one line for an image that cannot be read.
+    Raises
+    ------
+    InputError
+        With one line for an image that cannot be read.
     """
     if camera or catalog:
         solver = make_solver(
@@ -85,7 +102,10 @@ def solve(
 def pictures_in(paths: Iterable[Path]) -> list[Path]:
     """The files, with every folder replaced by its image files, sorted; without annotated images of an earlier call.
 
-    Raises InputError for a folder without an image.
+    Raises
+    ------
+    InputError
+        For a folder without an image.
     """
     found: list[Path] = []
     for path in paths:
@@ -177,7 +197,10 @@ def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
 def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
-    Raises InputError if the image cannot come from this camera.
+    Raises
+    ------
+    InputError
+        If the image cannot come from this camera.
     """
     camera = solver.camera
     if camera and image.ndim != 2:
@@ -215,7 +238,9 @@ def solve_picture(
     return solve_again(outcomes, date_utc) or outcomes[0]
 
 
-def solve_again(refused: list[SolvedReading], date_utc: datetime.datetime | None) -> SolvedReading | None:
+def solve_again(
+    refused: list[SolvedReading], date_utc: datetime.datetime | None
+) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     if refused[0].hypothesis.solver.camera:
         return None  # a frame of a camera that is known, with its own saturation
@@ -283,5 +308,3 @@ def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
     return seen | {"hint": diagnosis.likely_cause(refusal)}
-
-

@@ -11,24 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from math import hypot
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
 from estimator.attitude.rate import covariance_of
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
-from estimator.detection.classify import NO_STAR
-from estimator.detection.detect import DETECTORS
-from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
-from math import hypot
-from typing import NamedTuple
 from estimator.detection.background import estimate_background
+from estimator.detection.classify import NO_STAR
 from estimator.detection.detect import DETECTORS, to_native
-
-
-
-
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 
 # Centroids of a picture whose stars are large: out of focus, or blurred by motion.
 
@@ -182,5 +179,3 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
         return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))
     except ImageError:
         return Centroids.empty()
-
-

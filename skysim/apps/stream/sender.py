@@ -7,15 +7,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
+
 import numpy as np
-from skysim.apps.stream.sinks import (Packet, build_packet)
-from skysim.apps.stream.sinks import Sink
+
+from skysim.apps.stream.sinks import Packet, Sink, build_packet
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window
-
-
-
-
 
 # Real-time pacing: when a frame is due on the wall clock, and which frames are too late to render.
 
@@ -68,8 +65,13 @@ DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 class SenderStats:
     """Counters of the sender.
 
-    rendered, dropped : numbers of frames
-    late_ms : delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW frames
+    Attributes
+    ----------
+    rendered, dropped
+        Numbers of frames
+    late_ms
+        Delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW
+        frames
     """
 
     rendered: int = 0
@@ -109,7 +111,11 @@ def send(
     """Fly and send each frame of the main camera when it is due, until the last one or until all sinks have failed.
 
     Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
-    publish : also called with each packet
+
+    Parameters
+    ----------
+    publish
+        Also called with each packet
     """
     scene = flight.lab.scene
     may_drop = scene.filter is None
@@ -134,5 +140,3 @@ def send(
         if sinks and not publish and all(sink.fault for sink in sinks):
             return
     stats.dropped = scene.exposure.frames - stats.rendered  # and those after the last rendered
-
-

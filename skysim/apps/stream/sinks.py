@@ -3,30 +3,25 @@ simulation: packets that do not fit into the queue are dropped and counted."""
 
 from __future__ import annotations
 
-import json
-import re
-from typing import Any, BinaryIO, NamedTuple
-import numpy as np
-from numpy.typing import NDArray
-from skysim.core import quaternion
-from skysim.core.errors import InputError
-from skysim.simulation.flight import Shot
 import contextlib
 import functools
+import json
 import queue
+import re
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
+
 import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core import files, quaternion
 from skysim.core.errors import InputError, printable
-from skysim.core import files
-
-
-
-
+from skysim.simulation.flight import Shot
 
 # Wire format of a frame: a header as one line of JSON, then the raw pixels.
 
@@ -39,12 +34,18 @@ MAX_PIXELS = 1 << 28
 class Packet(NamedTuple):
     """A frame to send.
 
-    header : what a tracker may use. index, t_s (mid-exposure since the scene's start), exposure_s, width, height,
-             dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and made_unix_s (wall-clock times at
-             which the exposure ended and the frame was ready), dropped (frames dropped before this one)
-    pixels : (H, W)
-    truth  : cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px, y_px of the lights
-             on the detector
+    Attributes
+    ----------
+    header
+        What a tracker may use. index, t_s (mid-exposure since the scene's start), exposure_s,
+        width, height, dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and
+        made_unix_s (wall-clock times at which the exposure ended and the frame was ready),
+        dropped (frames dropped before this one)
+    pixels
+        (H, W)
+    truth
+        cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px,
+        y_px of the lights on the detector
     """
 
     header: dict[str, Any]
@@ -126,7 +127,12 @@ READER_GONE = "the reader has closed the pipe"
 class Sink:
     """A thread that passes packets to `write`, the oldest first.
 
-    sent, dropped : packets so far;  fault : the error that stopped it, or ""
+    Attributes
+    ----------
+    sent, dropped
+        Packets so far
+    fault
+        The error that stopped it, or ""
     """
 
     def __init__(self, name: str, write: Callable[[Packet], None]) -> None:
@@ -235,5 +241,3 @@ def pipe_writer(path: str) -> Callable[[Packet], None]:
         stream().flush()
 
     return write
-
-

@@ -6,26 +6,31 @@ interpolated between them (`fill`), which also initializes the frame.
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.special import erfc
-from skysim.core.types import Floats
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
+
 import numba
+import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import erfc
+
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
+from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import (FaintStarsGlowConfig, Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig)
+from skysim.scene.sections.light import (
+    FaintStarsGlowConfig,
+    Glow,
+    MoonGlowConfig,
+    SkyGlowConfig,
+    StrayLightConfig,
+    UniformGlowConfig,
+)
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-
-
-
-
 
 # The light of the stars that are too faint to be drawn one by one.
 
@@ -80,10 +85,16 @@ MIN_PST = 1e-30  # replaces a transmittance of 0 in the logarithm; gives no elec
 class ViewingGeometry:
     """Viewing directions of M nodes of the chip.
 
-    toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
-    boresight_lab  : (3,) unit vector
-    field_rad      : (M,) angle from the boresight
-    pixel_sr       : (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
+    Attributes
+    ----------
+    toward_cam, toward_lab
+        (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
+    boresight_lab
+        (3,) unit vector
+    field_rad
+        (M,) angle from the boresight
+    pixel_sr
+        (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
     """
 
     toward_cam: Floats
@@ -334,8 +345,12 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
 def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
     """Set an (H, W) frame, whatever it held, to coarse * factor, bilinear between the nodes (in place).
 
-    coarse : (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a single node
-             holds for all of the frame. image is float32 or float64; factor is the exposure in s for electrons.
+    Parameters
+    ----------
+    coarse
+        (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a
+        single node holds for all of the frame. image is float32 or float64; factor is the
+        exposure in s for electrons.
     """
     if coarse.max() == coarse.min():
         _fill_flat(image, float(coarse[0, 0]) * factor)
@@ -379,5 +394,3 @@ def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
             rise = image.dtype.type(right - left)
             for x in range(begin[i], begin[i + 1]):
                 row[x] = start + rise * offset[x]
-
-

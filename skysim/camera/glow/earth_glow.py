@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
+
 import numpy as np
 from scipy.spatial.transform import Rotation
-from skysim.camera.glow.background import (pixel_directions, viewing_geometry)
+
+from skysim.camera.glow.background import (
+    angular_separation_deg,
+    pixel_directions,
+    transmittance,
+    viewing_geometry,
+)
 from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import EarthConfig
-from skysim.sources.camera_orbit import TO_SPHERE
-from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from collections.abc import Sequence
-from skysim.camera.glow.background import (angular_separation_deg, transmittance)
-from skysim.core.constants import EARTH_RADIUS_M
 from skysim.scene.sections.camera import BaffleConfig
-from skysim.sources.dome.surface import perpendicular
-from skysim.sources.photometry import Band
+from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
-
-
+from skysim.sources.camera_orbit import TO_SPHERE
+from skysim.sources.dome.surface import perpendicular
+from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
 AIR_M = 8e3  # scale height of the air
@@ -104,8 +106,6 @@ def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
     return *pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics), (h, w)
 
 
-
-
 # Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side.
 
 
@@ -127,7 +127,10 @@ def stray_of_bodies_e_s_m2(
 ) -> dict[str, float]:
     """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
 
-    boresight : (3,)
+    Parameters
+    ----------
+    boresight
+        (3,)
     """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
@@ -188,5 +191,3 @@ def axes_about(z: Floats) -> Floats:
     """(3, 3) rows: two unit vectors across the unit vector z, and z."""
     x = perpendicular(z[None])[0]
     return np.stack([x, np.cross(z, x), z])
-
-

@@ -14,27 +14,22 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from skysim.camera.optics import Optics, ScaledOptics
-from skysim.core.types import SourceTruth
-from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig
-from skysim.sources.satellites import GHOST
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, special
-from skysim.core.types import Floats, SourceTruth
-from skysim.scene.sections.camera import GlareConfig
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
-from skysim.camera.glow.background import (node_directions, unproject, viewing_geometry)
-from skysim.camera.optics import Optics
-from skysim.core.types import Floats, Sources
-from skysim.sources.dome.interreflection import ReflectingDome
-from skysim.sources.dome.interreflection import DiffuseLight
+
+from skysim.camera.glow.background import node_directions, unproject, viewing_geometry
+from skysim.camera.optics import Optics, ScaledOptics
+from skysim.core.types import Floats, Sources, SourceTruth
+from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
+from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.dome.mirror import mirrored
 from skysim.sources.photometry import Band
-
-
+from skysim.sources.satellites import GHOST
 
 BLUR_PX = 0.7  # of a ghost's edge
 
@@ -58,8 +53,6 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
     """The truth of the lights of a pair of surfaces, as that of its ghosts; pairs are numbered from 1."""
     return replace(lights, id=lights.id + number * GHOST)
-
-
 
 
 # Veiling glare: light that rough or dirty surfaces of a lens scatter over the chip, by its glare-
@@ -109,8 +102,6 @@ def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:
     )
 
 
-
-
 # What a camera sees of the light that a dome reflects: the glow of wall and floor, and images of
 # LEDs in the wall.
 
@@ -128,9 +119,13 @@ def wall_glow(
 ) -> Floats:
     """(h, w) electrons s^-1 px^-1 at the nodes of `background.glow_map`: the radiance rho E / pi times the etendue.
 
-    camera_m : (3,) the entrance pupil in the lab; outside of the wall it sees nothing
     Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes, and beyond wall and floor
     it is dark. The light of the wall is interpolated between fewer points (`IRRADIANCE`), as it varies slowly.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil in the lab; outside of the wall it sees nothing
     """
     toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
@@ -192,5 +187,3 @@ def chip_grid(optics: Optics, shape: tuple[int, int], margin: float) -> Floats:
     )
     x, y = np.meshgrid(columns, rows)
     return unproject(np.column_stack([x.ravel(), y.ravel()]), optics).reshape(*shape, 3)
-
-

@@ -14,20 +14,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 from scipy import fft, special
+
+from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, Psf
-from typing import NamedTuple
-from numpy.typing import NDArray
-from skysim.camera.optics import Optics
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular
-
-
 
 QUANTUM_PX = 0.01  # sizes are rounded to this, so that LEDs of nearly one size share a kernel
 CUT_SIGMA = 5.0  # a Gaussian's image ends here: 4e-6 of its light is beyond
@@ -88,14 +88,20 @@ def build_kernel(
 ) -> Kernel:
     """The kernel of a uniform disk (a star has radius 0) seen through this lens with this defocus.
 
-    extra_sigma_px    : Gaussian blur added to the lens's own, see `otf.field_sigma_px`
-    emitter_radius_px : of the emitting disk's geometric image
-    blur_radius_px    : of the defocus disk
     All three are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round image gets
     up to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on the
     edge of a disk as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
     power-law wings beyond their reach is added to the image by normalization, so that its total is 1. Raises
     InputError for an unreadable file of a measured PSF.
+
+    Parameters
+    ----------
+    extra_sigma_px
+        Gaussian blur added to the lens's own, see `otf.field_sigma_px`
+    emitter_radius_px
+        Of the emitting disk's geometric image
+    blur_radius_px
+        Of the defocus disk
     """
     steps = tuple(
         round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
@@ -175,9 +181,14 @@ def softening_sigma_px(bandwidth: float, highest: float) -> float:
 class FourierBesselSeries:
     """Fourier-Bessel series of the HARMONICS on a circle of radius B.
 
-    f      : (3, K) frequencies j / (2 pi B), j the zeros of J_n
-    weight : (3, K) P_n(f) / (pi B^2 J_{n+1}(j)^2), P_n the square pixel's own n-th harmonic
-    matrix : (3, rows, K) J_n(j r / B) at r = 0, 1 / per_px, ..., up to reach_px
+    Attributes
+    ----------
+    f
+        (3, K) frequencies j / (2 pi B), j the zeros of J_n
+    weight
+        (3, K) P_n(f) / (pi B^2 J_{n+1}(j)^2), P_n the square pixel's own n-th harmonic
+    matrix
+        (3, rows, K) J_n(j r / B) at r = 0, 1 / per_px, ..., up to reach_px
     """
 
     f: Floats
@@ -327,8 +338,6 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     )
 
 
-
-
 # Geometric images of the emitting disks of LEDs: ellipses in perspective, whose light varies across
 # them.
 
@@ -339,9 +348,14 @@ class DiskImages(NamedTuple):
     The point r e of a disk, |e| <= 1, is imaged at center + A e from the image of the disk's center, and the density
     of the light there is 1 + q e over its mean. Its center of gravity is center + A q / 4.
 
-    matrix   : (N, 2, 2) A in pixels; the image's semi-axes are its singular values
-    center   : (N, 2) pixels
-    gradient : (N, 2) A q in pixels
+    Attributes
+    ----------
+    matrix
+        (N, 2, 2) A in pixels; the image's semi-axes are its singular values
+    center
+        (N, 2) pixels
+    gradient
+        (N, 2) A q in pixels
     """
 
     matrix: Floats
@@ -379,9 +393,14 @@ def disk_images(
     density goes as q = g + 3 k. For a Lambertian disk that is the law cos^4 of the field angle. Distortion is in A and
     in Q. Infinite or NaN where a point of the rim has no image.
 
-    offset_cam : (N, 3) from the pupil to the disks' centers
-    normal_cam : (N, 3)
-    radius_m   : (N,)
+    Parameters
+    ----------
+    offset_cam
+        (N, 3) from the pupil to the disks' centers
+    normal_cam
+        (N, 3)
+    radius_m
+        (N,)
     """
     across = radius_m[:, None] * perpendicular(normal_cam)
     rim = np.stack([across, np.cross(normal_cam, across)])  # (2, N, 3)
@@ -398,5 +417,3 @@ def disk_images(
     trace = image[1:].sum(axis=0) - 4 * image[0]
     gradient, tilt = (np.einsum("nij,jn->ni", matrix, part) for part in (slope + 3 * depth, depth))
     return DiskImages(matrix, trace / 8 - 0.75 * tilt, gradient)
-
-

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
+
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from collections.abc import Sequence
-from typing import Any
-import mujoco
-from numpy.typing import NDArray
-
-
 
 RANK_TOLERANCE = (
     1e-6  # directions with a smaller fraction of the largest singular value get no torque
@@ -59,12 +57,20 @@ def nothing(*_: Any) -> None:
 class ActuatorKind:
     """A kind of actuator.
 
-    key     : of its section in the scene's `vehicle`, which switches it on
-    joints, sites : beginnings of the names of its joints and sites in the vehicle's file
-    add     : adds its motors to a spec; (spec, the compiled spec, config)
-    control : makes the set that the flight computer commands; (compiled model, config)
-    start   : sets the joints' angles and speeds in the data of a model; (model, data, config)
-    check   : raises InputError for joints that do not fit together; (spec, path of the file)
+    Attributes
+    ----------
+    key
+        Of its section in the scene's `vehicle`, which switches it on
+    joints, sites
+        Beginnings of the names of its joints and sites in the vehicle's file
+    add
+        Adds its motors to a spec; (spec, the compiled spec, config)
+    control
+        Makes the set that the flight computer commands; (compiled model, config)
+    start
+        Sets the joints' angles and speeds in the data of a model; (model, data, config)
+    check
+        Raises InputError for joints that do not fit together; (spec, path of the file)
     """
 
     key: str
@@ -102,8 +108,6 @@ def positive_values(value: Floats, n: int, name: str) -> Floats:
     return values
 
 
-
-
 # Joints, sites and motors of actuators in the MuJoCo model.
 
 
@@ -114,11 +118,18 @@ UNIT_GEAR = (1, 0, 0, 0, 0, 0)
 class Hinges:
     """Hinge joints of one kind, in the order of their names.
 
-    names        : (n)
-    axes         : (3, n) unit axes in body axes, with all joints at zero
-    inertia_kg_m2: (n,) about each axis, of all that rotates with it
-    qpos, dof    : (n,) indices of angle and speed in qpos and qvel
-    motor        : (n,) actuator numbers, -1 without one
+    Attributes
+    ----------
+    names
+        (n)
+    axes
+        (3, n) unit axes in body axes, with all joints at zero
+    inertia_kg_m2
+        (n,) about each axis, of all that rotates with it
+    qpos, dof
+        (n,) indices of angle and speed in qpos and qvel
+    motor
+        (n,) actuator numbers, -1 without one
     """
 
     names: tuple[str, ...]
@@ -196,5 +207,3 @@ def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
     if values and len(values) != count:
         raise InputError(key, f"{len(values)} values", f"{count}, one for each, or none")
     return np.array(values or (0.0,) * count)
-
-

@@ -9,19 +9,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.dynamics.multibody.actuator_kind import (
+    ActuatorKind,
+    Actuators,
+    ControlInput,
+    add_motor,
+    joints,
+    sites,
+)
 from skysim.dynamics.multibody.cmgs import CMGS
-from skysim.dynamics.multibody.actuator_kind import (add_motor, joints, sites)
 from skysim.dynamics.multibody.fans import FANS
-from skysim.dynamics.multibody.actuator_kind import (ActuatorKind, Actuators, ControlInput)
 from skysim.dynamics.multibody.wheels import WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
-
-
 
 KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS)
 
@@ -152,5 +158,3 @@ def check_bare(joint: Any, path: Path) -> None:
             raise InputError(
                 path, f"joint {joint.name}: {name} is set by the scene; remove it from the file"
             )
-
-

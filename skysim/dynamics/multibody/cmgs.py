@@ -7,17 +7,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
 import mujoco
 import numpy as np
+
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import (Hinges, add_motor, joints, member_values)
-from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    ControlInput,
+    Hinges,
+    add_motor,
+    joints,
+    member_values,
+    positive_values,
+    scale_to_limit,
+    unit_columns,
+)
 from skysim.scene.sections.vehicle import CmgsConfig
-
-
 
 GIMBAL = "gimbal_"
 ROTOR = "rotor_"
@@ -125,14 +135,20 @@ def vscmg_commands(
 class CmgSet:
     """Control moment gyroscopes: rotating a spinning rotor's axle gives the torque d(angle)/dt x h.
 
-    gimbal_axes, spin_axes : (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
-    rotor_inertia_kg_m2    : (n,) of each rotor about its axle
-    rotor_torque_limit_nm  : None leaves the rotors to spin; a torque makes them variable-speed CMGs
-    steering               : a key of STEERING, which variable-speed CMGs do not use
-
     A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
     accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
     vectors or not at right angles, and for an unknown steering law.
+
+    Attributes
+    ----------
+    gimbal_axes, spin_axes
+        (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
+    rotor_inertia_kg_m2
+        (n,) of each rotor about its axle
+    rotor_torque_limit_nm
+        None leaves the rotors to spin; a torque makes them variable-speed CMGs
+    steering
+        A key of STEERING, which variable-speed CMGs do not use
     """
 
     gimbal_axes: Floats
@@ -300,5 +316,3 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
 CMGS = ActuatorKind(
     "cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs
 )
-
-

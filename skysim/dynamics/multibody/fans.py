@@ -5,17 +5,26 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import (add_motor, all_names, sites)
-from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, Actuators, ControlInput, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    Actuators,
+    ControlInput,
+    add_motor,
+    all_names,
+    scale_to_limit,
+    sites,
+    unit_columns,
+)
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
-
-
 
 FAN = "fan_"
 
@@ -48,9 +57,17 @@ class Fans:
 class FanSet:
     """Fans: thrust with a lever arm about the bearing's center rotates the vehicle, T = sum position x axis thrust.
 
-    force_axes : (3, n) unit vectors along which a positive thrust pushes the body
-    positions_m: (3, n) from the center of rotation
-    Raises InputError (one line) for axes that are not unit vectors and positions of another shape.
+    Attributes
+    ----------
+    force_axes
+        (3, n) unit vectors along which a positive thrust pushes the body
+    positions_m
+        (3, n) from the center of rotation
+
+    Raises
+    ------
+    InputError
+        (one line) for axes that are not unit vectors and positions of another shape.
     """
 
     force_axes: Floats
@@ -157,5 +174,3 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
 
 
 FANS = ActuatorKind("fans", add_fans, FanActuator, sites=(FAN,))
-
-

@@ -5,22 +5,19 @@ from __future__ import annotations
 import math
 import os.path
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import NamedTuple
-from xml.etree import ElementTree
-from skysim.core.errors import InputError
-from skysim.core.yaml_reader import (excerpt, is_file)
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
 import mujoco
-from skysim.core.guarded import run_guarded
+
+from skysim.core.errors import InputError
 from skysim.core.files import SCENES
-
-
-
-
+from skysim.core.guarded import run_guarded
+from skysim.core.yaml_reader import excerpt, is_file
 
 # Check that an untrusted MJCF file and all it includes name only files within its own folder, and
 # only finite numbers.
@@ -48,7 +45,12 @@ class FileReference(NamedTuple):
 class References:
     """References found so far. A setting in one file affects the paths of another, so all files are collected together.
 
-    bases : folders that a relative name may start from;  folders : values of meshdir and the like
+    Attributes
+    ----------
+    bases
+        Folders that a relative name may start from
+    folders
+        Values of meshdir and the like
     """
 
     folder: Path
@@ -219,7 +221,10 @@ def load(path: Path) -> Any:
 def trial_fault(path: Path, modified_ns: int) -> str:
     """Why MuJoCo does not survive the file, in one line; "" if it does. A shipped file needs no trial.
 
-    modified_ns : so that a changed file is tried again
+    Parameters
+    ----------
+    modified_ns
+        So that a changed file is tried again
     """
     data = path.read_bytes()
     if any(data == shipped.read_bytes() for shipped in (SCENES / "vehicles").glob("*.xml")):
@@ -248,5 +253,3 @@ def mujoco_warnings() -> Iterator[list[str]]:
 
 def one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-

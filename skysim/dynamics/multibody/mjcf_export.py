@@ -11,28 +11,25 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount, Sources
 from skysim.dynamics.multibody.integrator import Simulation
-from skysim.dynamics.multibody.mjcf import (compile_spec, mujoco_warnings)
+from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome import surface
-from skysim.sources.dome.surface import (Ellipsoid, Plane, Surface)
-from typing import NamedTuple
-from skysim.core.types import Floats
-from skysim.dynamics.multibody.mjcf import mujoco_warnings
-
-
+from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
 
 GROUP_LIGHTS = 1
 GROUP_FIELD = 2
@@ -60,10 +57,16 @@ FIELD_RGB = np.array([0.25, 0.75, 1.0])
 def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
     """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
-    sources       : LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
-    lab_from_body : attitude in the keyframe `start`, which also has the speeds and gimbal angles of the scene
     The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
     has a camera named `lab`.
+
+    Parameters
+    ----------
+    sources
+        LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
+    lab_from_body
+        Attitude in the keyframe `start`, which also has the speeds and gimbal angles of the
+        scene
     """
     spec = vehicle.spec.copy()
     mount = camera_mount(vehicle)
@@ -247,8 +250,11 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 def visible_shell_m(inside: Surface, around: Floats) -> Floats:
     """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
 
-    around : (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree, between 0 and
-             80 deg from the zenith and above a third of the surface's height
+    Parameters
+    ----------
+    around
+        (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree,
+        between 0 and 80 deg from the zenith and above a third of the surface's height
     """
     up = np.array([0.0, 0.0, 1.0])
 
@@ -270,7 +276,11 @@ def add_sheet(
 ) -> None:
     """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
 
-    rings_m : (K, n, 3) each counterclockwise seen from above, every one beneath or around the previous one
+    Parameters
+    ----------
+    rings_m
+        (K, n, 3) each counterclockwise seen from above, every one beneath or around the
+        previous one
     """
     index = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
     a = index[:-1].ravel()
@@ -474,8 +484,6 @@ def shorten_colors(text: str) -> str:
     )
 
 
-
-
 # The geometry of an MJCF file as plain shapes, for other drawing programs than MuJoCo's.
 
 
@@ -494,10 +502,18 @@ LIGHTS = ("stage_leds", "stage_stars")  # begin of the names of the lights' geom
 class Shape(NamedTuple):
     """A shape in the lab, or on the vehicle in body axes with every joint at zero.
 
-    name       : of the geom; empty if it has none
-    kind       : of KINDS;  size_m : as MuJoCo has it: half edges, radius and half length along z, semi-axes
-    on_vehicle : whether it turns with the vehicle
-    vertices_m, faces : (N, 3) and (M, 3) of a mesh, in the shape's axes; empty of other kinds
+    Attributes
+    ----------
+    name
+        Of the geom; empty if it has none
+    kind
+        Of KINDS
+    size_m
+        As MuJoCo has it: half edges, radius and half length along z, semi-axes
+    on_vehicle
+        Whether it turns with the vehicle
+    vertices_m, faces
+        (N, 3) and (M, 3) of a mesh, in the shape's axes; empty of other kinds
     """
 
     name: str
@@ -571,5 +587,3 @@ def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
     vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
     faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
     return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()
-
-

@@ -12,16 +12,16 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
+
 import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.mjcf import (mujoco_warnings, one_line)
-
-
+from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
 Picture = NDArray[np.uint8]
 
@@ -46,8 +46,12 @@ class NoPicture(RuntimeError):
 def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> Picture:
     """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
 
-    mjcf    : from `mjcf_export.mjcf`
-    size_px : width and height, at most `mjcf_export.MAX_PX`
+    Parameters
+    ----------
+    mjcf
+        From `mjcf_export.mjcf`
+    size_px
+        Width and height, at most `mjcf_export.MAX_PX`
     """
     return next(film(mjcf, np.atleast_2d(qpos), size_px))
 
@@ -85,7 +89,10 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
     """Write RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for other types;
     OSError.
 
-    fps : pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
+    Parameters
+    ----------
+    fps
+        Pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
     """
     if path.suffix not in ANIMATED:
         raise InputError(path, *unknown_name("animation format", path.suffix, ANIMATED))
@@ -131,5 +138,3 @@ if __name__ == "__main__":
         render_task()
     except Exception as error:
         sys.exit(f"{type(error).__name__}: {one_line(error)}")
-
-

@@ -12,15 +12,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
+
 import mujoco
 import numpy as np
+
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import (Hinges, add_motor, joints, member_values)
-from skysim.dynamics.multibody.actuator_kind import (RANK_TOLERANCE, ActuatorKind, ControlInput, positive_values, scale_to_limit, unit_columns)
+from skysim.dynamics.multibody.actuator_kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    ControlInput,
+    Hinges,
+    add_motor,
+    joints,
+    member_values,
+    positive_values,
+    scale_to_limit,
+    unit_columns,
+)
 from skysim.scene.sections.vehicle import WheelsConfig
-
-
 
 WHEEL = "wheel_"
 
@@ -29,10 +39,19 @@ WHEEL = "wheel_"
 class WheelSet:
     """Reaction wheels: a motor's torque on its wheel acts oppositely on the body, T = -sum axis u.
 
-    axes : (3, n) unit vectors; a positive speed is right-handed about them
-    inertia_kg_m2 : (n,) of each wheel about its axle
-    speed_limit_rad_s : relative to the body
-    Raises InputError (one line) for axes that are not unit vectors and inertias that are not positive.
+    Attributes
+    ----------
+    axes
+        (3, n) unit vectors; a positive speed is right-handed about them
+    inertia_kg_m2
+        (n,) of each wheel about its axle
+    speed_limit_rad_s
+        Relative to the body
+
+    Raises
+    ------
+    InputError
+        (one line) for axes that are not unit vectors and inertias that are not positive.
     """
 
     axes: Floats
@@ -110,5 +129,3 @@ def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
 
 
 WHEELS = ActuatorKind("wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels)
-
-

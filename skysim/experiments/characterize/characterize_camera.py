@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
-import numpy as np
-from skysim.experiments.characterize.night_sky import Night
-from skysim.experiments.characterize.night_sky import ImageSize
-from skysim.experiments.characterize.fixed_pattern import DarkCurrent
-from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, LIGHT, model)
-from skysim.experiments.characterize.sensor_fit import MeasuredSensor
-from skysim.results.plots import (INK, png)
-from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
-from skysim.scene.sections.camera import CameraConfig
 import copy
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from skysim.core.errors import printable
-from skysim.experiments.characterize.night_sky import (LENS, Night, lens_estimates)
-from skysim.experiments.characterize.photon_transfer import Estimate
-from skysim.scene.camera_sheet import (SheetLine, yaml_lines)
-from skysim.core.errors import InputError
+from typing import Any
+
+import numpy as np
+
 from skysim.core import files
-from skysim.experiments.characterize import frame_files
+from skysim.core.errors import InputError, printable
+from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
+from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.frame_files import read_stack
-from skysim.experiments.characterize import night_sky
-from skysim.experiments.characterize import sensor_fit
+from skysim.experiments.characterize.night_sky import LENS, ImageSize, Night, lens_estimates
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    CURVATURE,
+    FIRST_DARK,
+    GAIN,
+    LIGHT,
+    Estimate,
+    model,
+)
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
+from skysim.results.plots import INK, png
 from skysim.results.report import Report
+from skysim.results.report_blocks import Column, Facts, Figure, Items, Section, Table, Verdict
 from skysim.scene import loader
-from skysim.scene.camera_sheet import PLACEHOLDER_LENS
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS, SheetLine, yaml_lines
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
-
-
-
-
 
 # The report of a characterized camera: its values, and figures of what they were fitted to.
 
@@ -220,7 +218,11 @@ AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
 
 
 def preset_text(
-    camera: Mapping[str, Any], config: CameraConfig, sensor: MeasuredSensor, night: Night | None, name: str
+    camera: Mapping[str, Any],
+    config: CameraConfig,
+    sensor: MeasuredSensor,
+    night: Night | None,
+    name: str,
 ) -> str:
     """The file: YAML with the source of each value. camera : raw section of the camera that was measured"""
     head = [
@@ -306,7 +308,7 @@ def section_lines(
 
 def write(path: Path, contents: str) -> None:
     """Write the file and read it as a scene would. Raises InputError if it is no camera."""
-    from skysim.core.files import (make_folder, write_text)
+    from skysim.core.files import make_folder, write_text
     from skysim.scene.camera_sheet import PLACEHOLDER_LENS
     from skysim.scene.loader import load_camera
 
@@ -353,7 +355,9 @@ def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path)
     return sensor_fit.characterize(darks.levels, flats.levels)
 
 
-def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor) -> Night:
+def measure_night(
+    config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor
+) -> Night:
     """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
     if "focal_length" not in raw:
         raise InputError(
@@ -442,5 +446,3 @@ def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     assert darks is not None
     assert flats is not None
     return darks, flats
-
-

@@ -15,19 +15,16 @@ pixels for H if they have fewer than LEAST_HOT: h is then their count, with the 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special, stats
+
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import Estimate
-from collections.abc import Sequence
-from typing import Any
-from numpy.typing import NDArray
-from skysim.experiments.characterize.photon_transfer import (Level, Mask)
-from skysim.experiments.characterize.photon_transfer import (BLACK, Transfer)
-
-
+from skysim.experiments.characterize.photon_transfer import BLACK, Estimate, Level, Mask, Transfer
 
 LEAST_HOT = 10  # hot pixels for a fit of their scatter
 # quantiles; the tail is the upper hundredth
@@ -57,7 +54,10 @@ class RateNoise(NamedTuple):
 class DarkCurrent(NamedTuple):
     """Mean and DSNU over the pixels, fraction of hot pixels, and their mean excess if they are enough. Rates in DN/s.
 
-    edges, counts, expected : histogram of the rates, and what the law expects
+    Attributes
+    ----------
+    edges, counts, expected
+        Histogram of the rates, and what the law expects
     """
 
     mean: Estimate
@@ -202,8 +202,6 @@ def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
     ), hot.size
 
 
-
-
 # Fixed pattern: of the black level by columns, and of the sensitivity (PRNU).
 
 
@@ -218,7 +216,10 @@ Planes = tuple[
 def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes:
     """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature.
 
-    half : first_dn or second_dn
+    Parameters
+    ----------
+    half
+        first_dn or second_dn
     """
     times = np.array([one.exposure_s for one in darks])
     weight = np.array(
@@ -264,7 +265,10 @@ def prnu(
 ) -> Estimate:
     """Relative standard deviation of the sensitivity, from the rate of every pixel in the light.
 
-    dark_ratio : dark current at the flats' temperature over that of the darks
+    Parameters
+    ----------
+    dark_ratio
+        Dark current at the flats' temperature over that of the darks
     """
     rates = [
         light_rate(flats, transfer, half, planes, dark_ratio)
@@ -324,5 +328,3 @@ def smooth(image: Floats, usable: Mask) -> Floats:
     by_row = powers(np.arange(height), height)
     by_column = powers(np.arange(width), width)
     return np.asarray(by_row.T @ matrix.T @ by_column, dtype=np.float64)
-
-

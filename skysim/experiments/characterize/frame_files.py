@@ -7,30 +7,28 @@ temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from skysim.core.errors import InputError
-from skysim.core import images
-from skysim.core.text import read_named_rows
-from skysim.experiments.characterize.photon_transfer import (Level, LevelBuilder)
+from scipy import ndimage
+
 from skysim.camera import detector
 from skysim.camera.detector import Detector
-from skysim.core.files import (atomic_file, make_folder)
-from skysim.core.random_streams import random_stream
-from skysim.scene.sections.camera import CameraConfig, DetectorConfig
-import math
-from scipy import ndimage
+from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file, make_folder
+from skysim.core.random_streams import random_stream
+from skysim.core.text import read_named_rows
 from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import (Level, Mask)
-from skysim.experiments.characterize.photon_transfer import FIT_RANGE
-
-
+from skysim.experiments.characterize.photon_transfer import FIT_RANGE, Level, LevelBuilder, Mask
+from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
 TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -152,7 +150,11 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     """The levels of a folder's frames, by exposure. Raises InputError with one line.
 
     Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
-    shape : (height, width) of the camera's frames
+
+    Parameters
+    ----------
+    shape
+        (height, width) of the camera's frames
     """
     builders: dict[Setting, LevelBuilder] = {}
     stack = Stack(folder)
@@ -204,8 +206,6 @@ def describe(setting: Setting) -> str:
     return f"{setting.exposure_s:g} s{at}"
 
 
-
-
 # Darks and flats as a camera of a scene would take them, written as files: to try the command, and
 # to test it.
 
@@ -242,7 +242,9 @@ def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
         for part in DARK_PARTS:
             yield PlannedFrame("darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS)
     for part in FLAT_PARTS:
-        yield PlannedFrame("flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR)
+        yield PlannedFrame(
+            "flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR
+        )
 
 
 def capacity_e(config: DetectorConfig) -> float:
@@ -289,8 +291,6 @@ def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path
 def frame_count(config: DetectorConfig) -> int:
     """Number of files of `write_frames`."""
     return sum(shot.frames for shot in shots(config))
-
-
 
 
 # Frames that cannot be what they are taken for: darks with light, flats that are not flat, too few
@@ -477,5 +477,3 @@ def extremes(medians: Floats) -> BrightSpots:
         )
 
     return BrightSpots(word(int(np.argmax(medians))), word(int(np.argmin(medians))))
-
-

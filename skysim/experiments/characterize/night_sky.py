@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-import numpy as np
-from scipy import special
-from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import Estimate
-from skysim.experiments.characterize.photon_transfer import ROUNDING_DN2
 import datetime
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 from scipy.spatial import cKDTree
-from estimator.calibration.star_field import (Calibration, self_calibrate)
+
+from estimator.calibration.star_field import Calibration, self_calibrate
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError
 from skysim.core import images
-from skysim.experiments.characterize.frame_files import (image_files, padding_bits, raw_numbers)
-from skysim.experiments.characterize.photon_transfer import (BLACK, GAIN, READ, Transfer)
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    GAIN,
+    READ,
+    ROUNDING_DN2,
+    Estimate,
+    Transfer,
+)
 from skysim.scene.sections.camera import CameraConfig
-from skysim.tracking.onboard_model import (calibration, onboard_catalog)
-
-
-
-
+from skysim.tracking.onboard_model import calibration, onboard_catalog
 
 # Size of star images over the field, from Gaussian fits of single stars.
 
@@ -53,9 +55,18 @@ LEAST_VARIANCE_PX2 = 1e-3
 class StarImages(NamedTuple):
     """Fitted images of N stars.
 
-    xy_px : (N, 2);  flux_dn : (N,);  variance_px2, variance_sigma_px2 : (N,) mean of s_x^2 and s_y^2, and its error
-    stretch_px2 : (N, 2) s_x^2 - s_y^2, and twice the covariance of x and y: of a trail
-    chi2 : (N,) reduced
+    Attributes
+    ----------
+    xy_px
+        (N, 2)
+    flux_dn
+        (N,)
+    variance_px2, variance_sigma_px2
+        (N,) mean of s_x^2 and s_y^2, and its error
+    stretch_px2
+        (N, 2) s_x^2 - s_y^2, and twice the covariance of x and y: of a trail
+    chi2
+        (N,) reduced
     """
 
     xy_px: Floats
@@ -302,9 +313,7 @@ def read_frame(
     chosen = measurable(numbers, centroids, transfer, saturation_dn)
     gain = float(transfer.values[GAIN])
     read = float(transfer.values[READ])
-    return NightFrame(
-        path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc
-    )
+    return NightFrame(path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc)
 
 
 def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
@@ -439,5 +448,3 @@ def lens_estimates(config: CameraConfig, found: Calibration) -> dict[str, Estima
         for name, value, error in zip(LENS[1:], values, errors[1:], strict=True)
     }
     return {"focal_length_mm": focal, **rest}
-
-

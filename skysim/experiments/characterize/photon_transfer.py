@@ -18,18 +18,16 @@ saturated level the variance collapses: it grows up to the turnover and falls to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
-import numpy as np
-from scipy import special
-from skysim.core.types import Floats
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
 from numpy.typing import NDArray
-from collections.abc import Sequence
+from scipy import special
 from scipy.optimize import least_squares
 
-
+from skysim.core.types import Floats
 
 # A measured number with its interval.
 
@@ -87,8 +85,6 @@ def propagate(
     return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 
-
-
 # Frames of one exposure, reduced to two mean frames and to the mean and temporal variance of their
 # pixels.
 
@@ -112,10 +108,18 @@ class Moments(NamedTuple):
 class Level:
     """Frames of one exposure time and temperature.
 
-    count  : frames, an even number;  greatest_dn, least_dn : of all pixels
-    first_dn, second_dn : (H, W) means of the first and of the second frames of the pairs
-    variance_dn2 : (H, W) temporal variance of every pixel, from count / 2 pairs
-    difference_dn2 : mean square of the difference of the frames of a pair, averaged over the frame
+    Attributes
+    ----------
+    count
+        Frames, an even number
+    greatest_dn, least_dn
+        Of all pixels
+    first_dn, second_dn
+        (H, W) means of the first and of the second frames of the pairs
+    variance_dn2
+        (H, W) temporal variance of every pixel, from count / 2 pairs
+    difference_dn2
+        Mean square of the difference of the frames of a pair, averaged over the frame
     """
 
     exposure_s: float
@@ -228,11 +232,19 @@ class TransferPoint(NamedTuple):
 class Transfer(NamedTuple):
     """The fit.
 
-    values     : K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each temperature
-    covariance : of these
-    flicker    : relative standard deviation of the light from frame to frame
-    misfit     : chi-square over its degrees of freedom
-    points     : those fitted
+    Attributes
+    ----------
+    values
+        K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each
+        temperature
+    covariance
+        Of these
+    flicker
+        Relative standard deviation of the light from frame to frame
+    misfit
+        chi-square over its degrees of freedom
+    points
+        Those fitted
     """
 
     values: Floats
@@ -360,5 +372,3 @@ def lamp_flicker(
     chance = math.sqrt(2 / len(points)) * float(np.sqrt(np.mean((noise / (2 * signal**2)) ** 2)))
     mean = float(np.mean(excess))
     return math.sqrt(mean) if mean > SIGNIFICANT * chance else 0.0
-
-

@@ -5,18 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+
 import numpy as np
+
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
-from skysim.experiments.characterize import fixed_pattern
-from skysim.experiments.characterize import photon_transfer
-from skysim.experiments.characterize.fixed_pattern import (DarkCurrent, RateNoise)
-from skysim.experiments.characterize.photon_transfer import (Estimate, propagate)
-from skysim.experiments.characterize.photon_transfer import (Level, Mask)
-from skysim.experiments.characterize.photon_transfer import (BLACK, CURVATURE, FIRST_DARK, GAIN, READ, ROUNDING_DN2, TransferPoint, Transfer)
-from skysim.experiments.characterize.fixed_pattern import Planes
-
-
+from skysim.experiments.characterize import fixed_pattern, photon_transfer
+from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    CURVATURE,
+    FIRST_DARK,
+    GAIN,
+    READ,
+    ROUNDING_DN2,
+    Estimate,
+    Level,
+    Mask,
+    Transfer,
+    TransferPoint,
+    propagate,
+)
 
 HOT_SIGMAS = 20.0  # above the median dark: pixels left out of the photon transfer
 HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a particle hit it
@@ -25,11 +34,18 @@ HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a part
 class MeasuredSensor(NamedTuple):
     """What the frames tell.
 
-    estimates : by key of `camera.detector`, in its units
-    remarks   : what they do not tell, one line each
-    dark      : distribution of the dark current, None if it is below the noise
-    flats     : all levels, those too that are beyond the fit
-    saturation_dn : digital number of a saturated pixel, or of the brightest flat
+    Attributes
+    ----------
+    estimates
+        By key of `camera.detector`, in its units
+    remarks
+        What they do not tell, one line each
+    dark
+        Distribution of the dark current, None if it is below the noise
+    flats
+        All levels, those too that are beyond the fit
+    saturation_dn
+        Digital number of a saturated pixel, or of the brightest flat
     """
 
     estimates: dict[str, Estimate]
@@ -145,7 +161,10 @@ def best_temperature(
 
 
 def full_well(
-    estimates: dict[str, Estimate], remarks: list[str], transfer: Transfer, flats: Sequence[TransferPoint]
+    estimates: dict[str, Estimate],
+    remarks: list[str],
+    transfer: Transfer,
+    flats: Sequence[TransferPoint],
 ) -> None:
     """Full well and nonlinearity: electrons where the signal stays though the exposure grows, and what is missing
     there; c x of the fit."""
@@ -191,8 +210,12 @@ def dark_parameters(
 ) -> DarkCurrent | None:
     """Dark current, DSNU and hot pixels from the rates of the pixels at the temperature of these darks.
 
-    own   : index of the temperature for which they are stated
-    ratio : dark current at it over that of these darks
+    Parameters
+    ----------
+    own
+        Index of the temperature for which they are stated
+    ratio
+        Dark current at it over that of these darks
     """
     weights = first[2]
     gain = transfer.values[GAIN]
@@ -307,5 +330,3 @@ def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float
     slope, intercept = np.polyfit(x, y, 1, w=1 / y)
     line = intercept + slope * x
     return float(np.mean(np.abs(y - line) / line))
-
-

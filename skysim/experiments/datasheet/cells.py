@@ -7,35 +7,29 @@ thermal state, attitude and noise by number, so that terms can be separated and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
+
 import numpy as np
+import yaml
+from numpy.typing import NDArray
+
 from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
-from skysim.experiments.study.factors import Settings
+from skysim.core.files import make_folder, write_text
+from skysim.core.types import Floats
+from skysim.core.yaml_reader import parse_yaml
+from skysim.experiments.study.execution import runner, store
+from skysim.experiments.study.factors import Point, Settings
+from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
 from skysim.experiments.study.study_file import has_survey_errors
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig, StarsConfig)
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
-import yaml
-from numpy.typing import NDArray
-from skysim.core.files import (make_folder, write_text)
-from skysim.core.yaml_reader import parse_yaml
-from skysim.core.types import Floats
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
-from skysim.scene.scene import Scene
-
-
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 
 SCAN_PX = (
     3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
@@ -62,8 +56,15 @@ MISSED_PX = (
 class Size:
     """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of other cells.
 
-    draws : frames in each field with attitudes and noise of their own, in which units and thermal states take turns
-    sky   : frames in new fields, of other units;  pairs : frames with and without a cause to compare
+    Attributes
+    ----------
+    draws
+        Frames in each field with attitudes and noise of their own, in which units and thermal
+        states take turns
+    sky
+        Frames in new fields, of other units
+    pairs
+        Frames with and without a cause to compare
     """
 
     fields: int
@@ -224,7 +225,9 @@ class Designer:
                             "attitude": attitude,
                             "frame": frame,
                         }
-                        yield DatasheetCell("terms", levels, self.settings(Draw(unit, state, attitude)))
+                        yield DatasheetCell(
+                            "terms", levels, self.settings(Draw(unit, state, attitude))
+                        )
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: str
@@ -384,8 +387,6 @@ class Designer:
         return math.degrees(math.atan(side_px / 2 / self.scene.camera.focal_px))
 
 
-
-
 # Run the experiments of a datasheet: write them as a study, run its missing trials, and read them
 # as arrays.
 
@@ -398,8 +399,16 @@ AXES = ("x_arcsec", "y_arcsec", "roll_arcsec")
 class MeasuredFrames:
     """The measured frames of a datasheet.
 
-    columns : of the trials, (cells, fields) each;  scene_name : as it was given;  overrides : of the command line
-    spec    : what a trial needs to be run again
+    Attributes
+    ----------
+    columns
+        Of the trials, (cells, fields) each
+    scene_name
+        As it was given
+    overrides
+        Of the command line
+    spec
+        What a trial needs to be run again
     """
 
     scene: Scene
@@ -407,7 +416,7 @@ class MeasuredFrames:
     overrides: Mapping[str, str]
     size: Size
     designer: Designer
-    cells: list[Cell]
+    cells: list[DatasheetCell]
     columns: dict[str, NDArray[Any]]
     spec: TrialSpec
 
@@ -444,7 +453,11 @@ class MeasuredFrames:
 
 
 def study_tree(
-    scene_name: str, scene: Scene, overrides: Mapping[str, str], size: Size, cells: list[Cell]
+    scene_name: str,
+    scene: Scene,
+    overrides: Mapping[str, str],
+    size: Size,
+    cells: list[DatasheetCell],
 ) -> dict[str, Any]:
     """The study file of the cells."""
     settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
@@ -482,9 +495,13 @@ def measure(
 ) -> MeasuredFrames:
     """Run the missing trials of a scene's datasheet in a folder, and return all of them.
 
-    quick, fields : smaller experiments, and another number of fields
     watch(trials) : returns the function that is called after every batch
     Raises InputError for a scene without attitudes of single frames, and for a cell whose trials fail.
+
+    Parameters
+    ----------
+    quick, fields
+        Smaller experiments, and another number of fields
     """
     check_scene(scene)
     size = QUICK if quick else FULL
@@ -514,5 +531,3 @@ def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:
         point: Point = plan.points[trial // plan.study.replicates]
         raise InputError(point.levels["cell"], error.strip().splitlines()[-1])
     return {name: values.reshape(len(plan.points), -1) for name, values in kept.columns().items()}
-
-

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
-import numpy as np
-from skysim.experiments.datasheet.variance_components import Components
-from skysim.experiments.datasheet.statement import (NAMES, Statement)
-from skysim.experiments.datasheet.variance_components import GROUPS
-from skysim.results.plots import INK
 import shlex
+from collections.abc import Callable
 from pathlib import Path
-from skysim.core.files import (make_folder, to_json, write_bytes, write_text)
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.files import make_folder, to_json, write_bytes, write_text
 from skysim.experiments.datasheet import statement as statements
 from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.statement import Statement
-from skysim.results.plots import png
-from skysim.results.report import Block, Column, Figure, Report, Section, Table, Text, Verdict
-from skysim.results.report_blocks import figure_files
-
-
+from skysim.experiments.datasheet.statement import NAMES, Statement
+from skysim.experiments.datasheet.variance_components import GROUPS, Components
+from skysim.results.plots import INK, png
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
+    Block,
+    Column,
+    Figure,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    figure_files,
+)
 
 # Figures of a datasheet.
 
@@ -229,5 +235,3 @@ def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, P
     write_text(paths["json"], to_json(statements.numbers(statement)))
     report.save(paths["report"])
     return paths
-
-

@@ -19,9 +19,8 @@ from __future__ import annotations
 import json
 import math
 from typing import Any, NamedTuple
+
 import numpy as np
-
-
 
 AXES = ("x", "y", "roll")
 
@@ -29,7 +28,16 @@ AXES = ("x", "y", "roll")
 class State(NamedTuple):
     """What is kept from one time to the next: standard normal numbers, the unit's bias and the axis of the rate.
 
-    field, pixel : (3,);  scale : a number;  bias : (3,) arcseconds;  axis_rad : angle of the axis from x toward y
+    Attributes
+    ----------
+    field, pixel
+        (3,)
+    scale
+        A number
+    bias
+        (3,) arcseconds
+    axis_rad
+        Angle of the axis from x toward y
     """
 
     field: Any
@@ -42,10 +50,14 @@ class State(NamedTuple):
 class ErrorModel:
     """Constants of one tracker.
 
-    constants : mean, unit, field, pixel (x, y, roll: arcseconds, 1 sigma), scale (x, y, roll: standard deviation of the
-        logarithm of the variance), field_deg, pixel_deg, scale_deg (correlation angles), rates_deg_s, noise (for each
-        rate x, y, roll in arcseconds) and along (for each rate what is added about its axis, arcseconds); both are
-        linear between the rates and constant beyond the last
+    Attributes
+    ----------
+    constants
+        Mean, unit, field, pixel (x, y, roll: arcseconds, 1 sigma), scale (x, y, roll: standard
+        deviation of the logarithm of the variance), field_deg, pixel_deg, scale_deg
+        (correlation angles), rates_deg_s, noise (for each rate x, y, roll in arcseconds) and
+        along (for each rate what is added about its axis, arcseconds); both are linear between
+        the rates and constant beyond the last
     """
 
     def __init__(self, constants: dict[str, Any]) -> None:
@@ -67,7 +79,10 @@ class ErrorModel:
     def start(self, rng: Any, unit: bool = True) -> State:
         """The state of a new unit in a random field, turning about a random axis across the boresight.
 
-        unit : whether its bias is drawn, or the mean of all units
+        Parameters
+        ----------
+        unit
+            Whether its bias is drawn, or the mean of all units
         """
         bias = self.mean + (self.unit * rng.standard_normal(3) if unit else 0.0)
         axis_rad = float(rng.uniform(0, 2 * math.pi))
@@ -107,9 +122,15 @@ class ErrorModel:
     ) -> Any:
         """(N, 3) errors in arcseconds, at times step_s apart.
 
-        rate_deg_s : (N,) rate of the boresight; from one time to the next it turns by rate times step
-        state      : at the first time; that of a new unit in a random field if left out
-        axis_rad   : angle of the rate's axis from the camera's x toward y, or (N,); that of the state if left out
+        Parameters
+        ----------
+        rate_deg_s
+            (N,) rate of the boresight; from one time to the next it turns by rate times step
+        state
+            At the first time; that of a new unit in a random field if left out
+        axis_rad
+            Angle of the rate's axis from the camera's x toward y, or (N,); that of the state if
+            left out
         """
         rate = np.abs(np.asarray(rate_deg_s, dtype=float))
         first = self.start(rng) if state is None else state
@@ -173,5 +194,3 @@ def correlated(steps: Any, first: Any, rng: Any) -> Any:
         left[shift:] *= left[:-shift].copy()
         shift *= 2
     return values
-
-

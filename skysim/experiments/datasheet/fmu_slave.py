@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from pythonfmu3 import Float64, Fmi3Causality, Fmi3Slave, Fmi3Variability, Int32
 from tracker_error import ErrorModel  # type: ignore[import-not-found]
 
 
-
 class TrackerError(Fmi3Slave):
     """Input: the rate of the boresight. Outputs: the errors about the camera's axes, drawn anew at every step.
 
-    seed : of the random numbers; read at the first step
+    Attributes
+    ----------
+    seed
+        Of the random numbers; read at the first step
     """
 
     author = "skysim"
@@ -48,5 +51,3 @@ class TrackerError(Fmi3Slave):
         self.x_arcsec, self.y_arcsec, self.roll_arcsec = errors.tolist()
         self.time = current_time + step_size
         return True
-
-

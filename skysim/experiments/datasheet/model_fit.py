@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any
-import numpy as np
-from skysim.core.types import Floats
-from skysim.experiments.datasheet.variance_components import (components, effects, mean_known)
-from skysim.experiments.datasheet.error_model import AXES
-from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.variance_components import (GROUPS, term_errors)
-from skysim.experiments.study.execution import (trials)
-from skysim.experiments.study.execution import setups
 from dataclasses import replace
-from typing import NamedTuple
-from scipy import stats
-from skysim.core.random_streams import random_stream
-from skysim.experiments.datasheet.variance_components import mean_known
-from skysim.experiments.datasheet.error_model import ErrorModel
-from skysim.experiments.datasheet.variance_components import term_errors
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
 from skysim.core.errors import InputError
-from skysim.core.files import (make_folder, to_json, write_text)
-
-
+from skysim.core.files import make_folder, to_json, write_text
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.error_model import AXES, ErrorModel
+from skysim.experiments.datasheet.variance_components import (
+    GROUPS,
+    components,
+    effects,
+    mean_known,
+    term_errors,
+)
+from skysim.experiments.study.execution import setups, trials
 
 GRID = 60  # correlation angles that are tried
 LEAST_NOISE = (
@@ -106,10 +106,16 @@ def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
     return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
 
 
-def along_square(sheet: MeasuredFrames, rate_deg_s: float, mean: list[float], errors: Floats) -> float:
+def along_square(
+    sheet: MeasuredFrames, rate_deg_s: float, mean: list[float], errors: Floats
+) -> float:
     """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
 
-    errors : (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is negative
+    Parameters
+    ----------
+    errors
+        (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is
+        negative
     """
     if not rate_deg_s:
         return 0.0
@@ -154,7 +160,9 @@ def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Fl
     return np.array(angles), np.array(products), np.array(squares)
 
 
-def field_angle_deg(sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]) -> float:
+def field_angle_deg(
+    sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]
+) -> float:
     """The correlation angle of the field term: that with the least squares of the lagged products.
 
     They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest, each in
@@ -179,8 +187,6 @@ def field_angle_deg(sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: l
     return float(trials_deg[int(np.argmin(left))])
 
 
-
-
 # Compare a measurement model with frames that it was not fitted to: distribution by rate, and
 # correlation.
 
@@ -192,9 +198,16 @@ APART_STEP_S = 1e9  # between draws, which then are of other fields
 class Agreement(NamedTuple):
     """How well the model agrees with other fields at one rate.
 
-    fitted      : the fields of the fit, even or odd;  frames : one of each other field
-    p_values    : (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
-    correlation : mean over the axes and over all pairs of frames of a sequence, and that of the model
+    Attributes
+    ----------
+    fitted
+        The fields of the fit, even or odd
+    frames
+        One of each other field
+    p_values
+        (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
+    correlation
+        Mean over the axes and over all pairs of frames of a sequence, and that of the model
     """
 
     fitted: str
@@ -230,7 +243,9 @@ def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
     return ErrorModel(constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]})
 
 
-def agreement(model: ErrorModel, sheet: MeasuredFrames, rate_deg_s: float, fitted: str) -> Agreement:
+def agreement(
+    model: ErrorModel, sheet: MeasuredFrames, rate_deg_s: float, fitted: str
+) -> Agreement:
     """The agreement with the sequences at one rate."""
     steps, errors = sequences(sheet, rate_deg_s)
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
@@ -270,8 +285,6 @@ def at_rest(model: ErrorModel) -> Floats:
     return turning(ErrorModel(model.constants | rest), 1.0)
 
 
-
-
 # Write a measurement model: a Python module that needs NumPy alone, its constants as JSON, a co-
 # simulation unit.
 
@@ -284,7 +297,7 @@ HERE = Path(__file__).parent
 def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
     """Write the module and its constants to a folder; return their paths."""
     paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
-    write_text(paths[0], (HERE / "errors.py").read_text(encoding="utf-8"))
+    write_text(paths[0], (HERE / "error_model.py").read_text(encoding="utf-8"))
     write_text(paths[1], to_json(constants))
     return paths
 
@@ -312,5 +325,3 @@ def write_fmu(folder: Path) -> Path:
             script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]
         )
     )
-
-

@@ -10,11 +10,14 @@ import numpy as np
 from scipy.special import chdtri
 
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.variance_components import (mean_known, mean_square_ratio)
 from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.variance_components import (GROUPS, rms)
-from skysim.experiments.study.execution import (trials)
-from skysim.experiments.study.execution import setups
+from skysim.experiments.datasheet.variance_components import (
+    GROUPS,
+    mean_known,
+    mean_square_ratio,
+    rms,
+)
+from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.tracking import factory
@@ -195,10 +198,16 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 class Limit(NamedTuple):
     """Between which levels the probability of a right attitude falls below `share`, each shown at 95 % confidence.
 
-    share : the highest of LIMITS that the frames of a level can show
-    above : the highest level up to which all are shown to be above it, NaN if none is
-    below : the lowest from which all are shown to be below it, infinite if none is
-    fields : fewest fields at a level
+    Attributes
+    ----------
+    share
+        The highest of LIMITS that the frames of a level can show
+    above
+        The highest level up to which all are shown to be above it, NaN if none is
+    below
+        The lowest from which all are shown to be below it, infinite if none is
+    fields
+        Fewest fields at a level
     """
 
     share: float

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
-from skysim.experiments.datasheet import (performance)
-from skysim.experiments.datasheet import variance_components
-from skysim.experiments.datasheet.cells import TRACKED
-from skysim.experiments.datasheet.variance_components import (Bounded, Components)
+
+from skysim.experiments.datasheet import performance, variance_components
+from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
 from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
-from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results.metrics import Summary
-
-
 
 NAMES = {
     "bias": "bias",
@@ -253,7 +251,10 @@ def lowering_section(statement: Statement) -> StatementSection:
     rows = [
         [
             one["cause"],
-            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in variance_components.GROUPS),
+            *(
+                bounded(Bounded(*(100 * part for part in one[name])))
+                for name in variance_components.GROUPS
+            ),
         ]
         for one in statement.causes
     ]
@@ -321,7 +322,10 @@ def quantile_section(statement: Statement) -> StatementSection:
         consistency_text(statement.consistency),
     ]
     rows = [
-        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in variance_components.GROUPS)]
+        [
+            f"{100 * one['level']:g} %",
+            *(quantile_text(one[name]) for name in variance_components.GROUPS),
+        ]
         for one in statement.quantiles
     ]
     return StatementSection(
@@ -358,7 +362,11 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
     """Cells of a pair of frames: noise-equivalent angle and error."""
-    return [arcsec(row[f"{kind}_{name}"]) for name in variance_components.GROUPS for kind in ("nea", "rms")]
+    return [
+        arcsec(row[f"{kind}_{name}"])
+        for name in variance_components.GROUPS
+        for kind in ("nea", "rms")
+    ]
 
 
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
@@ -504,5 +512,3 @@ def disturbance_section(statement: Statement) -> StatementSection:
         ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"],
         rows,
     )
-
-

@@ -16,14 +16,14 @@ import math
 from collections.abc import Iterator
 from itertools import combinations
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.core.errors import InputError
 from skysim.experiments.datasheet.cells import MeasuredFrames
-
-
 
 FIELD, UNIT, STATE = range(3)
 Subset = tuple[int, ...]
@@ -63,9 +63,14 @@ def subsets(present: list[int]) -> Iterator[Subset]:
 def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
     """Variance of each crossed effect plus what is left in the means of nested ones, by subset of the factors.
 
-    means : (fields, units, states). Mean squares of the orthogonal decomposition (inclusion and exclusion of marginal
     means) have E[MS_A] = sum over B containing A of var_B times the number of cells that share one level of B; they
     are solved from the largest subset down. var_() is the square of the mean.
+
+    Parameters
+    ----------
+    means
+        (fields, units, states). Mean squares of the orthogonal decomposition (inclusion and
+        exclusion of marginal
     """
     found: dict[Subset, float] = {}
     counts = np.array(means.shape)
@@ -89,11 +94,19 @@ def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
 def components(errors: Floats) -> Components:
     """The error's terms from (fields, units, states, attitudes, frames) values, at least two fields, attitudes, frames.
 
-    bias     : constant over fields, attitudes and time: the mean's square and the variance among units
-    thermal  : all that changes with the thermal state
-    field    : changes from field to field, for one unit: catalog, distortion, map of the LEDs, geometry of the stars
-    pixel    : changes over a few pixels: centroiding, fixed pattern
-    temporal : changes from frame to frame
+    Returns
+    -------
+    bias
+        Constant over fields, attitudes and time: the mean's square and the variance among units
+    thermal
+        All that changes with the thermal state
+    field
+        Changes from field to field, for one unit: catalog, distortion, map of the LEDs,
+        geometry of the stars
+    pixel
+        Changes over a few pixels: centroiding, fixed pattern
+    temporal
+        Changes from frame to frame
     """
     temporal = float(np.mean(np.var(errors, axis=-1, ddof=1)))
     cells = errors.mean(axis=-1)
@@ -155,7 +168,12 @@ def mean_known(values: Floats, axis: int | tuple[int, ...] | None = None) -> Any
 def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
     """The sum of the terms over the mean square that independent frames of the same fields have.
 
-    errors : (axes, fields, ...) of the design;  at_once : (axes, fields, draws), NaN where there is no attitude
+    Parameters
+    ----------
+    errors
+        (axes, fields, ...) of the design
+    at_once
+        (axes, fields, draws), NaN where there is no attitude
     """
     squares = mean_known(at_once**2, (0, 2))
     known = np.isfinite(squares)
@@ -170,7 +188,10 @@ def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
 def mean_square_ratio(numerator: Floats, denominator: Floats) -> Bounded:
     """Ratio of two mean squares that were measured in the same fields, with its bootstrap interval over the fields.
 
-    numerator, denominator : (fields,) mean squares; fields without one of them are left out
+    Parameters
+    ----------
+    numerator, denominator
+        (fields,) mean squares; fields without one of them are left out
     """
     known = np.isfinite(numerator) & np.isfinite(denominator)
     top = numerator[known]
@@ -179,8 +200,6 @@ def mean_square_ratio(numerator: Floats, denominator: Floats) -> Bounded:
         return Bounded(math.nan, math.nan, math.nan)
     drawn = [top[rows].mean() / bottom[rows].mean() for rows in resamples(len(top))]
     return bounded(top.mean() / bottom.mean(), np.array(drawn))
-
-
 
 
 # The terms of a datasheet: sizes, sum against the total, what would lower them, and what
@@ -202,8 +221,12 @@ TERMS = {
 class TermTable(NamedTuple):
     """The terms about one group of axes.
 
-    squares : mean squares of terms and total, arcsec^2 of one axis, with intervals
-    ratio   : sum of the terms over the mean square of independent frames
+    Attributes
+    ----------
+    squares
+        Mean squares of terms and total, arcsec^2 of one axis, with intervals
+    ratio
+        Sum of the terms over the mean square of independent frames
     """
 
     squares: dict[str, Bounded]
@@ -218,7 +241,10 @@ class TermTable(NamedTuple):
 def term_errors(sheet: MeasuredFrames) -> tuple[Floats, np.ndarray]:
     """(3, fields, units, states, attitudes, frames) errors of the fields in which all frames are solved, and which.
 
-    Raises InputError where they are too few for a statement.
+    Raises
+    ------
+    InputError
+        Where they are too few for a statement.
     """
     rows = sheet.rows("terms")
     designer = sheet.designer
@@ -286,5 +312,3 @@ def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 def rms(sheet: MeasuredFrames, rows: list[int], axes: slice) -> float:
     """Root mean square of the errors about one axis, arcseconds, over all frames with a right attitude."""
     return float(np.sqrt(mean_known(sheet.errors(rows)[axes] ** 2)))
-
-

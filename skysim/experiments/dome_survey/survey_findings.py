@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
+
 import numpy as np
+from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, project
-from estimator.calibration import survey_faults
+from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
-from estimator.calibration.survey_plan import Mask, SurveyAccuracy
-from skysim.core.types import Floats
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.dome_survey.survey_frames import (GATE_SIGMAS, Correspondences)
-from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, image_sizes)
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
-from scipy.spatial.transform import Rotation
-from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
+from skysim.core.types import Floats
 from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey.survey_frames import (Ints, match_by_imu)
-from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, survey_model)
+from skysim.experiments.dome_survey.survey_frames import (
+    GATE_SIGMAS,
+    Correspondences,
+    Ints,
+    SurveyFrame,
+    match_by_imu,
+)
+from skysim.experiments.dome_survey.survey_prior import (
+    CalibrationPrior,
+    SurveyUncertainty,
+    image_sizes,
+    survey_model,
+)
 from skysim.scene.scene import Scene
-
-
-
-
 
 # A survey of a dome as its last round has it: frames, correspondences, what they show of each LED,
 # stray lights.
@@ -41,9 +43,17 @@ STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames ma
 class SurveyRun:
     """A survey with the frames and correspondences of its last round.
 
-    taken  : all frames, with the IMU's attitudes;  rows : those of `taken` that are in the survey
-    listed : the LEDs before the survey
-    prior  : the model before the last round; its LEDs are the listed ones, those moved at the places found
+    Attributes
+    ----------
+    taken
+        All frames, with the IMU's attitudes
+    rows
+        Those of `taken` that are in the survey
+    listed
+        The LEDs before the survey
+    prior
+        The model before the last round; its LEDs are the listed ones, those moved at the places
+        found
     """
 
     survey: DomeSurvey
@@ -181,8 +191,14 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
 class Coverage:
     """The frames held so far, and which LEDs they measure.
 
-    model : by which further attitudes are chosen;  held, seen : body_from_lab of F frames, and (F, N) LEDs in them
-    accuracy : that of the survey, or predicted before it; None if the frames are too few
+    Attributes
+    ----------
+    model
+        By which further attitudes are chosen
+    held, seen
+        body_from_lab of F frames, and (F, N) LEDs in them
+    accuracy
+        That of the survey, or predicted before it; None if the frames are too few
     """
 
     model: SurveyModel
@@ -257,13 +273,23 @@ def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> Survey
 class DomeFaults:
     """Faults of the dome by LED number.
 
-    dark      : LEDs that no frame shows though it must
-    displaced : LED and its distance from the list's place, m;  list_sigma_m : error of the other places about each axis
-    exchanged : LED at whose place another one shines, that other one, and others that would do as well
-    found_m   : places, m, at which displaced LEDs and lights of exchanged ones were found
-    unlisted  : places, m, of lights at rest that are no LED of the list
-    exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if none are
-        compared: too few are in enough frames, or the time of their code is unknown
+    Attributes
+    ----------
+    dark
+        LEDs that no frame shows though it must
+    displaced
+        LED and its distance from the list's place, m
+    list_sigma_m
+        Error of the other places about each axis
+    exchanged
+        LED at whose place another one shines, that other one, and others that would do as well
+    found_m
+        Places, m, at which displaced LEDs and lights of exchanged ones were found
+    unlisted
+        Places, m, of lights at rest that are no LED of the list
+    exchange_share
+        Share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
+        none are compared: too few are in enough frames, or the time of their code is unknown
     """
 
     dark: list[int]
@@ -389,5 +415,3 @@ def rows_of(numbers: Sequence[int], ids: Ints) -> Ints:
     """Rows of LEDs by their numbers."""
     order = np.argsort(ids)
     return np.asarray(order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))])
-
-

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
 from estimator.calibration import survey_plan
 from estimator.calibration.survey_plan import Mask, SurveyModel
-from skysim.core.errors import InputError
-from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
-from skysim.scene.scene import Scene
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Frame, Truth
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats, Frame, Truth
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab
-from skysim.tracking import onboard_model
 from skysim.tracking import factory as tracker_settings
-from typing import NamedTuple
-from scipy.optimize import linear_sum_assignment
-from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty)
-
-
+from skysim.tracking import onboard_model
 
 # Attitudes at which the vehicle is held for a survey: by a plan, or random.
 
@@ -43,7 +40,11 @@ STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103, "candidates": 104, "
 def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) -> Rotation:
     """Random lab_from_body at `count` stops: tilt uniform in solid angle up to tilt_deg, yaw uniform.
 
-    stream_name : random stream, a key of STREAM_KEYS. Raises InputError if the tilt exceeds the vehicle's tilt stop.
+    Parameters
+    ----------
+    stream_name
+        Random stream, a key of STREAM_KEYS. Raises InputError if the tilt exceeds the vehicle's
+        tilt stop.
     """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
@@ -72,9 +73,17 @@ def planned_stops(
 ) -> Rotation:
     """lab_from_body at up to `count` stops that reduce the errors most, in their order (`survey_plan.choose`).
 
-    margin_px  : of the chip, where an image would be incomplete
-    held, seen : body_from_lab of frames taken before, and the LEDs identified in them
-    Raises InputError if no attitude shows enough LEDs.
+    Parameters
+    ----------
+    margin_px
+        Of the chip, where an image would be incomplete
+    held, seen
+        body_from_lab of frames taken before, and the LEDs identified in them
+
+    Raises
+    ------
+    InputError
+        If no attitude shows enough LEDs.
     """
     candidates = stop_attitudes(scene, "candidates", CANDIDATES, tilt_deg).inv()
     shown = model.visible(candidates, margin_px)
@@ -115,7 +124,10 @@ SAME_LIGHT_PX = 2.0  # greatest distance of a centroid from the true image
 class SurveyFrame:
     """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment.
 
-    index : number of the frame, from 0, which tells what coded LEDs show
+    Attributes
+    ----------
+    index
+        Number of the frame, from 0, which tells what coded LEDs show
     """
 
     lights: Centroids
@@ -143,7 +155,10 @@ def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Trut
 def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
     """Standard deviation of a centroid's coordinates, robust, from the true images in NOISE_FRAMES simulated frames.
 
-    Raises InputError if they show too few lights.
+    Raises
+    ------
+    InputError
+        If they show too few lights.
     """
     errors = []
     for _, truth, lights in take_frames(
@@ -179,8 +194,6 @@ def detect_lights(settings: Settings, camera: Camera, image_dn: NDArray[Any]) ->
         return Centroids.empty()
 
 
-
-
 # Identification of the LEDs in the frames of a dome survey.
 
 
@@ -203,12 +216,15 @@ def prediction_sigmas_px(
 ) -> tuple[float, Floats]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
 
-    map_px : (N,) standard deviation of each LED's place; that of `uncertainty` if None
-
     The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error moves the
     camera too: it turns the direction of an LED at the distance R from the center of rotation, d from the camera, by
     R / d of itself. The LED position error, and the roll and focal length errors (largest, and evaluated, at the image
     corner), act on each light differently.
+
+    Parameters
+    ----------
+    map_px
+        (N,) standard deviation of each LED's place; that of `uncertainty` if None
     """
     camera = prior.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
@@ -230,7 +246,10 @@ def match_by_imu(
 ) -> Correspondences:
     """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment.
 
-    map_px : see `prediction_sigmas_px`
+    Parameters
+    ----------
+    map_px
+        See `prediction_sigmas_px`
     """
     common_px, individual_px = prediction_sigmas_px(prior, uncertainty, map_px)
     predicted = prior.pixels(frame.body_from_lab)
@@ -298,7 +317,10 @@ def match_by_survey(
 ) -> Correspondences:
     """Match detections to LEDs with the attitudes and map of an adjustment.
 
-    sigma_px : (N,) standard deviation of each LED's predicted coordinates
+    Parameters
+    ----------
+    sigma_px
+        (N,) standard deviation of each LED's predicted coordinates
     """
     predicted = prior.pixels(frame.body_from_lab)
     visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max())))
@@ -306,5 +328,3 @@ def match_by_survey(
         frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible]
     )
     return Correspondences(light, visible[led])
-
-

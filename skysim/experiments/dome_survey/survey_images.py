@@ -7,31 +7,29 @@ name are identified by the tracker with the list of LEDs, or with the survey of 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
-from skysim.core.errors import InputError
 from skysim.core import images
+from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
-from skysim.core.text import (excerpt, read_named_rows)
+from skysim.core.text import excerpt, read_named_rows
 from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey.survey_frames import (SurveyFrame, detect_lights)
-from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty)
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-
-
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 
 ATTITUDES = "attitudes.csv"
 FRAME = "frame_{:04d}.fits"
@@ -125,7 +123,9 @@ def write_attitudes(
 ) -> None:
     """Write attitudes as `read_attitudes` reads them; leds : number of LEDs in view, for a plan."""
     lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
-    for n, (name, angles) in enumerate(zip(names, survey_frames.angles_deg(lab_from_body), strict=True)):
+    for n, (name, angles) in enumerate(
+        zip(names, survey_frames.angles_deg(lab_from_body), strict=True)
+    ):
         cells = [name, *(f"{angle:.4f}" for angle in angles)] + (
             [f"{leds[n]}"] if leds is not None else []
         )
@@ -168,8 +168,6 @@ def lost_in_space(
         return DomeTracker(camera, leds, lever, settings)
     except ImageError as error:
         raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
-
-
 
 
 # A folder of images that is followed while they are taken.
@@ -255,5 +253,3 @@ def stamp_of(path: Path) -> Stamp | None:
     except OSError:
         return None
     return about.st_size, about.st_mtime_ns
-
-

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeSurvey
@@ -20,11 +22,9 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome import surface
+from skysim.sources.dome.layouts import led_list, registry
 from skysim.tracking import onboard_model
-
-
 
 Ints = NDArray[np.int64]
 BLUR_PX = 3.0  # of an image's edge
@@ -42,8 +42,16 @@ UNCERTAINTY_RANGES = {
 class SurveyUncertainty:
     """Uncertainty before the survey: standard deviations per axis, and a focal length error.
 
-    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
-    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
+    Attributes
+    ----------
+    imu_sigma_rad
+        Attitude from the IMU at each frame
+    led_sigma_m
+        Position of each LED
+    lever_sigma_m
+        Position of the camera in the body
+    focal_error
+        Relative error of the assumed focal length
     """
 
     imu_sigma_rad: float
@@ -60,9 +68,15 @@ class SurveyUncertainty:
 class CalibrationPrior:
     """Assumed model of dome and camera, before a survey or from it.
 
-    floor_px : least standard deviation of a prediction's residuals, by which lights are matched
-    disk_m   : diameter of an LED's luminous disk
-    levels   : (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None if all are steady
+    Attributes
+    ----------
+    floor_px
+        Least standard deviation of a prediction's residuals, by which lights are matched
+    disk_m
+        Diameter of an LED's luminous disk
+    levels
+        (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None
+        if all are steady
     """
 
     camera: Camera
@@ -225,5 +239,3 @@ def with_onboard_model(
         assumed_camera_body_m=None,
         map=path,
     )
-
-

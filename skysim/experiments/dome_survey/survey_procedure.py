@@ -6,27 +6,49 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
 from estimator.trackers.pipeline import Settings
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.tracker_comparison import with_config
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
-from skysim.experiments.dome_survey.survey_images import (ATTITUDES, FRAME, SurveyImage, frames_with_attitude, write_attitudes)
-from skysim.experiments.dome_survey.survey_frames import (SurveyFrame, centroid_noise_px, imu_attitudes, take_frames)
-from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty, calibration_prior, image_sizes, survey_model, with_survey_errors)
-from skysim.experiments.dome_survey.survey_findings import (accuracy_statistics, find_faults, predicted)
+from skysim.experiments.dome_survey.survey_findings import (
+    SurveyRun,
+    accuracy_statistics,
+    find_faults,
+    predicted,
+)
+from skysim.experiments.dome_survey.survey_frames import (
+    SurveyFrame,
+    centroid_noise_px,
+    imu_attitudes,
+    take_frames,
+)
+from skysim.experiments.dome_survey.survey_images import (
+    ATTITUDES,
+    FRAME,
+    SurveyImage,
+    frames_with_attitude,
+    write_attitudes,
+)
+from skysim.experiments.dome_survey.survey_prior import (
+    CalibrationPrior,
+    SurveyUncertainty,
+    calibration_prior,
+    image_sizes,
+    survey_model,
+    with_survey_errors,
+)
 from skysim.experiments.dome_survey.survey_report import led_errors
-from skysim.experiments.dome_survey.survey_findings import SurveyRun
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.files import recording as frame_files
 from skysim.scene.scene import Scene
-from skysim.simulation.lab import (Lab, build_lab)
-
-
+from skysim.simulation.lab import Lab, build_lab
 
 PLANNED = "plan"
 RANDOM = "random"
@@ -36,7 +58,12 @@ RANDOM = "random"
 class HeldAttitudes:
     """Attitudes to hold, one frame at each.
 
-    shown : (F, N) LEDs that each shows;  margin_px : from the edge, where an image would be incomplete
+    Attributes
+    ----------
+    shown
+        (F, N) LEDs that each shows
+    margin_px
+        From the edge, where an image would be incomplete
     """
 
     lab_from_body: Rotation
@@ -117,7 +144,10 @@ def survey_images(
 ) -> SurveyRun:
     """Survey from images, of which `frames` have an attitude; the others are identified with the LEDs surveyed so far.
 
-    Raises InputError if too few images have an attitude, or they do not determine the unknowns.
+    Raises
+    ------
+    InputError
+        If too few images have an attitude, or they do not determine the unknowns.
     """
     if len(frames) < 2:
         raise InputError(
@@ -222,5 +252,3 @@ def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
         "ratio": ratio,
         "ratio_sigma": ratio and ratio * relative,
     }
-
-

@@ -2,46 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
-import numpy as np
-from skysim.core.types import Floats
-from skysim.experiments.dome_survey.survey_findings import (accuracy_statistics, fault_lines)
-from skysim.experiments.dome_survey.survey_findings import (SurveyRun, residuals_px)
-from skysim.results.plots import (INK, png)
-from skysim.results.report import (
-    Block,
-    Cell,
-    Column,
-    Facts,
-    Figure,
-    Report,
-    Section,
-    Table,
-    Text,
-    Verdict,
-)
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Mount, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
+from skysim.experiments.dome_survey.survey_findings import (
+    Coverage,
+    DomeFaults,
+    SurveyRun,
+    accuracy_statistics,
+    fault_lines,
+    residuals_px,
+    rows_of,
+)
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
-from skysim.experiments.dome_survey.survey_findings import (Coverage, DomeFaults, rows_of)
-from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.results import metrics
+from skysim.results.plots import INK, png
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
-
-
 
 CELLS = 8  # across the chip, over which residuals are averaged
 BINS = 60
@@ -265,8 +267,6 @@ def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int
         xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x [px]", ylabel="y [px]"
     )
     axes.set_title("mean residuals over the chip", loc="left")
-
-
 
 
 # Report of a dome survey: statistics, pictures of the dome, and the comparison of a simulated one
@@ -513,5 +513,3 @@ def list_shifts(run: SurveyRun) -> LedErrors:
     found_m = run.survey.leds.position_m[row]
     none = np.zeros(len(row), dtype=bool)
     return LedErrors(found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none)
-
-

@@ -8,21 +8,18 @@ fault of the paper's laboratory); else `disagrees`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
-from skysim.experiments.papers.published import (Experiment, PublishedRow)
-from skysim.results.metrics import Summary
-from collections.abc import Callable, Sequence
-from typing import Any
+
 import numpy as np
 from scipy.special import stdtrit
+
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
+from skysim.experiments.papers.published import Experiment, PublishedRow
 from skysim.results import metrics
 from skysim.results.metrics import CONFIDENCE, RESAMPLES, Summary
-
-
 
 Verdict = Literal["agrees", "explained", "disagrees"]
 VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
@@ -32,8 +29,14 @@ VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
 class ExperimentOptions:
     """Options of an experiment.
 
-    quick: fewer trials, wider intervals;  seed: of all its random streams
-    watch: progress callback, called with (completed, total)
+    Attributes
+    ----------
+    quick
+        Fewer trials, wider intervals
+    seed
+        Of all its random streams
+    watch
+        Progress callback, called with (completed, total)
     """
 
     quick: bool = False
@@ -156,7 +159,10 @@ def compare(
 ) -> Reproduction:
     """Compare every published row with our result.
 
-    Raises ValueError if the experiment has no result for a row, or a result for a row that is not published.
+    Raises
+    ------
+    ValueError
+        If the experiment has no result for a row, or a result for a row that is not published.
     """
     if unmatched := published.rows.keys() ^ experiment.results.keys():
         raise ValueError(
@@ -213,8 +219,6 @@ def format_published(row: PublishedRow) -> str:
     return f"{text} ± {row.tolerance:.3g}" if row.tolerance else text
 
 
-
-
 # 95 % intervals: confidence interval of a mean, prediction interval of one draw, bootstrap of
 # functions of means.
 
@@ -230,8 +234,13 @@ def prediction_interval(
     """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n), t for n - 1 degrees of freedom.
 
     For a published number that is itself a single draw.
-    count : number of independent draws, if fewer than the values
-    own_variance : of the predicted draw in units of s^2, in place of 1
+
+    Parameters
+    ----------
+    count
+        Number of independent draws, if fewer than the values
+    own_variance
+        Of the predicted draw in units of s^2, in place of 1
     """
     draws = np.asarray(values, float)
     count = count or len(draws)
@@ -282,7 +291,12 @@ def widen_interval(summary: Summary) -> Summary:
 def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:
     """A function of K column means, with its bootstrap percentile interval over the N rows; NaNs are left out.
 
-    columns : (N, K);  statistic : of (..., K) means, shape (...)
+    Parameters
+    ----------
+    columns
+        (N, K)
+    statistic
+        Of (..., K) means, shape (...)
     """
     finite = np.isfinite(columns)
     filled = np.where(finite, columns, 0.0)
@@ -295,5 +309,3 @@ def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> S
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.nanpercentile(resampled, [tail, 100 - tail])
     return widen_interval(Summary(value, min(float(low), value), max(float(high), value), rows))
-
-

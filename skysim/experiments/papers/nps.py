@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import LedMap, on_surface
 from estimator.attitude.solvers import quest
 from estimator.catalog import pair_index
@@ -22,18 +24,20 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, with_cause)
-from skysim.experiments.papers.compare import bootstrap_interval
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    bootstrap_interval,
+    with_cause,
+)
 from skysim.results.metrics import Summary, proportion
-from skysim.results.plots import (INK, MARKS)
+from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.scene.sections.light import (DomeConfig, FlatSurfaceConfig)
+from skysim.scene.sections.light import DomeConfig, FlatSurfaceConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
-from skysim.tracking import onboard_model
-from skysim.tracking import factory
-
-
+from skysim.simulation.lab import Lab, build_lab
+from skysim.tracking import factory, onboard_model
 
 INITIAL_DEG = (-6, -3, 0, 3, 6)
 ITERATED_DEG = 2.0
@@ -46,7 +50,16 @@ FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
 class OnboardModel(NamedTuple):
     """The tracker's model: the true panel and lever arm, and the nine stars as seen from the level vehicle.
 
-    lab: the true lab;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
+    Attributes
+    ----------
+    lab
+        The true lab
+    panel
+        The plane
+    vectors
+        (9, 3) unit, from the bearing
+    pairs
+        Their index
     """
 
     lab: Lab
@@ -216,7 +229,9 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
-    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw(fig, series), (7.4, 4.6)),)
+    )
 
 
 def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
@@ -240,5 +255,3 @@ def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
     below.set(
         ylabel="error of solutions (deg)", xlabel="error of the initial attitude, each angle (deg)"
     )
-
-

@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+
 from skysim.camera.render import Poses, in_view, project
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.experiments.tracker_comparison import with_config
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import bootstrap_interval
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+)
 from skysim.experiments.papers.published import experiments
-from skysim.results.metrics import exact, extremum
-from skysim.results.plots import (INK, MARKS)
-from skysim.scene import loader
-from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.lab import (Lab, build_lab)
-from skysim.sources import dome
-from skysim.sources.photometry import Band
-from skysim.tracking import onboard_model
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_centroid_trials
 from skysim.experiments.study.plan import CentroidTrial
-from skysim.results.metrics import Summary, rms
+from skysim.experiments.tracker_comparison import with_config
+from skysim.results.metrics import Summary, exact, extremum, rms
+from skysim.results.plots import INK, MARKS
+from skysim.scene import loader
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
-from skysim.simulation.lab import (build_lab, build_tracker)
-
-
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.sources import dome
+from skysim.sources.photometry import Band
+from skysim.tracking import onboard_model
 
 LARGE_OFFSET_M = 0.05
 SMALL_OFFSET_M = 1e-3
@@ -167,7 +168,9 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
         for offset_m in OFFSETS_M
     ]
     caption = "Largest angular discrepancy of a fiber against the camera's offset, with the offset unknown and known."
-    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw_apl(fig, np.array(worst))),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw_apl(fig, np.array(worst))),)
+    )
 
 
 def draw_apl(fig: Any, worst_arcsec: Floats) -> None:
@@ -191,8 +194,6 @@ def draw_apl(fig: Any, worst_arcsec: Floats) -> None:
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
     axes.legend()
-
-
 
 
 # AFIT's later OLED dome: noise-equivalent angle and absolute error of the attitude with many small
@@ -265,7 +266,10 @@ def mean_absolute_error_deg(
 ) -> Summary:
     """Mean error angle in degrees. The attitudes of one survey share its errors, so the interval is over surveys.
 
-    seeds : one list per survey: its seed, then the seeds of its attitudes
+    Parameters
+    ----------
+    seeds
+        One list per survey: its seed, then the seeds of its attitudes
     """
     means_arcsec = []
     for survey_seed, *attitude_seeds in seeds:
@@ -304,7 +308,9 @@ def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
     caption = (
         "Noise-equivalent angle by the number of lights in the field; dashed the published bounds."
     )
-    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw_oled(fig, errors_by_lights)),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw_oled(fig, errors_by_lights)),)
+    )
 
 
 def draw_oled(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
@@ -335,5 +341,3 @@ def draw_oled(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
     axes.set_yticks(ARCSEC_TICKS, [f"{tick:g}" for tick in ARCSEC_TICKS])
     axes.minorticks_off()
     axes.legend(ncols=2, loc="center")
-
-

@@ -9,28 +9,36 @@ from __future__ import annotations
 
 import datetime
 from typing import Any, NamedTuple
+
 import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.constants import DAY_S, EARTH_RATE_RAD_S
 from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.time import J2000_JD, tt_days, utc_days
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import (bootstrap_interval, sample_std, symmetric_interval)
-from skysim.experiments.papers.published import (experiments, published_values)
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+    sample_std,
+    symmetric_interval,
+)
+from skysim.experiments.papers.published import experiments, published_values
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
-from skysim.results.plots import (INK, MARKS)
+from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import stars
 from skysim.tracking import factory
-
-
 
 SITE_DEG = (-23.2, -45.9)  # latitude, longitude of Sao Jose dos Campos
 UTC_LESS_LOCAL = datetime.timedelta(hours=3)
@@ -82,8 +90,14 @@ def paper_angles_deg(cam_from_icrs: Rotation) -> Floats:
 class FrameSolutions(NamedTuple):
     """Solutions of N frames.
 
-    local : (N,) local times;  estimated_deg, true_deg : (N, 3) estimated and true angles as in Table 2
-    error_rad : (N,) error angle. Estimates and errors are NaN for unsolved frames.
+    Attributes
+    ----------
+    local
+        (N,) local times
+    estimated_deg, true_deg
+        (N, 3) estimated and true angles as in Table 2
+    error_rad
+        (N,) error angle. Estimates and errors are NaN for unsolved frames.
     """
 
     local: list[datetime.datetime]
@@ -221,7 +235,9 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
     return float(np.degrees(np.arccos(itrs_from_icrs(LOCAL_TIMES[0]).apply(boresight) @ up)))
 
 
-def drawings(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> tuple[FigureDrawing, ...]:
+def drawings(
+    calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
+) -> tuple[FigureDrawing, ...]:
     return (
         FigureDrawing(
             "Right ascension of the fixed camera against time: Table 2 and ours.",
@@ -269,5 +285,3 @@ def draw_errors(fig: Any, calibrated: FrameSolutions, uncalibrated: list[FrameSo
     fig.legend(
         [panels[0].lines[n] for n in (0, -2, -1)], names, ncols=3, loc="outside upper center"
     )
-
-

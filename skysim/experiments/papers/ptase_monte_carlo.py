@@ -8,26 +8,40 @@ the paper's definitions (eqs. 7-9). No images are rendered.
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+
 import numpy as np
-from estimator.catalog import pair_index
-from estimator.catalog import published_catalogs
+
+from estimator.catalog import pair_index, published_catalogs
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.checks import Ints
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
+from estimator.identification.published.fialho import (
+    MIN_FRACTION_BASIC,
+    MIN_FRACTION_FALSE_STARS,
+    VERSIONS,
+    FialhoOptions,
+    search,
+    search_options,
+)
 from estimator.identification.solver_options import Options
-from estimator.identification.published.fialho import (MIN_FRACTION_BASIC, MIN_FRACTION_FALSE_STARS, VERSIONS, FialhoOptions, search, search_options)
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.jit import jit
 from skysim.core.files import CATALOGS
+from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import (bootstrap_interval, percent, sample_std)
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+    percent,
+    sample_std,
+)
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import WRONG_RAD, Summary, proportion
-from skysim.results.plots import (INK, MARKS)
-
-
+from skysim.results.plots import INK, MARKS
 
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
 SIGMA_RAD = 3 * ARCSEC_RAD
@@ -137,10 +151,16 @@ def _field(R: Floats, index: PairIndex) -> tuple[Floats, Floats]:
 class RunErrors(NamedTuple):
     """(N,) errors of the solved runs in arcsec, as the paper defines them (eqs. 7-9), and the rotation angle.
 
-    attitude : |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
-    angle    : rotation angle of the error
-    roll     : |phi_true - phi_est| of eq. 5's angle, which counts from north
-    axis     : |Z_true - Z_est|
+    Attributes
+    ----------
+    attitude
+        |M_true - M_est|, Frobenius norm, sqrt(2) times the rotation angle for small angles
+    angle
+        Rotation angle of the error
+    roll
+        |phi_true - phi_est| of eq. 5's angle, which counts from north
+    axis
+        |Z_true - Z_est|
     """
 
     attitude: Floats
@@ -280,5 +300,3 @@ def draw_simulations(fig: Any, by_version: dict[str, VersionRuns]) -> None:
     axes.plot(TABLE_1[:, 2], TABLE_1[:, 1], "*", color=INK[1], ms=9, label="published")
     axes.set(xlabel="mean roll error (arcsec)", ylabel="mean |M true - M est| (arcsec)")
     axes.legend()
-
-

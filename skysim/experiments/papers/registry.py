@@ -6,23 +6,31 @@ import time
 from collections.abc import Callable
 
 from skysim.core.errors import InputError
-from skysim.experiments.papers.afit import (led_tests, test1)
-from skysim.experiments.papers.afit import test3_attitude
-from skysim.experiments.papers.afit import test2
-from skysim.experiments.papers.afit import test3_attitude
-from skysim.experiments.papers.afit import afit_surface
-from skysim.experiments.papers.afit import test3
-from skysim.experiments.papers.compare import (ExperimentOptions, ExperimentResult, Reproduction, compare)
-from skysim.experiments.papers import other_domes
-from skysim.experiments.papers import nps
-from skysim.experiments.papers import other_domes
-from skysim.experiments.papers import ptase_ground
-from skysim.experiments.papers import ptase_monte_carlo
+from skysim.experiments.papers import (
+    nps,
+    other_domes,
+    ptase_ground,
+    ptase_monte_carlo,
+    shefex_camera,
+    shefex_identification,
+    shefex_nights,
+    shefex_setup,
+)
+from skysim.experiments.papers.afit import (
+    afit_surface,
+    led_tests,
+    test1,
+    test2,
+    test3,
+    test3_attitude,
+)
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    Reproduction,
+    compare,
+)
 from skysim.experiments.papers.published import experiments
-from skysim.experiments.papers import shefex_camera
-from skysim.experiments.papers import shefex_setup
-from skysim.experiments.papers import shefex_identification
-from skysim.experiments.papers import shefex_nights
 
 ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
 

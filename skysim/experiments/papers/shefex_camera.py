@@ -7,29 +7,36 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.detection.detect import DETECTORS
-from estimator.detection.shefex_detection import (maximum_scan, sequential_scan)
+from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import (bootstrap_interval, bootstrap_of_means)
-from skysim.experiments.papers.shefex_nights import (FULL_MOON, exposure_override, render_frames)
-from skysim.experiments.papers.shefex_setup import (MAX_CENTROIDS, PUBLISHED)
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+    bootstrap_of_means,
+)
+from skysim.experiments.papers.shefex_nights import FULL_MOON, exposure_override, render_frames
+from skysim.experiments.papers.shefex_setup import MAX_CENTROIDS, PUBLISHED
 from skysim.results.metrics import Summary, exact, quantile
-from skysim.results.plots import (INK, MARKS)
+from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import (StarCamera, build_lab)
+from skysim.simulation.lab import StarCamera, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.factory import ExposureController
-
-
 
 REPEATS = 15
 MAX_OBJECTS = 1000
@@ -139,7 +146,14 @@ DISTURBANCES: dict[str, dict[str, Any]] = {"planet": PLANET, "planets": PLANETS,
 class ExposureLoop:
     """A camera at rest with closed-loop exposure control.
 
-    overrides : of the scene;  lab_from_body : its attitude;  start_ms : first exposure time
+    Attributes
+    ----------
+    overrides
+        Of the scene
+    lab_from_body
+        Its attitude
+    start_ms
+        First exposure time
     """
 
     def __init__(
@@ -243,7 +257,9 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
         results[name] = RowResult(
             Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
         )
-    drawing = FigureDrawing("Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0]))
+    drawing = FigureDrawing(
+        "Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0])
+    )
     return ExperimentResult(results, (drawing,))
 
 
@@ -275,5 +291,3 @@ def draw_control(lab_from_body: Rotation, fig: Any) -> None:
         )
     axes.set(xlabel="frame", ylabel="exposure (ms)", ylim=(0, 57), xlim=(0, boundaries[-1]))
     fig.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-
-

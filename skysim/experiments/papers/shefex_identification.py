@@ -10,20 +10,39 @@ from __future__ import annotations
 import itertools
 from functools import partial
 from typing import Any, NamedTuple
+
 import numpy as np
+
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
-from estimator.identification.published.shefex import (FOURTH_STAR, angle_interval, cos_error, search)
+from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.experiments.papers.shefex_setup import (CHOSEN_COS_ERROR, MAX_CENTROIDS, PIXEL_RAD, PRINTED_FIELD_RAD, PUBLISHED, StarField, identify_and_solve, pairs, plot_curve, random_fields, search_options, shefex_lab)
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_of_means,
+)
+from skysim.experiments.papers.shefex_setup import (
+    CHOSEN_COS_ERROR,
+    MAX_CENTROIDS,
+    PIXEL_RAD,
+    PRINTED_FIELD_RAD,
+    PUBLISHED,
+    StarField,
+    identify_and_solve,
+    pairs,
+    plot_curve,
+    random_fields,
+    search_options,
+    shefex_lab,
+)
 from skysim.experiments.study.report.figures import logarithmic
 from skysim.results.metrics import Summary, exact, extremum, proportion
 from skysim.tracking import onboard_model
-
-
 
 COS_ERRORS = np.array([5e-6, 1e-5, 1.5e-5, 2e-5, 3e-5, 4e-5, 5.5e-5, 8e-5, 1.2e-4, 2e-4])
 INDEX_OF = {float(one): n for n, one in enumerate(COS_ERRORS)}
@@ -86,12 +105,20 @@ def identify(
 class Curves(NamedTuple):
     """Results for N attitudes. The paper accepts a match with a fourth star; our rule requires significance.
 
-    work, right       : (centroid errors, cosErrors, N) by the paper's rule
-    right_significant : (cosErrors, N) by our rule, at 0.2 px
-    wrong             : (spikes, cosErrors of SPIKE_COS_ERRORS, N) by the paper's rule, at 0.2 px
-    wrong_significant : (spikes, N) by our rule, at 0.2 px
-    error_deg         : (centroid errors of ERRORS_PX, N, 3)
-    has_four_stars    : (N,) whether four stars are on the detector
+    Attributes
+    ----------
+    work, right
+        (centroid errors, cosErrors, N) by the paper's rule
+    right_significant
+        (cosErrors, N) by our rule, at 0.2 px
+    wrong
+        (spikes, cosErrors of SPIKE_COS_ERRORS, N) by the paper's rule, at 0.2 px
+    wrong_significant
+        (spikes, N) by our rule, at 0.2 px
+    error_deg
+        (centroid errors of ERRORS_PX, N, 3)
+    has_four_stars
+        (N,) whether four stars are on the detector
     """
 
     work: Floats
@@ -383,5 +410,3 @@ def draw_attitude(curves: Curves, fig: Any) -> None:
 def fractions(rows: Floats) -> list[Summary]:
     """Fraction of ones with its interval, for each row."""
     return [proportion(row.sum(), len(row)) for row in rows]
-
-

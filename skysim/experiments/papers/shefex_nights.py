@@ -6,41 +6,48 @@ the paper's processing chain and through our default one. Varied: exposure time,
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, partial
+from typing import Any, NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.calibration.star_field import self_calibrate
 from estimator.core.camera import Camera
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
+from skysim.camera.glow import background
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Trajectory
-from skysim.experiments.papers.compare import (ExperimentOptions, RowResult, format_summary)
-from skysim.experiments.papers.compare import (bootstrap_interval, symmetric_interval)
-from skysim.experiments.papers.shefex_setup import (apparent, shefex_lab, stars)
+from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+    format_summary,
+    symmetric_interval,
+)
+from skysim.experiments.papers.shefex_setup import (
+    PUBLISHED,
+    apparent,
+    plot_curve,
+    processing_chain,
+    shefex_lab,
+    stars,
+)
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.plan import FrameTrial
-from skysim.results.metrics import Summary, exact
-from skysim.scene.loader import load
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.tracking import onboard_model
-from collections.abc import Iterator
-from functools import partial
-from typing import Any, NamedTuple
-from skysim.camera.glow import background
-from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import bootstrap_interval
-from skysim.experiments.papers.shefex_setup import (PUBLISHED, plot_curve, processing_chain)
 from skysim.results import metrics
-from skysim.results.metrics import Summary, proportion
-from skysim.simulation.lab import (build_lab, build_tracker)
-from skysim.tracking import factory
-
-
+from skysim.results.metrics import Summary, exact, proportion
+from skysim.scene.loader import load
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.tracking import factory, onboard_model
 
 # SHEFEX-2's camera as rendered: field of view, smear length, peak loss by smear, defocus,
 # calibrated focal length.
@@ -96,8 +103,12 @@ def star_image(
 ) -> Floats:  # fmt: skip
     """(H, W) noise-free electrons of the catalog's brightest star alone, with the camera rotating across the boresight.
 
-    place_rad : offset of the star from the boresight, right and down, at mid-exposure
-    axis_rad : direction of the rotation axis, from camera x towards y
+    Parameters
+    ----------
+    place_rad
+        Offset of the star from the boresight, right and down, at mid-exposure
+    axis_rad
+        Direction of the rotation axis, from camera x towards y
     """
     brightest = lab.camera.sources.take(np.array([np.argmax(lab.camera.sources.strength)]))
     star_direction = brightest.place[0, :3]
@@ -224,8 +235,12 @@ CATALOG = "uniform"  # "processed using the uniform Hipparcos catalog"
 class NightResults(NamedTuple):
     """Results of N frames, each (N,): solved correctly, solved wrongly, number of centroids, by the paper's chain.
 
-    right_low_threshold : solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA
-    ours : solved correctly by our default chain
+    Attributes
+    ----------
+    right_low_threshold
+        Solved correctly by it with a threshold of LOW_SIGMA in place of SIGMA
+    ours
+        Solved correctly by our default chain
     """
 
     right: Floats
@@ -407,5 +422,3 @@ def draw_frame(seed: int, fig: Any) -> None:
     axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.grid(visible=False)
     fig.legend(*axes.get_legend_handles_labels(), loc="outside right upper")
-
-

@@ -3,39 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.solvers import SOLVERS
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
-from estimator.catalog import published_catalogs
+from estimator.catalog import catalog, pair_index, published_catalogs
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.checks import Ints
 from estimator.core.types import Centroids
-from estimator.identification.published.shefex import (FOURTH_STAR, ShefexOptions, search)
+from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions, search
 from estimator.trackers.pipeline import Settings
 from skysim.core.files import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_of_means,
+    with_cause,
+)
 from skysim.experiments.study.execution import detections
-from skysim.results.metrics import Summary
-from skysim.results.plots import (INK, MARKS)
+from skysim.results.metrics import Summary, exact
+from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
-from functools import partial
-from typing import Any
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
-from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.results.metrics import exact
-from skysim.results.plots import INK
-
-
 
 MAX_CENTROIDS = 15
 CHOSEN_COS_ERROR = 5.5e-5  # tolerance on cosines of angles
@@ -94,7 +94,14 @@ class ChainResult(NamedTuple):
 class ProcessingChain:
     """The paper's processing chain: sequential scan, 15 centroids, triangles and pyramids at cosError 5.5e-5, ESOQ2.
 
-    name : of its catalog;  threshold_sigma : of the scan, in units of the frame's noise;  focal_px : calibrated
+    Attributes
+    ----------
+    name
+        Of its catalog
+    threshold_sigma
+        Of the scan, in units of the frame's noise
+    focal_px
+        calibrated
     """
 
     def __init__(self, name: str, threshold_sigma: float, focal_px: float) -> None:
@@ -189,8 +196,6 @@ def plot_curve(axes: Any, x: Any, summaries: list[Summary], curve: int, label: s
     )
 
 
-
-
 # SHEFEX-2's on-board catalogs: counts, pairs, sky maps, uniformity (Samaan & Theil 2011, section
 # 3.3, figs 4, 5).
 
@@ -261,7 +266,10 @@ def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOption
 def relative_dispersion(means: Floats) -> Floats:
     """Index of dispersion (variance over mean) of the uniform catalog's counts, divided by the asymmetric one's.
 
-    means : (..., 4) mean counts of both catalogs, then mean squared counts
+    Parameters
+    ----------
+    means
+        (..., 4) mean counts of both catalogs, then mean squared counts
     """
     mean = means[..., :2]
     square = means[..., 2:]
@@ -295,5 +303,3 @@ def draw_counts(counts: Floats, fig: Any) -> None:
     axes.axvline(MIN_STARS - 0.5, color=PUBLISHED, ls="--", label="published: four are needed")
     axes.set(xlabel="stars in the field", ylabel="share of the fields")
     axes.legend()
-
-

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+
 import numpy as np
-from skysim.experiments.study.table import (Place, PointRow)
-from skysim.results import metrics
-from skysim.results.metrics import Summary
+
 from skysim.experiments.study import thresholds
-from skysim.experiments.study.table import (axis, distinct, unit_of)
-from skysim.experiments.study.table import (Place, PointRow, format_level, format_summary, has_few_values)
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
-
-
+from skysim.experiments.study.table import (
+    Place,
+    PointRow,
+    axis,
+    distinct,
+    format_level,
+    format_summary,
+    has_few_values,
+    unit_of,
+)
+from skysim.results import metrics
+from skysim.results.metrics import Summary
 
 # What a study's numbers allow to claim, in words: whether the tracker's claimed errors are true,
 # and rare events.
@@ -142,9 +149,14 @@ def headline(
 ) -> list[str]:
     """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
 
-    lines : of all points, with the responses of the study and RESPONSES
-    may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
-    worst : the command that lists the worst trials
+    Parameters
+    ----------
+    lines
+        Of all points, with the responses of the study and RESPONSES
+    may_be_ambiguous
+        Whether the tracker can refuse a frame as ambiguous
+    worst
+        The command that lists the worst trials
     """
     done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
     if not done:
@@ -160,6 +172,39 @@ def headline(
         found.append(event(text, [line.responses[name] for line in done], done, place))
         found += effect_of_wrong_matches(done, place) if name == "misidentified" else []
     return [*found, *runs_needed(done, list(EVENTS)), *claimed_errors(done, place)]
+
+
+def verdict(study: Study, lines: Sequence[PointRow]) -> str:
+    """What the study answers, in three or four short sentences; "" if no trial has an answer.
+
+    1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
+    """
+    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    if not done:
+        return ""
+    place = placer(study, done)
+    frame = "attitude" if study.trial.kind == "centroids" else "frame"
+    sentences = [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
+    sentences += [
+        worst_share(
+            "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done, place
+        ),
+        worst_share(
+            "wrong", "No attitude is wrong", f"of the {frame}s give a wrong attitude", done, place
+        ),
+    ]
+    return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
+
+
+def worst_share(name: str, never: str, text: str, lines: Sequence[PointRow], place: Place) -> str:
+    """ "No attitude is wrong (in 12,000).", or the share at the point where it is largest."""
+    worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
+    share = worst.responses[name]
+    if not share.value > 0:
+        return f"{never} (in {sum(line.responses[name].trials for line in lines):,})."
+    if len(lines) == 1:
+        return f"{percent(share.value)} {text} ({interval(share)})."
+    return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
 
 
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
@@ -186,17 +231,42 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
-def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
-    """Smallest and largest value of a response over the points; those of few values only if there are no others."""
+def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow] | None:
+    """The points with the least and the largest value of a response; those of few values only without others."""
     known = [line for line in lines if np.isfinite(line.responses[name].value)]
     known = [line for line in known if not has_few_values(line, name)] or known
     if not known:
+        return None
+
+    def value(line: PointRow) -> float:
+        return line.responses[name].value
+
+    return min(known, key=value), max(known, key=value)
+
+
+def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
+    """Smallest and largest value of a response over the points, as a sentence."""
+    found = extremes(name, lines)
+    if found is None:
         return f"{name}: no trial has a value."
-    least, most = (pick(known, key=lambda line: line.responses[name].value) for pick in (min, max))
-    low, high = (format_summary(line.responses[name]) for line in (least, most))
+    least, most = found
+    low, high = (format_summary(line.responses[name]) for line in found)
     if least.responses[name].value == most.responses[name].value:
-        return f"{name}: {low}" + (f" at all {len(known)} points." if len(known) > 1 else ".")
+        equal = sum(np.isfinite(line.responses[name].value) for line in lines)
+        return f"{name}: {low}" + (f" at all {equal} points." if equal > 1 else ".")
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
+
+
+def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
+    """Of each response its name, least value, the point that has it, largest value, and the point that has that."""
+    done = [line for line in lines if line.trials]
+    place = placer(study, done)
+    rows = []
+    for name in study.responses:
+        if found := extremes(name, done):
+            low, high = (format_summary(line.responses[name]) for line in found)
+            rows.append([name, low, place(found[0]), high, place(found[1])])
+    return rows
 
 
 def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
@@ -273,5 +343,3 @@ def interval(share: Summary) -> str:
 def percent(share: float) -> str:
     """A share in percent, to three digits."""
     return f"{100 * share:.3g} %"
-
-

@@ -7,21 +7,18 @@ sampled design therefore only generates points in the unit cube.
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
 import numpy as np
 import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
+
 from skysim.core.errors import InputError
-from skysim.core.units import ConfigModel
-import itertools
-from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Literal, NamedTuple
-from pydantic import Field
 from skysim.core.types import Floats
-
-
+from skysim.core.units import ConfigModel
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
@@ -96,7 +93,10 @@ class Values(KeyedFactor):
 class Range(KeyedFactor):
     """A key between two bounds: `steps` values in a design with levels, uniformly distributed in a sampled design.
 
-    scale : equal steps (linear) or equal ratios (log); integer : rounded to whole numbers
+    Attributes
+    ----------
+    scale
+        Equal steps (linear) or equal ratios (log); integer : rounded to whole numbers
     """
 
     from_: Annotated[Value, Field(alias="from")]
@@ -227,8 +227,6 @@ Factor = Annotated[
 ]
 
 
-
-
 # Experimental designs: full factorial, one factor at a time, and samples of the unit cube of the
 # factors.
 
@@ -243,10 +241,16 @@ class Point(NamedTuple):
 class Design(ConfigModel):
     """How points are chosen.
 
-    kind  : factorial, every combination of levels; one_at_a_time, the first levels, then each other level alone;
-            lhs, a Latin hypercube; sobol, a Sobol sequence; saltelli, the sample for Sobol indices: matrices A and B,
-            and A with each column of B in turn, points * (factors + 2) in all (Saltelli et al. 2010)
-    points: number of points, for lhs, sobol and saltelli only; a power of two for sobol and saltelli
+    Attributes
+    ----------
+    kind
+        Factorial, every combination of levels; one_at_a_time, the first levels, then each other
+        level alone; lhs, a Latin hypercube; sobol, a Sobol sequence; saltelli, the sample for
+        Sobol indices: matrices A and B, and A with each column of B in turn, points * (factors
+        + 2) in all (Saltelli et al. 2010)
+    points
+        Number of points, for lhs, sobol and saltelli only; a power of two for sobol and
+        saltelli
     """
 
     kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"
@@ -340,5 +344,3 @@ DESIGNS: dict[str, Callable[[Design, Factors, int], Iterator[Point]]] = {
     "sobol": sample,
     "saltelli": saltelli,
 }
-
-

@@ -7,37 +7,40 @@ them. The result is the feasible candidate with the best objective or, with two 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from skysim.core.errors import InputError, unknown_name
-from skysim.core.units import in_si
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.factors import (Factor, Levels, Range, Value, split_quantity)
-from skysim.experiments.study.plan import Cost, Plan, resolve_point
-from skysim.results.files.parts import parts_list
-from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 import json
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
+
 import numpy as np
-from skysim.core.errors import InputError
-from skysim.experiments.study.table import (format_level, format_summary)
-from skysim.experiments.study.factors import (Point, make_point)
+
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
-from skysim.experiments.study.execution.runner import (Progress, Watch, run_points)
-from skysim.experiments.study.execution.setups import (code_version, seed_of)
+from skysim.experiments.study.execution.runner import Progress, Watch, run_points
+from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.execution.trials import REFUSED, Row
-from skysim.experiments.study.factors import (Distribution, Range, Value)
-from skysim.experiments.study.plan import Constraint, Plan, Search, Study
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Levels,
+    Point,
+    Range,
+    Value,
+    make_point,
+    split_quantity,
+)
+from skysim.experiments.study.plan import Constraint, Cost, Plan, Search, Study, resolve_point
+from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
+from skysim.results.files.parts import parts_list
 from skysim.results.metrics import Columns, Summary
-
-
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -130,10 +133,16 @@ MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 class Candidate(NamedTuple):
     """One evaluated point.
 
-    figures  : statistic of each response that is an objective or a constraint
-    feasible : all constraints hold for the values (intervals are ignored), and no value is missing
-    refused  : its scene is invalid
-    why      : the violated constraints, or the error message of the scene; empty if feasible
+    Attributes
+    ----------
+    figures
+        Statistic of each response that is an objective or a constraint
+    feasible
+        All constraints hold for the values (intervals are ignored), and no value is missing
+    refused
+        Its scene is invalid
+    why
+        The violated constraints, or the error message of the scene; empty if feasible
     """
 
     number: int
@@ -149,8 +158,13 @@ class Candidate(NamedTuple):
 class SearchResult(NamedTuple):
     """Result of a search.
 
-    front    : the Pareto-optimal feasible candidates, best in the first objective first; with one objective, the best
-    finished : whether all candidates, or all existing points, were evaluated
+    Attributes
+    ----------
+    front
+        The Pareto-optimal feasible candidates, best in the first objective first; with one
+        objective, the best
+    finished
+        Whether all candidates, or all existing points, were evaluated
     """
 
     candidates: list[Candidate]
@@ -422,8 +436,12 @@ def run_candidate(
 ) -> bool:  # fmt: skip
     """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
 
-    total   : progress of the whole search, passed to `watch`
-    refused : number of failed trials of invalid scenes, which the budget does not count
+    Parameters
+    ----------
+    total
+        Progress of the whole search, passed to `watch`
+    refused
+        Number of failed trials of invalid scenes, which the budget does not count
     """
     # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
     before = replace(total)
@@ -467,5 +485,3 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
         )
         for k in missing
     ]
-
-

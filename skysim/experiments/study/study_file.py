@@ -7,13 +7,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+
 from pydantic import ValidationError
+
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
-from skysim.core.yaml_reader import (check_version, explain, read_yaml, set_key, where_of)
+from skysim.core.yaml_reader import check_version, explain, read_yaml, set_key, where_of
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import unused_options
-from skysim.experiments.study.factors import make_point
-from skysim.experiments.study.factors import (Distribution, Factor, Levels, Settings, Value)
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Levels,
+    Settings,
+    Value,
+    make_point,
+)
 from skysim.experiments.study.plan import (
     TRIAL,
     AttitudeRange,
@@ -33,10 +41,8 @@ from skysim.experiments.study.plan import (
 from skysim.results import metrics
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
-from skysim.tracking.tracker_interface import (OWN, TRACKERS)
-
-
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.tracking.tracker_interface import OWN, TRACKERS
 
 SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
@@ -62,9 +68,16 @@ def load(
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
-    programs : commands of external trackers and controllers by name; None if the study will not be run, and its
-               trackers and controllers need not be installed
-    Raises InputError with one line: the key, the fault, what is allowed, the file and line.
+    Parameters
+    ----------
+    programs
+        Commands of external trackers and controllers by name; None if the study will not be
+        run, and its trackers and controllers need not be installed
+
+    Raises
+    ------
+    InputError
+        With one line: the key, the fault, what is allowed, the file and line.
     """
     path = find(str(name))
     tree, text = read_yaml(path)
@@ -85,8 +98,17 @@ def plan_of(
 ) -> Plan:
     """The validated plan of a study's tree, read from a text.
 
-    path : of the text, for messages;  base : a file beside which scenes are, `path` if left out
-    Raises InputError with one line.
+    Parameters
+    ----------
+    path
+        Of the text, for messages
+    base
+        A file beside which scenes are, `path` if left out
+
+    Raises
+    ------
+    InputError
+        With one line.
     """
     try:
         study = Study.model_validate(tree)
@@ -105,9 +127,11 @@ def plan_of(
 def check(plan: Plan, to_run: bool) -> None:
     """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
 
-    to_run : whether the trackers and controllers must be installed
+    Parameters
+    ----------
+    to_run
+        Whether the trackers and controllers must be installed
     """
-    from skysim.experiments.study import search
     from skysim.experiments.study import search
     from skysim.experiments.study.execution.store import COLUMNS
 
@@ -143,8 +167,7 @@ def check(plan: Plan, to_run: bool) -> None:
 
 def check_figures(plan: Plan) -> None:
     """Raise InputError for a figure or threshold of an unknown factor, level or response."""
-    from skysim.experiments.study import thresholds
-    from skysim.experiments.study import table
+    from skysim.experiments.study import table, thresholds
     from skysim.experiments.study.table import PointRow
 
     study = plan.study
@@ -338,5 +361,3 @@ def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Sett
         ).settings
         for level, settings in factor.options() or [middle[name]]:
             yield name, level, settings, others | settings
-
-

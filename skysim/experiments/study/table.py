@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
-from skysim.experiments.study.execution.store import Store
-from skysim.results import metrics
-from skysim.results.files.row_parts import Rows
-from skysim.results.metrics import Summary
-from typing import NamedTuple
 import scipy
-from skysim.core.errors import InputError
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.study.plan import Plan
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
+from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
+from skysim.results import metrics
+from skysim.results.files.row_parts import Rows
 from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
-from skysim.core.errors import InputError, unknown_name
-from skysim.experiments.study.factors import (Distribution, Levels, Range, Value, split_quantity)
-from skysim.experiments.study.plan import Figure, Study, Threshold
-
-
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
@@ -161,8 +156,6 @@ def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
     return Rows((*rows, *levels), [column], [rows.starts[-1]])
 
 
-
-
 # Error budget: Sobol indices of the attitude error for each factor (Sobol 1993).
 
 
@@ -251,8 +244,6 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
     varying = weight > 0
     both = (estimate.first_order, estimate.total_order)
     return np.stack([weight[varying] @ index[varying] / weight.sum() for index in both])
-
-
 
 
 # Factors of a study as axes, and which of its points a figure or a threshold is about.
@@ -453,5 +444,3 @@ def group_points(
         group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
         for one in group_axis.levels
     }
-
-

@@ -12,17 +12,16 @@ import bisect
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+
 import numpy as np
 import scipy
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study import table
-from skysim.experiments.study.table import Axis
-from skysim.experiments.study.table import PointRow
 from skysim.experiments.study.plan import Curve, Study, Threshold
+from skysim.experiments.study.table import Axis, PointRow
 from skysim.results import metrics
-
-
 
 TAIL = (1 - metrics.CONFIDENCE) / 2
 MOST_TRIALS = 1_000_000  # more trials than that are no advice
@@ -32,12 +31,21 @@ MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic
 class Crossing(NamedTuple):
     """Where a proportion crosses a limit along a factor.
 
-    value    : the estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither rises nor falls
-    low, high: interval at CONFIDENCE; -inf or inf where no level is certain
-    rising   : whether the proportion rises along the factor
-    between  : the two levels between which it crosses, where trials are so few that the estimate is no more than that
-               (`too_few`); None otherwise
-    needs    : of each open end that more trials would close, a level, and about how many trials it takes in all
+    Attributes
+    ----------
+    value
+        The estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither
+        rises nor falls
+    low, high
+        Interval at CONFIDENCE; -inf or inf where no level is certain
+    rising
+        Whether the proportion rises along the factor
+    between
+        The two levels between which it crosses, where trials are so few that the estimate is no
+        more than that (`too_few`); None otherwise
+    needs
+        Of each open end that more trials would close, a level, and about how many trials it
+        takes in all
     """
 
     value: float
@@ -54,13 +62,16 @@ class Crossing(NamedTuple):
 def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = False) -> Crossing:
     """Where a monotonic proportion crosses a limit, from (L,) hits of (L,) trials at (L,) ascending levels.
 
-    log : interpolate between the levels in the logarithm of x
-
     The isotonic fit is the maximum-likelihood estimate of a monotonic curve (Ayer et al. 1955). The interval's ends
     are found by fixed-sequence tests (Maurer, Hothorn & Lehmacher 1995): from the side where the proportion is above
     the limit, level after level as long as its exact lower bound (Clopper & Pearson 1934) is; from the other side
     likewise with upper bounds. A wrong end requires a wrong test at the first level beyond the true crossing, so each
     end is wrong with a probability of at most 2.5 %, for any monotonic curve.
+
+    Parameters
+    ----------
+    log
+        Interpolate between the levels in the logarithm of x
     """
     fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
     rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
@@ -144,7 +155,10 @@ def certain_levels(
 ) -> tuple[float | None, float | None]:
     """The last level that is certainly above the limit and the first that is certainly below it, by fixed sequences.
 
-    x : (L,) levels in the order in which the proportion falls
+    Parameters
+    ----------
+    x
+        (L,) levels in the order in which the proportion falls
     """
     counts = list(
         zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True)
@@ -272,3 +286,39 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"
 
 
+def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
+    """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
+    axis = table.axis(study, lines, threshold.along)
+    unit = table.unit_of(axis)
+    found = [
+        (f" ({label})" if label else "", one)
+        for label, one in crossings(threshold, study, lines).items()
+        if one is not None
+    ]
+    if not found:
+        return ""
+    limit = f"{100 * threshold.limit:g} %"
+    at = [
+        f"{one.between[0]:.4g} to {one.between[1]:.4g}{unit}{label}"
+        if one.between
+        else f"{one.value:.4g}{unit}{label}"
+        for label, one in found
+        if math.isfinite(one.value)
+    ]
+    always = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) != one.rising
+    ]
+    never = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) == one.rising
+    ]
+    parts = []
+    if at:
+        crosses = "reaches" if any(one.rising for _, one in found) else "falls below"
+        parts.append(
+            f"{threshold.response} {crosses} {limit} at {threshold.along} = {', '.join(at)}"
+        )
+    for labels, text in ((always, f"at least {limit}"), (never, f"below {limit}")):
+        if labels:
+            subject = "" if parts else f"{threshold.response} is "
+            parts.append(f"{subject}{text} at all levels{','.join(labels)}")
+    return "; ".join(parts) + "." if parts else ""

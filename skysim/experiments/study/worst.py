@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from skysim.core.types import Floats
-from skysim.experiments.study.table import points_at
-from skysim.experiments.study.table import PointRow
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
+from skysim.experiments.study.table import PointRow, points_at
 from skysim.results import metrics
 from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import Columns
-
-
 
 COUNT = 3  # number of worst trials that a report lists
 DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
@@ -37,10 +36,20 @@ ColumnsOf = Callable[..., Columns]  # the columns of the trials of some points
 class WorstTrial(NamedTuple):
     """One of the worst trials: its number, point and attitude, and what happened in it.
 
-    status : "misidentified" where it is solved with wrong lights
-    tilt_deg, azimuth_deg : of the body's z axis under a dome;  ra_deg, dec_deg : of the boresight under the stars
-    yaw_deg, pitch_deg, roll_deg : the body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
-    lights : in the field;  cross_arcsec, roll_arcsec : its errors, NaN without a solution
+    Attributes
+    ----------
+    status
+        "misidentified" where it is solved with wrong lights
+    tilt_deg, azimuth_deg
+        Of the body's z axis under a dome
+    ra_deg, dec_deg
+        Of the boresight under the stars
+    yaw_deg, pitch_deg, roll_deg
+        The body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
+    lights
+        In the field
+    cross_arcsec, roll_arcsec
+        Its errors, NaN without a solution
     """
 
     trial: int
@@ -184,5 +193,3 @@ def worst_of_levels(
     rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
     chosen = points_at(rows, study, levels)
     return worst_trials(store.point_columns(*(row.point for row in chosen)), response, count)
-
-

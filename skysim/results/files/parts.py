@@ -10,32 +10,28 @@ tape with a driver chip at each LED.
 from __future__ import annotations
 
 import csv
+import io
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
-from skysim.core.errors import InputError, Where
-from skysim.core.text import (excerpt, read_lines)
-from skysim.core.yaml_reader import suggestion
-from skysim.core.files import DATA
-import io
-from collections.abc import Callable
+
 import numpy as np
-from skysim.core.errors import InputError
+
+from skysim.core.errors import InputError, Where
+from skysim.core.files import DATA
+from skysim.core.text import excerpt, read_lines
 from skysim.core.types import Floats, Sources
+from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig, PwmConfig, SequentialConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import Ints
-from skysim.sources.dome.layouts.string import (mean_meridian, wind)
-from skysim.sources.dome.surface import cap_area_m2
-from skysim.sources.dome.surface import (Surface, build_surface)
+from skysim.sources.dome.layouts.string import mean_meridian, wind
+from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
 from skysim.sources.photometry import Band
-
-
-
-
 
 # Prices of a dome's parts: a CSV table that the user edits; the shipped one, `assumed`, is a guess
 # throughout.
@@ -62,8 +58,16 @@ LARGEST = 1e9
 class Price(NamedTuple):
     """A line of the table.
 
-    price : of a unit;  fixed : once;  serves : how many LEDs or channels one part serves
-    sigma_m : error of an LED's place along each axis that a survey reaches; nan for other parts
+    Attributes
+    ----------
+    price
+        Of a unit
+    fixed
+        once
+    serves
+        How many LEDs or channels one part serves
+    sigma_m
+        Error of an LED's place along each axis that a survey reaches; nan for other parts
     """
 
     unit: str
@@ -277,7 +281,9 @@ def build_design(scene: Scene) -> DomeDesign:
         raise InputError("light.kind", f"{light.kind} has no parts", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
-    return DomeDesign(light, surface, leds, max(light.layout.cap_deg, max_tilt_deg(leds.place[:, :3])))
+    return DomeDesign(
+        light, surface, leds, max(light.layout.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    )
 
 
 def single_leds(design: DomeDesign) -> Quantities:
@@ -385,5 +391,3 @@ def cells(line: PartLine) -> list[str]:
     quantity = f"{line.quantity:.0f}" if line.unit == "each" else f"{line.quantity:.2f}"
     money = [f"{line.price:.2f}", f"{line.fixed:.2f}", f"{line.sum:.2f}"]
     return [line.part, quantity, line.unit, *money, line.what]
-
-

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skysim.core.errors import InputError
-from skysim.core import files
-from skysim.core.images import read_fits
-from skysim.core.types import Floats
-from skysim.sources import stars
-import dataclasses
-import shutil
+
 from skysim.camera import wcs
-from skysim.core.files import (atomic_file, write_png16, write_table)
-from skysim.core.types import Frame, Truth
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file, write_png16, write_table
+from skysim.core.images import read_fits
+from skysim.core.types import Floats, Frame, Truth
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-
-
+from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
@@ -114,7 +113,10 @@ class Recording:
     def motion(self) -> tuple[Floats, Rotation] | None:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
 
-        Raises InputError if a column is missing.
+        Raises
+        ------
+        InputError
+            If a column is missing.
         """
         telemetry = self.table("telemetry")
         if telemetry is None:
@@ -157,7 +159,10 @@ def open_recording(folder: Path) -> Recording:
 def read_truth(path: Path) -> FrameTruth:
     """Read the truth of a frame.
 
-    Raises InputError (one line) for a file that is not a truth file or that an older skysim wrote.
+    Raises
+    ------
+    InputError
+        (one line) for a file that is not a truth file or that an older skysim wrote.
     """
     sources = files.read_table(path)
     counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
@@ -187,8 +192,6 @@ def read_truth(path: Path) -> FrameTruth:
         sources=sources,
         **numbers,
     )
-
-
 
 
 # Write frames and their truth to a results folder, and clear an earlier run from it. Writes are
@@ -303,5 +306,3 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     if truth.satellites:
         table.meta["satellites"] = [dataclasses.asdict(satellite) for satellite in truth.satellites]
     write_table(path, table)
-
-

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
-import numpy as np
-from scipy.spatial.transform import Rotation
-from skysim.core.errors import InputError
-from skysim.core.time import in_utc
-from skysim.core.types import Floats
-from skysim.dynamics.profile_samples import (BODY, CAMERA, ICRF, LAB)
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
 import cv2
-from skysim.core.errors import InputError, unknown_name
-from skysim.core import files
-from skysim.core import images
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.time import in_utc
+from skysim.core.types import Floats
+from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
 from skysim.results import plots
 from skysim.results.files import recording as frame_files
-from skysim.results.files.recording import (FrameTruth, Recording)
+from skysim.results.files.recording import FrameTruth, Recording
 from skysim.results.files.row_parts import EXTRA
-
-
-
-
 
 # Write attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation
 # (CCSDS 504.0-B-2).
@@ -55,15 +50,22 @@ def message(
 ) -> str:
     """The text of an AEM file with one segment of type QUATERNION.
 
-    name     : object name
-    notes    : comments
-    frames   : (A, B), keys of MEANING
-    utc      : K epochs, ascending
-    a_from_b : K rotations
-
     The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
     quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
     X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
+
+    Parameters
+    ----------
+    name
+        Object name
+    notes
+        comments
+    frames
+        (A, B), keys of MEANING
+    utc
+        K epochs, ascending
+    a_from_b
+        K rotations
     """
     if not utc:
         raise InputError(name, "no attitude to write")
@@ -340,7 +342,10 @@ def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
 def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """Write frames.zarr (Zarr 3): frames in chunks of one, with times, exposures, attitudes and rates.
 
-    Raises InputError if zarr is not installed or the frames differ in size or type.
+    Raises
+    ------
+    InputError
+        If zarr is not installed or the frames differ in size or type.
     """
     try:
         import zarr
@@ -477,7 +482,10 @@ EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
 def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
     """Write a run in each of the formats and return the paths.
 
-    Raises InputError for an unknown format before anything is written.
+    Raises
+    ------
+    InputError
+        For an unknown format before anything is written.
     """
     names = list(dict.fromkeys(formats))
     for name in names:
@@ -485,5 +493,3 @@ def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[
             raise InputError("export.formats", *unknown_name("format", name, EXPORTS))
     files.make_folder(out)
     return [path for name in names for path in EXPORTS[name](run, out, bar)]
-
-

@@ -14,25 +14,22 @@ is longer than the surface by the factor 1 / cos(x / R), which `MAX_WIDTH_M` lim
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from html import escape
-from typing import NamedTuple
-from skysim.core.types import Floats
 import math
 from collections.abc import Callable, Iterator
+from html import escape
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.layouts.string import directions
-from skysim.sources.dome.surface import (Surface, build_surface, perpendicular)
-
-
-
-
+from skysim.sources.dome.surface import Surface, build_surface, perpendicular
 
 # A flat drawing in millimeters, as SVG to print and as DXF for a cutter.
 
@@ -128,7 +125,7 @@ def to_dxf(drawing: Drawing) -> str:
 
 def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
     """The group codes and values of a shape; a dashed line is on a layer of its own."""
-    kind = type(shape).__name__.upper()
+    kind = "CIRCLE" if isinstance(shape, Circle) else "TEXT"
     layer = (8, shape.layer)
     if isinstance(shape, Polyline):
         layer = (8, "HELP" if shape.dashed else shape.layer)
@@ -169,7 +166,12 @@ MARK_M = 4e-3  # size of an LED's mark on the mesh
 class Dome(NamedTuple):
     """What the builder makes: the surface to the cap's rim, and LEDs by number (N,) at (N, 3) places.
 
-    name : of the scene;  led_radius_m : of an LED's disk
+    Attributes
+    ----------
+    name
+        Of the scene
+    led_radius_m
+        Of an LED's disk
     """
 
     name: str
@@ -265,8 +267,8 @@ def gores(dome: Dome) -> Drawing:
     rule_mm = bottom_mm + CAPTION_MM
     caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top. To scale if this line is {RULE_MM:g} mm."
     shapes += [
-        Path(np.array([[MARGIN_MM, rule_mm], [MARGIN_MM + RULE_MM, rule_mm]])),
-        Text(MARGIN_MM, rule_mm + 6, 5.0, caption),
+        Polyline(np.array([[MARGIN_MM, rule_mm], [MARGIN_MM + RULE_MM, rule_mm]])),
+        SheetText(MARGIN_MM, rule_mm + 6, 5.0, caption),
     ]
     return Drawing(left_mm - GAP_MM + MARGIN_MM, rule_mm + CAPTION_MM + MARGIN_MM, shapes)
 
@@ -283,18 +285,18 @@ def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
 def gore_shapes(outline_mm: Floats, title: str) -> Iterator[Shape]:
     """The outline of a gore, its central meridian and its title at the apex."""
     apex = outline_mm[0]
-    yield Path(outline_mm, closed=True)
-    yield Path(np.array([apex, [apex[0], outline_mm[:, 1].max()]]), dashed=True)
-    yield Text(apex[0] - 12, apex[1] - 2, 4.0, title)
+    yield Polyline(outline_mm, closed=True)
+    yield Polyline(np.array([apex, [apex[0], outline_mm[:, 1].max()]]), dashed=True)
+    yield SheetText(apex[0] - 12, apex[1] - 2, 4.0, title)
 
 
 def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
     """A circle with a cross for each LED, and its number."""
     for number, (x, y) in zip(numbers, xy_mm, strict=True):
         yield Circle(x, y, radius_mm)
-        yield Path(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
-        yield Path(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
-        yield Text(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
+        yield Polyline(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
+        yield Polyline(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
+        yield SheetText(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
 
 
 def shell_obj(dome: Dome) -> str:
@@ -350,5 +352,3 @@ TEMPLATES: dict[str, Callable[[Dome], str]] = {
     ".dxf": lambda dome: to_dxf(gores(dome)),
     ".obj": shell_obj,
 }
-
-

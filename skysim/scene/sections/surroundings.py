@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Self
-from pydantic import Field, model_validator
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
 from skysim.core.constants import FWHM_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
-from typing import Annotated, Literal
-from skysim.core.units import Ascending, ConfigModel, Length, Number, Time, check_table
-from typing import Annotated, Literal, Self
-from pydantic import AfterValidator, Field, model_validator
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, Time, check_table
 from skysim.core.yaml_reader import existing_file
-from skysim.core.units import ConfigModel, Fraction, Length, Number
-
-
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
@@ -41,8 +36,12 @@ class HorizonConfig(ConfigModel):
 class AirGlowConfig(ConfigModel):
     """The sky's glow, which follows from time and place.
 
-    dark_mag_arcsec2 : V surface brightness of the moonless night sky at the zenith
-    moonlight, twilight : scattered light of the Moon and of the Sun
+    Attributes
+    ----------
+    dark_mag_arcsec2
+        V surface brightness of the moonless night sky at the zenith
+    moonlight, twilight
+        Scattered light of the Moon and of the Sun
     """
 
     dark_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 21.7
@@ -53,15 +52,26 @@ class AirGlowConfig(ConfigModel):
 class AirConfig(ConfigModel):
     """The atmosphere over `site`. Of the standard atmosphere at the site's height what is left out.
 
-    pressure_hpa, temperature_c : at the site
-    humidity         : relative, 0 to 1
-    wavelength       : of refraction; the mean of a G2 star's photo-electrons if left out
-    extinction_mag   : k' at the zenith in the camera's band;  color_extinction_mag : k''. A star loses
-        (k' + k'' (B-V)) mag for each air mass
-    scintillation    : whether stars twinkle
-    seeing_arcsec    : full width of a star's image at the zenith, half maximum, at a long exposure
-    horizon          : the skyline; altitude 0 all around if left out
-    glow             : sky, twilight and moonlight; none if left out
+    Attributes
+    ----------
+    pressure_hpa, temperature_c
+        At the site
+    humidity
+        Relative, 0 to 1
+    wavelength
+        Of refraction; the mean of a G2 star's photo-electrons if left out
+    extinction_mag
+        k' at the zenith in the camera's band
+    color_extinction_mag
+        k''. A star loses (k' + k'' (B-V)) mag for each air mass
+    scintillation
+        Whether stars twinkle
+    seeing_arcsec
+        Full width of a star's image at the zenith, half maximum, at a long exposure
+    horizon
+        The skyline; altitude 0 all around if left out
+    glow
+        Sky, twilight and moonlight; none if left out
     """
 
     pressure_hpa: Annotated[Number, Field(ge=0, le=1100)] | None = None
@@ -79,8 +89,6 @@ class AirConfig(ConfigModel):
         """Standard deviation of a star's image at the zenith by the seeing; 0 where it is too small to matter."""
         sigma_px = math.radians(self.seeing_arcsec / 3600) * (1 / FWHM_PER_SIGMA) * focal_px
         return sigma_px if sigma_px > NEGLIGIBLE_PX else 0.0
-
-
 
 
 # Schema of the scene section `thermal`: the temperature of the laboratory, and what moves with it.
@@ -140,13 +148,22 @@ Temperatures = Annotated[
 class ThermalConfig(ConfigModel):
     """What has moved since survey and calibration, which were at reference_c. The tracker does not know of it.
 
-    temperature   : of dome, mount and lens alike, against the time since the scene's start
-    speed         : the temperature's history runs so many times as fast as the clock, so that a short run has hours
-    dome_ppm_k    : linear expansion of the dome with its LEDs, from the level anchor_height above the bearing's center
-        on its axis; acrylic has 70, steel 12
-    creep         : displacement of the dome since its survey
-    mount_arcsec_k: rotation of the camera on the vehicle about the camera's axes
-    lens_ppm_k    : relative change of the focal length
+    Attributes
+    ----------
+    temperature
+        Of dome, mount and lens alike, against the time since the scene's start
+    speed
+        The temperature's history runs so many times as fast as the clock, so that a short run
+        has hours
+    dome_ppm_k
+        Linear expansion of the dome with its LEDs, from the level anchor_height above the
+        bearing's center on its axis; acrylic has 70, steel 12
+    creep
+        Displacement of the dome since its survey
+    mount_arcsec_k
+        Rotation of the camera on the vehicle about the camera's axes
+    lens_ppm_k
+        Relative change of the focal length
     """
 
     temperature: Temperatures
@@ -174,8 +191,6 @@ class ThermalConfig(ConfigModel):
         return self
 
 
-
-
 # Schema of the scene section `orbit`, of the satellites in a sky scene, and of what the Earth does
 # to the camera.
 
@@ -188,10 +203,17 @@ Rate = Annotated[Number, Field(gt=0, le=30)]
 class RandomSatellitesConfig(ConfigModel):
     """Sunlit satellites on random paths, drawn anew for each frame: anywhere in the field, in any direction.
 
-    per_field  : mean number in the camera's field (the circle around its chip) at any moment
-    rate_deg_s : least and greatest angular rate against the stars; its logarithm is uniformly distributed
-    v_mag      : least and greatest V magnitude, uniformly distributed
-    seed       : of all these draws, together with the scene's
+    Attributes
+    ----------
+    per_field
+        Mean number in the camera's field (the circle around its chip) at any moment
+    rate_deg_s
+        Least and greatest angular rate against the stars; its logarithm is uniformly
+        distributed
+    v_mag
+        Least and greatest V magnitude, uniformly distributed
+    seed
+        Of all these draws, together with the scene's
     """
 
     per_field: Annotated[Number, Field(gt=0, le=1000)]
@@ -211,9 +233,14 @@ class RandomSatellitesConfig(ConfigModel):
 class SatellitesConfig(ConfigModel):
     """Artificial satellites, seen from the scene's `orbit`, or else from `site` with its longitude.
 
-    file         : mean elements: TLE, or OMM as CSV, XML or JSON
-    standard_mag : V at a range of 1000 km and a phase angle of 90 degrees, of all satellites of the file
-    random       : further satellites on random paths
+    Attributes
+    ----------
+    file
+        Mean elements: TLE, or OMM as CSV, XML or JSON
+    standard_mag
+        V at a range of 1000 km and a phase angle of 90 degrees, of all satellites of the file
+    random
+        Further satellites on random paths
     """
 
     file: ElementsFile | None = None
@@ -230,8 +257,14 @@ class SatellitesConfig(ConfigModel):
 class ExclusionConfig(ConfigModel):
     """When the tracker can be used in its orbit, for `skysim availability`.
 
-    sun_deg, moon_deg : least angle of the boresight from their centers;  earth_deg : from the Earth's limb
-    stars : least number of stars to `tracker.limit_mag` in a round field of the chip's area
+    Attributes
+    ----------
+    sun_deg, moon_deg
+        Least angle of the boresight from their centers
+    earth_deg
+        From the Earth's limb
+    stars
+        Least number of stars to `tracker.limit_mag` in a round field of the chip's area
     """
 
     sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
@@ -243,8 +276,12 @@ class ExclusionConfig(ConfigModel):
 class EarthConfig(ConfigModel):
     """The Earth's light in the field: lit ground, the air above its limb, and the airglow.
 
-    albedo  : of the ground with its clouds
-    airglow : V surface brightness of the layer seen from straight above
+    Attributes
+    ----------
+    albedo
+        Of the ground with its clouds
+    airglow
+        V surface brightness of the layer seen from straight above
     """
 
     albedo: Fraction = 0.3
@@ -254,8 +291,12 @@ class EarthConfig(ConfigModel):
 class OrbitConfig(ConfigModel):
     """The camera's orbit about the Earth: keys common to all kinds.
 
-    earth     : the Earth's light; if left out it is dark, but hides stars
-    exclusion : limits of the tracker's use; none if left out
+    Attributes
+    ----------
+    earth
+        The Earth's light; if left out it is dark, but hides stars
+    exclusion
+        Limits of the tracker's use; none if left out
     """
 
     earth: EarthConfig | None = None
@@ -265,8 +306,12 @@ class OrbitConfig(ConfigModel):
 class CircularOrbitConfig(OrbitConfig):
     """A circular orbit at the scene's start, in GCRS axes, turned by the Earth's flattening (J2).
 
-    altitude     : above the Earth's equatorial radius, 6378.137 km
-    argument_deg : from the ascending node to the camera at start_time
+    Attributes
+    ----------
+    altitude
+        Above the Earth's equatorial radius, 6378.137 km
+    argument_deg
+        From the ascending node to the camera at start_time
     """
 
     kind: Literal["circular"]
@@ -279,7 +324,10 @@ class CircularOrbitConfig(OrbitConfig):
 class TleOrbitConfig(OrbitConfig):
     """An orbit of mean elements (SGP4): a TLE, or an OMM as CSV, XML or JSON.
 
-    number : the satellite's catalog number, for a file of several
+    Attributes
+    ----------
+    number
+        The satellite's catalog number, for a file of several
     """
 
     kind: Literal["tle"]
@@ -297,5 +345,3 @@ class OemOrbitConfig(OrbitConfig):
 Orbit = Annotated[
     CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
 ]
-
-

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
@@ -17,8 +19,6 @@ from skysim.dynamics import guidance, multibody
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.lab import Lab
-
-
 
 MAX_FRAMES = (
     400  # frames at which the reference is evaluated to find the fastest and the most tilted one
@@ -31,10 +31,16 @@ GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 class CheckedAttitudes(NamedTuple):
     """N attitudes.
 
-    lab_from_body   : N rotations
-    rate_body_rad_s : (N, 3) in body axes; zeros where only the direction is of interest
-    t_s             : (N,) time of the frame; NaN where it is none
-    acceleration_body_rad_s2 : (N, 3) in body axes; None for zeros
+    Attributes
+    ----------
+    lab_from_body
+        N rotations
+    rate_body_rad_s
+        (N, 3) in body axes; zeros where only the direction is of interest
+    t_s
+        (N,) time of the frame; NaN where it is none
+    acceleration_body_rad_s2
+        (N, 3) in body axes; None for zeros
     """
 
     lab_from_body: Rotation
@@ -127,9 +133,12 @@ def within_reach(
 ) -> CheckedAttitudes:
     """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
-    tilt_deg : the greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
-
     Directions are even on a Fibonacci spiral; the angles about them are even too.
+
+    Parameters
+    ----------
+    tilt_deg
+        The greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
     """
     n = np.arange(DIRECTIONS)
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
@@ -170,5 +179,3 @@ def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) ->
         tilt_deg = float(multibody.tilt_deg(lab_from_body))
         where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
     return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"
-
-

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
+
 from skysim.camera import wcs
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.scene.sections.light import (DomeConfig, StarsConfig)
-from skysim.simulation.checks import attitudes
+from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, context_of
-from skysim.simulation.checks import dome_warnings
 from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
-from skysim.simulation.checks.sampling import (CheckedSamples, sampled)
-from skysim.simulation.checks import sky_warnings
-from skysim.simulation.checks import sky_warnings
+from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.lab import Lab
 from skysim.simulation.motion import check_reference
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
-
-
 
 OWN_KEYS = (
     "camera.",
@@ -60,10 +57,19 @@ class Check(NamedTuple):
 def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
     """Check the plan of a lab whose motion need not be simulated.
 
-    tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
-    rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames
+    Parameters
+    ----------
+    tilt_deg
+        Greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of
+        a study)
+    rate_body_rad_s
+        (3,) rate of all frames in body axes, in place of the motion's, for trials of single
+        frames
 
-    Raises InputError for unreadable files, and for a maneuver that a run would refuse.
+    Raises
+    ------
+    InputError
+        For unreadable files, and for a maneuver that a run would refuse.
     """
     scene = lab.scene
     first = [
@@ -120,7 +126,9 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     return dome_warnings.compared(context, samples, LEAST_ALIKE, MAP_WORK)
 
 
-def samples_of(context: Context, frames: CheckedAttitudes, tilt_deg: float | None) -> CheckedSamples:
+def samples_of(
+    context: Context, frames: CheckedAttitudes, tilt_deg: float | None
+) -> CheckedSamples:
     """What the camera sees at the frames and within reach."""
     reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
     return CheckedSamples(sampled(frames, context), sampled(reach, context))
@@ -206,5 +214,3 @@ def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
         for line in own
     ]
     return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]
-
-

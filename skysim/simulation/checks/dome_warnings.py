@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-from skysim.core.types import Mount, Sources
-from skysim.scene.scene import Scene
-from skysim.scene.sections.light import (DomeConfig, SurveyedSurfaceConfig)
-from skysim.sources.dome import surface
-from skysim.sources.dome.surface import (Radial, Surface)
 import math
 from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.types import Mount, Sources
+from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.simulation.checks.detection import Context, centroid_variance, threshold_e
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.sampling import CheckedSamples
-from skysim.sources.dome.layouts.ambiguity import (Ambiguity, field_ambiguity)
-from skysim.simulation.checks.detection import Context, threshold_e
-from skysim.simulation.checks.facts import short
+from skysim.simulation.lights.lab_room import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
-from skysim.simulation.lights.lab_room import (IMAGES, Mirror)
-
-
+from skysim.sources.dome import surface
+from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
+from skysim.sources.dome.surface import Radial, Surface
 
 # Largest rms distance of the fitted ellipsoid from the surface that gives no warning. For a camera whose line of
 # sight passes 0.2 m beside the bearing, 1 m under the dome, it puts the intersection of the line of sight with the
@@ -119,8 +116,6 @@ def exposure_warning(scene: Scene, sources: Sources) -> str:
     )
 
 
-
-
 # Fields of an LED dome that look like another one: a regular layout is ambiguous however accurate
 # its survey.
 
@@ -172,8 +167,14 @@ def compared(
 ) -> tuple[Ambiguity, float]:
     """The most similar other field of each field within the greatest tilt, and what coincides, m.
 
-    least : fraction below which none is sought;  most_work : fields compared, those at the least tilts, times LEDs in
     a field
+
+    Parameters
+    ----------
+    least
+        Fraction below which none is sought
+    most_work
+        Fields compared, those at the least tilts, times LEDs in
     """
     lab = context.lab
     camera = context.camera.optics.camera
@@ -225,8 +226,6 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
     )
 
 
-
-
 # Whether the tracker detects images of LEDs in the dome's wall.
 
 
@@ -253,5 +252,3 @@ def mirror_images(context: Context, samples: CheckedSamples) -> str:
         f" {len(frames.used[n])} LEDs, the brightest {short(1 / share, 2)} times above its threshold, at"
         f" {attitudes.describe(frames.attitudes, n, lab.scene, lab.camera.mount)}; {cure}"
     )
-
-

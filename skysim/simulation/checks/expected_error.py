@@ -51,7 +51,6 @@ from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
 from skysim.sources.dome import survey_errors
-from skysim.sources.dome import survey_errors
 
 
 class Independent(NamedTuple):
@@ -232,8 +231,15 @@ EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     """(n, 3, 2) K_i: the rotation by a unit error of each image position, for weights 1 / sigma^2.
 
-    fitted : (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
-    Raises LinAlgError if the lights do not determine the rotation.
+    Parameters
+    ----------
+    fitted
+        (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
+
+    Raises
+    ------
+    LinAlgError
+        If the lights do not determine the rotation.
     """
     jacobian = view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
     weighted = jacobian / sigma_px[:, None, None] ** 2
@@ -272,9 +278,14 @@ def believed_sigma_px(view: View, noise: Independent, context: Context) -> Float
 class Mismatch(NamedTuple):
     """How far images are from where the tracker expects them, after the best attitude for that.
 
-    residual_px : (n,) of all errors together, of those drawn once 1 sigma;  gate_px : (n,) at which the tracker takes a
-        light for another
-    by_cause    : rms of the residual of each cause
+    Attributes
+    ----------
+    residual_px
+        (n,) of all errors together, of those drawn once 1 sigma
+    gate_px
+        (n,) at which the tracker takes a light for another
+    by_cause
+        Rms of the residual of each cause
     """
 
     residual_px: Floats

@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.scene.sections.light import (DomeConfig, StarsConfig)
-from skysim.simulation.checks import (beliefs)
-from skysim.simulation.checks import attitudes
+from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
-from skysim.simulation.checks.sampling import (Sampled, CheckedSamples)
+from skysim.simulation.checks.sampling import CheckedSamples, Sampled
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
 
@@ -187,9 +186,16 @@ def smear(context: Context, samples: CheckedSamples) -> Fact:
 class CapMargin(NamedTuple):
     """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
 
-    cap_deg : where the LEDs end; of a `listed` layout, the farthest one
-    needed_deg : for the middle of the field's longer side;  corner_deg : for its corner
-    limit_deg : the layout's `cap_deg`, to which shell and wires reach
+    Attributes
+    ----------
+    cap_deg
+        Where the LEDs end; of a `listed` layout, the farthest one
+    needed_deg
+        For the middle of the field's longer side
+    corner_deg
+        For its corner
+    limit_deg
+        The layout's `cap_deg`, to which shell and wires reach
     """
 
     cap_deg: float
@@ -213,10 +219,14 @@ def cap_margin(
 ) -> CapMargin | None:
     """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
-    tilt_deg : the greatest of the attitudes in reach if None
     Any side or corner of the field may point outward. Rays at these angles from the boresight are traced to the surface
     from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
     `light.layout.cap_deg` is compared with.
+
+    Parameters
+    ----------
+    tilt_deg
+        The greatest of the attitudes in reach if None
     """
     light = context.lab.scene.light
     camera = context.camera.optics.camera

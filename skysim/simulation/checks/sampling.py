@@ -9,24 +9,33 @@ from __future__ import annotations
 import math
 from collections import Counter
 from typing import NamedTuple
+
 import numpy as np
+
 from skysim.core.types import Floats
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
 from skysim.simulation.checks.views import VISIBLE, View, view
 from skysim.simulation.exposure import expected_exposure
-from skysim.simulation.lights.light import (Beam, Exposure, beam_of)
-
+from skysim.simulation.lights.light import Beam, Exposure, beam_of
 
 
 class Sampled(NamedTuple):
     """Some attitudes, what the camera sees there, and the expected errors.
 
-    known  : the lights on the chip that the tracker knows, also hidden ones
-    seen   : of them those that nothing hides;  used : those that it also detects
-    hidden : how many of them are hidden, by the name of what hides them
-    others : the lights that it detects and does not know, by their names
+    Attributes
+    ----------
+    known
+        The lights on the chip that the tracker knows, also hidden ones
+    seen
+        Of them those that nothing hides
+    used
+        Those that it also detects
+    hidden
+        How many of them are hidden, by the name of what hides them
+    others
+        The lights that it detects and does not know, by their names
     """
 
     attitudes: CheckedAttitudes
@@ -110,5 +119,3 @@ def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, 
             seen = view(lit, exposure, context.camera, beam.before(lit))
             found[lit.name] = usable(seen.take(seen.behind == VISIBLE), context)
     return {name: seen for name, seen in found.items() if len(seen)}
-
-

@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import math
-import numpy as np
-from skysim.core.constants import ARCSEC_RAD
-from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.detection import Context
-from skysim.simulation.checks.facts import short
-from skysim.simulation.checks.sampling import CheckedSamples
-from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.light import find_light
-from skysim.tracking.tracker_interface import OWN
 from collections.abc import Iterator
+
+import numpy as np
+
+from skysim.camera.glow.background import angular_separation_deg
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.checks.detection import Context, full_scale_e
-from skysim.simulation.checks.views import peak_share
-from skysim.sources.bodies import (NAMES, BodyLight)
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.simulation.checks import attitudes
+from skysim.simulation.checks.detection import (
+    BINOMIAL_VARIANCE_PX2,
+    Context,
+    centroid_variance,
+    full_scale_e,
+    threshold_e,
+)
 from skysim.simulation.checks.expected_error import Independent, covariance, gains, star_places
 from skysim.simulation.checks.facts import Fact, short
-from skysim.simulation.checks.sampling import (Sampled, CheckedSamples)
-from skysim.camera.glow.background import angular_separation_deg
+from skysim.simulation.checks.findings import few_lights
+from skysim.simulation.checks.sampling import CheckedSamples, Sampled
+from skysim.simulation.checks.views import peak_share
+from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.light import find_light
+from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad
 from skysim.sources.ephemeris import place
-from skysim.simulation.checks.detection import BINOMIAL_VARIANCE_PX2, Context, threshold_e
-from skysim.simulation.checks.facts import Fact
-from skysim.simulation.checks.findings import few_lights
 from skysim.sources.photometry import SUN, star_flux_e_s_m2
-
-
+from skysim.tracking.tracker_interface import OWN
 
 MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
 
@@ -71,8 +71,6 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
     if lab.scene.tracker.name == OWN:
         return f"tracker.refraction: {text}; change it to true"
     return f"tracker.name: {text}; change it to own, with tracker.refraction: true, or point higher"
-
-
 
 
 # Whether the Sun, the Moon or a planet is in the field of a scene's frames, and whether Sun or Moon
@@ -130,8 +128,6 @@ def peak_fill(context: Context, body: BodyLight) -> float:
         * float(peak_share(lens2_px2, radius, none, none)[0])
         / full_scale_e(scene.camera.detector)
     )
-
-
 
 
 # Whether the errors that the tracker will claim are true: the mean NEES that the checks expect
@@ -202,8 +198,6 @@ def floor_too_small(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-
-
 # Whether stray light past the baffle costs stars, and whether a body is within the tracker's
 # exclusion angles.
 
@@ -272,8 +266,6 @@ def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     )
     limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
     return np.array([sun, limb_deg, moon])
-
-
 
 
 # How deep the camera sees, and whether the simulated sky and the tracker's catalog are as deep.
@@ -415,5 +407,3 @@ def least_streak_px(samples: CheckedSamples) -> float:
             default=0.0,
         )
     )
-
-

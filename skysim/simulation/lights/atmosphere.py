@@ -9,17 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
+
 from skysim.camera.glow.air_glow import air_glow
-from skysim.camera.glow.background import (node_directions, viewing_geometry)
+from skysim.camera.glow.background import node_directions, viewing_geometry
 from skysim.camera.render import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit, Obstacle, Occluder)
-from skysim.simulation.lights.light import LightPlan
-from skysim.sources.air import (Air, Sky)
-
+from skysim.scene.sections.surroundings import AirGlowConfig
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.sources.air import Air, Sky
 
 
 @dataclass(frozen=True)
@@ -93,5 +92,3 @@ def build(plan: LightPlan) -> Iterator[Light]:
         yield Skyline(air)
         if light.air.glow:
             yield AirGlow(air, light.air.glow)
-
-

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
 from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Sources
-from skysim.scene.sections.light import (CollimatedDisplayConfig, DomeConfig)
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.sections.surroundings import ThermalConfig
-from skysim.simulation.lights.light import (EdgedGlow, Exposure, KnownLight, Lit)
-from skysim.sources.dome.led import warm_up_factor
-from skysim.sources.dome.codes import (Clocks, build_clocks)
-from skysim.sources.dome.codes import (LedCodes, build_codes)
-from collections.abc import Callable
-from typing import Any
-from skysim.simulation.lights.light import KnownLight
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, LightPlan, Lit
 from skysim.simulation.lights.starlight import stars_of
 from skysim.sources import dome
 from skysim.sources.dome import display
-from skysim.sources.dome.led import Emitter
-
-
+from skysim.sources.dome.codes import Clocks, LedCodes, build_clocks, build_codes
+from skysim.sources.dome.led import Emitter, warm_up_factor
 
 MAX_RUNS = 4  # whose timing is kept
 
@@ -31,8 +25,12 @@ MAX_RUNS = 4  # whose timing is kept
 class LedTiming(NamedTuple):
     """The LEDs' timing in one run.
 
-    clocks : the controllers' oscillators; None where all light is steady
-    codes  : the LEDs' words and the clock of their bits; None without light.led.code
+    Attributes
+    ----------
+    clocks
+        The controllers' oscillators; None where all light is steady
+    codes
+        The LEDs' words and the clock of their bits; None without light.led.code
     """
 
     clocks: Clocks | None
@@ -43,7 +41,10 @@ class LedTiming(NamedTuple):
 class LedDome(KnownLight):
     """A dome's LEDs: warmed up, moved by the temperature, and lit by their controllers' pulses and codes.
 
-    thermal : what has moved since the survey; None for nothing
+    Attributes
+    ----------
+    thermal
+        What has moved since the survey; None for nothing
     """
 
     config: DomeConfig
@@ -111,8 +112,6 @@ def black_pixels(
     )
 
 
-
-
 # The scene's own light, which a tracker can know: stars, LEDs of a dome, or stars on a collimated
 # display.
 
@@ -142,5 +141,3 @@ KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
 def known_light(plan: LightPlan) -> KnownLight:
     """The light of the section `light`; that of the plan, if it has been made."""
     return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)
-
-

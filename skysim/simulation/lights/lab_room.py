@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
-from skysim.camera.glow.stray import (images_in_wall, wall_glow)
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.camera.glow.stray import images_in_wall, wall_glow
 from skysim.core.types import Floats
+from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.dome import known_light
-from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit)
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
 from skysim.sources.dome.led import warm_up_factor
-from skysim.sources.dome.interreflection import (ReflectingDome, reflecting_dome)
-from functools import partial
-import numpy as np
-from numpy.typing import NDArray
-from skysim.dynamics import multibody
-from skysim.simulation.lights.light import (Exposure, Light, Lit, Obstacle, Occluder)
-from skysim.sources.dome.surface import (Surface, build_surface)
-
+from skysim.sources.dome.surface import Surface, build_surface
 
 
 def images_of(name: str) -> str:
@@ -83,8 +82,6 @@ def build_wall(plan: LightPlan) -> Iterator[Light]:
             yield Mirror(dome)
 
 
-
-
 # What stands in the laboratory between a light and the camera: the vehicle's parts, and the dome's
 # wall.
 
@@ -145,5 +142,3 @@ def build_obstacles(plan: LightPlan) -> Iterator[Light]:
         yield Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount))
         if isinstance(light, DomeConfig):
             yield DomeWall(build_surface(light.surface))
-
-

@@ -10,11 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from skysim.camera.discs import centers_of
-from skysim.camera.glow.earth_glow import (stray_around_e_s_m2, stray_of_bodies_e_s_m2)
+from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.camera.glow.stray import ghost_optics
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
-from skysim.simulation.lights.light import (Beam, Exposure, Light, Lit, LightPath, beam_of)
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPath, LightPlan, Lit, beam_of
 from skysim.sources.bodies import BodyLight
 
 STRAY_LIGHT = "stray light"
@@ -69,7 +68,8 @@ class Ghosts(Light):
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
         paths = (
-            LightPath(n, ghost_optics(exposure.optics, ghost)) for n, ghost in enumerate(self.ghosts, 1)
+            LightPath(n, ghost_optics(exposure.optics, ghost))
+            for n, ghost in enumerate(self.ghosts, 1)
         )
         return beam._replace(paths=(*beam.paths, *paths))
 

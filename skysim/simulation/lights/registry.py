@@ -12,18 +12,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from skysim.scene.sections.light import (LightConfig, add_kind)
-from skysim.simulation.lights import (lens)
-from skysim.simulation.lights import atmosphere
-from skysim.simulation.lights import lab_room
-from skysim.simulation.lights import lab_room
-from skysim.simulation.lights import starlight
-from skysim.simulation.lights import sky_bodies
-from skysim.simulation.lights import sky_bodies
-from skysim.simulation.lights import sky_bodies
+from skysim.scene.sections.light import LightConfig, add_kind
+from skysim.simulation.lights import atmosphere, lab_room, lens, sky_bodies, starlight
 from skysim.simulation.lights.dome import known_light
-from skysim.simulation.lights.light import Light
-from skysim.simulation.lights.light import LightPlan
+from skysim.simulation.lights.light import Light, LightPlan
 
 KINDS: dict[str, Callable[[Any, LightPlan], Light]] = {}
 
@@ -31,8 +23,12 @@ KINDS: dict[str, Callable[[Any, LightPlan], Light]] = {}
 def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]) -> None:
     """Add a kind of light to those of the scene's list `lights`.
 
-    config : the schema of its section, with a literal `kind`
-    build  : makes the light of such a section
+    Parameters
+    ----------
+    config
+        The schema of its section, with a literal `kind`
+    build
+        Makes the light of such a section
     """
     KINDS[add_kind(config)] = build
 

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
-from skysim.camera.glow.earth_glow import earth_around
-from skysim.camera.glow.earth_glow import earth_light
+
+from skysim.camera.glow.earth_glow import earth_around, earth_light
 from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import EarthConfig
-from skysim.simulation.lights.light import (EdgedGlow, Exposure, Light, Lit, Obstacle, Occluder)
-from skysim.simulation.lights.light import LightPlan
-from skysim.sources.camera_orbit import (hidden_by_earth, sun_m)
-from typing import ClassVar
-from skysim.scene.sections.light import StarsConfig
-from skysim.scene.sections.surroundings import SatellitesConfig
-from skysim.simulation.lights.light import (Exposure, Light, Lit)
-from skysim.sources.orbit_elements import (MeanElements, read_elements)
-from skysim.sources.satellites import (MovingLight, as_sources, known_satellites, random_satellites)
-from skysim.sources.ephemeris import GcrsState
-from skysim.scene.sections.light import (BodiesConfig, StarsConfig)
+from skysim.scene.sections.light import BodiesConfig, StarsConfig
+from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
+from skysim.simulation.lights.light import (
+    EdgedGlow,
+    Exposure,
+    Light,
+    LightPlan,
+    Lit,
+    Obstacle,
+    Occluder,
+)
 from skysim.sources.bodies import bodies_from
-
-
+from skysim.sources.camera_orbit import hidden_by_earth, sun_m
+from skysim.sources.ephemeris import GcrsState
+from skysim.sources.orbit_elements import MeanElements, read_elements
+from skysim.sources.satellites import MovingLight, as_sources, known_satellites, random_satellites
 
 NAME = "the Earth"
 
@@ -72,8 +75,6 @@ def build_earth(plan: LightPlan) -> Iterator[Light]:
         yield LitEarth(orbit.earth) if orbit.earth else DarkEarth()
 
 
-
-
 # Artificial satellites: those of a file, and random ones.
 
 
@@ -81,7 +82,10 @@ def build_earth(plan: LightPlan) -> Iterator[Light]:
 class Satellites(Light):
     """Satellites that can cross the field, those of the file first.
 
-    elements : of the file; None without one
+    Attributes
+    ----------
+    elements
+        Of the file; None without one
     """
 
     only_adds: ClassVar[bool] = True
@@ -115,8 +119,6 @@ def build_satellites(plan: LightPlan) -> Iterator[Light]:
         yield Satellites(light.satellites, read_elements(file) if file else None)
 
 
-
-
 # Sun, Moon and planets.
 
 
@@ -135,5 +137,3 @@ def build_solar_system(plan: LightPlan) -> Iterator[Light]:
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.bodies:
         yield SolarSystem(light.bodies)
-
-

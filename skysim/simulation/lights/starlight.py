@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from skysim.camera.glow.background import glow_map
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, StarSources
-from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.lights.light import (Exposure, KnownLight, Lit)
-from skysim.simulation.lights.light import LightPlan
+from skysim.scene.sections.light import Glow, StarsConfig
+from skysim.simulation.lights.light import Exposure, KnownLight, Light, LightPlan, Lit
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar
-from skysim.camera.glow.background import glow_map
-from skysim.scene.sections.light import Glow
-from skysim.simulation.lights.light import (Exposure, Light, Lit)
-
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,10 @@ class FixedStars(KnownLight):
 class StarsInOrbit(KnownLight):
     """Stars displaced by the velocity of an orbit, which turns by a degree in 15 s when it is low.
 
-    velocity_m_s : (3,) barycentric velocity for which `sources` are
+    Attributes
+    ----------
+    velocity_m_s
+        (3,) barycentric velocity for which `sources` are
     """
 
     velocity_m_s: Floats
@@ -77,8 +77,6 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
     return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)
 
 
-
-
 # The scene's section `background`: light leaks and the glow of the sky.
 
 
@@ -103,5 +101,3 @@ class BackgroundLight(Light):
 
 def build(plan: LightPlan) -> Iterator[Light]:
     yield BackgroundLight(plan.scene.background)
-
-

@@ -21,7 +21,10 @@ from skysim.sources.photometry import Band
 def sources(config: light.DomeConfig, band: Band) -> Sources:
     """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band.
 
-    Raises InputError for LEDs off the surface, and for a dome that does not fit into its room.
+    Raises
+    ------
+    InputError
+        For LEDs off the surface, and for a dome that does not fit into its room.
     """
     surface = build_surface(config.surface)
     if config.room is not None:

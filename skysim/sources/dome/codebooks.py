@@ -28,13 +28,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig
-
-
 
 Words = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -50,7 +50,10 @@ MAX_DATA_BITS = 20  # 2^20 words are listed at most
 def codebook(config: Code, count: int) -> Words:
     """(count, frames) levels of a scene's code, 0 the lowest; read-only.
 
-    Raises InputError if the kind has not so many words.
+    Raises
+    ------
+    InputError
+        If the kind has not so many words.
     """
     if isinstance(config, BchCodeConfig):
         words = packed(partial(bch, distance=config.distance), count, config.levels)
@@ -271,5 +274,3 @@ def balanced(words: Words) -> Words:
 
 
 PLAIN: dict[str, Callable[[int], Words]] = {"gray": gray, "hamming": hamming, "gold": gold}
-
-

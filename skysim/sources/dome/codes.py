@@ -8,23 +8,19 @@ drive's pulses are much faster than a bit; the code scales their light.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+
 import numpy as np
+
 from skysim.core.constants import HOUR_S, PPM
-from skysim.core.random_streams import LED_CLOCKS, random_stream
+from skysim.core.random_streams import LED_CLOCKS, LED_CODE, LED_CODE_CLOCK, random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import Layout, OnPoints
-from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig
-from skysim.scene.sections.light import (DomeConfig, Light)
-import math
-from skysim.core.random_streams import LED_CODE, LED_CODE_CLOCK, random_stream
-from skysim.scene.sections.leds import Code
-from skysim.sources.dome.codebooks import (Words, codebook, light_levels)
-
-
-
-
+from skysim.scene.sections.leds import ClockConfig, Code, DirectConfig, PwmConfig
+from skysim.scene.sections.light import DomeConfig, Light
+from skysim.sources.dome.codebooks import Words, codebook, light_levels
 
 # Clocks of the LED controllers: each times its pulses with an oscillator of its own.
 
@@ -39,10 +35,16 @@ FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' error
 class Clocks:
     """The oscillators of C controllers, (C,) each.
 
-    on_s    : tau_0, controller's time at t = 0
-    offset  : y, relative frequency offset at t = 0
-    drift_s : d, change of the relative frequency per second
-    filter_s : (N,) time constants of the LEDs' low-pass filters; None without them
+    Attributes
+    ----------
+    on_s
+        tau_0, controller's time at t = 0
+    offset
+        Y, relative frequency offset at t = 0
+    drift_s
+        D, change of the relative frequency per second
+    filter_s
+        (N,) time constants of the LEDs' low-pass filters; None without them
     """
 
     on_s: Floats
@@ -145,9 +147,14 @@ def hardware_seed(layout: Layout) -> int:
 class LedCodes:
     """The code of a dome's LEDs in one run.
 
-    words  : (N, B) levels, in the order of the dome's LEDs
-    clock  : one oscillator; None if the camera's trigger advances the code
-    seed   : of the run, which draws the bits that fail
+    Attributes
+    ----------
+    words
+        (N, B) levels, in the order of the dome's LEDs
+    clock
+        One oscillator; None if the camera's trigger advances the code
+    seed
+        Of the run, which draws the bits that fail
     """
 
     words: Words
@@ -202,5 +209,3 @@ def build_codes(light: Light, sources: Sources, seed: int) -> LedCodes | None:
         else Clocks.draw(light.led.clock, 1, hardware_seed(light.layout), seed, LED_CODE_CLOCK)
     )
     return LedCodes(codebook(code, len(sources)), code, clock, seed)
-
-

@@ -9,14 +9,17 @@ from __future__ import annotations
 import dataclasses
 import datetime
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections import (layouts, leds)
-from skysim.scene.sections import light
+from skysim.scene.sections import layouts, leds, light
+from skysim.scene.sections.layouts import ProjectorConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import Catalog
 from skysim.sources.dome.led import (
@@ -27,15 +30,8 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.surface import Plane
+from skysim.sources.dome.surface import Plane, Surface
 from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
-from skysim.scene.sections.layouts import ProjectorConfig
-from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.surface import Surface
-from skysim.sources.photometry import Band
-
-
 
 Ints = NDArray[np.int64]
 PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
@@ -44,10 +40,16 @@ PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 class PixelBlocks(NamedTuple):
     """Stars on a display, one for each of M lit blocks.
 
-    star      : (M,) index of the star; where several fall on one block, of the brightest
-    corner_px : (M, 2) column and row of the block's first pixel
-    center_px : (M, 2) column and row of its center, from the display's center
-    level     : (M,) transmitted light above that of black, as a fraction of a white block's
+    Attributes
+    ----------
+    star
+        (M,) index of the star; where several fall on one block, of the brightest
+    corner_px
+        (M, 2) column and row of the block's first pixel
+    center_px
+        (M, 2) column and row of its center, from the display's center
+    level
+        (M,) transmitted light above that of black, as a fraction of a white block's
     """
 
     star: Ints
@@ -59,10 +61,15 @@ class PixelBlocks(NamedTuple):
 def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats) -> PixelBlocks:
     """Draw stars as blocks of pixels: places rounded to the nearest block that fits, levels to the nearest gray.
 
-    position_m : (N, 2) places on the display along its columns' and its rows' direction, from its center
-    level      : (N,) fraction of white; stars on one block add up, to white at most
     Rounding to a pitch p is an error uniform over p, p / sqrt(12) rms along each axis. A returned level of 0 is a
     star too faint for the gray levels.
+
+    Parameters
+    ----------
+    position_m
+        (N, 2) places on the display along its columns' and its rows' direction, from its center
+    level
+        (N,) fraction of white; stars on one block add up, to white at most
     """
     pixels = np.array(config.pixels)
     exact_px = position_m / config.pitch_m + (pixels - 1) / 2 - (config.block - 1) / 2
@@ -105,7 +112,10 @@ def min_level(config: layouts.PixelsConfig) -> float:
 def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
     """The panel as a surface: the flat surface, cut to the extent of the pixels.
 
-    Raises InputError if the pixels do not fit into the surface's width and height.
+    Raises
+    ------
+    InputError
+        If the pixels do not fit into the surface's width and height.
     """
     assert isinstance(surface, Plane)  # DomeConfig admits no other surface
     half_m = np.array(config.pixels) * config.pitch_m / 2
@@ -139,9 +149,13 @@ def panel_sources(
 ) -> Sources:
     """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
 
-    stars : as LEDs that are always lit, on the panel or near it; they are projected onto it
     Places and gray levels as in `draw_blocks`. A block is represented by a disk of its area; numbers are those of the
     stars. Raises InputError for a star nearer to black than to the first gray level.
+
+    Parameters
+    ----------
+    stars
+        As LEDs that are always lit, on the panel or near it; they are projected onto it
     """
     own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
     blocks = visible_blocks(config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band))
@@ -222,11 +236,15 @@ def display_sources(
 ) -> Sources:
     """Stars on a collimated display: a pixel (x, y) off the axis is a parallel beam along (x, y, focal length).
 
-    time : UTC, of the apparent places shown
     Returns Sources in lab axes: points at infinity, or, with config.conjugate_m = D, at D from the bearing's center, so
     that a camera off it by r sees them shifted by r / D. Strength is that of a star of config.brightest_mag and the
     Sun's color, times the gray level; magnitude is the catalog's. Pixels are not resolved.
     Raises InputError if no star is in the field, and for a star nearer to black than to the first gray level.
+
+    Parameters
+    ----------
+    time
+        UTC, of the apparent places shown
     """
     stars = stars.to_limit(config.limit_mag)
     direction = (
@@ -292,8 +310,6 @@ def beam_sources(
         clock=np.zeros(len(beam), dtype=np.int64),
         magnitude=stars.v_mag,
     )
-
-
 
 
 # A projector in the dome: a grid of pixels through a lens onto the matt wall, from a place off the
@@ -377,10 +393,17 @@ def projector_sources(
 ) -> Sources:
     """Stars drawn on the nearest blocks of pixels, as disks on the wall where the projector's rays meet it.
 
-    stars : as LEDs that are always lit, on the surface. Numbers are theirs; the picture is drawn for the lens's
-        distortion, so that a star is off by the rounding to pixels alone
-    Raises InputError for a projector outside the dome, for stars outside its picture or nearer to black than to the
-    first gray level, and for a pixel that passes below the rim.
+    Parameters
+    ----------
+    stars
+        As LEDs that are always lit, on the surface. Numbers are theirs; the picture is drawn
+        for the lens's distortion, so that a star is off by the rounding to pixels alone
+
+    Raises
+    ------
+    InputError
+        For a projector outside the dome, for stars outside its picture or nearer to black than
+        to the first gray level, and for a pixel that passes below the rim.
     """
     position_m = np.array(config.position_m)
     if not surface.inside(position_m):
@@ -405,7 +428,7 @@ def projector_sources(
     normal = surface.inward(place_m)
     lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
     cos_axis = ray @ own_from_lab(config).as_matrix()[2]
-    patches = Patches(
+    patches = LitBlocks(
         place_m, normal, np.hypot(lens_disk_m, led.disk_diameter_m / 2), cos_axis**config.falloff
     )
     return block_sources(config, led, band, stars, blocks, patches, 0.0)
@@ -425,5 +448,3 @@ def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) 
     cos_incidence = -np.sum(normal * sight_m, axis=1) / distance_m
     area_m2 = pixel_sr(config, cos_axis) * distance_m**2 / np.maximum(cos_incidence, 0)
     return np.where(shown & (cos_incidence > 0), cos_axis**config.falloff / area_m2, 0.0)
-
-

@@ -13,21 +13,17 @@ E = P / (A (1 - rho)), the law of the integrating sphere.
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+
 import numba
 import numpy as np
+
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.leds import Lobe
-from skysim.scene.sections.light import (FloorConfig, ReflectionConfig)
+from skysim.scene.sections.light import DomeConfig, FloorConfig, ReflectionConfig
 from skysim.sources.dome.led import LOBES
-from skysim.sources.dome.surface import Surface
-from typing import NamedTuple
-from skysim.core.types import Sources
-from skysim.scene.sections.light import (DomeConfig, ReflectionConfig)
-from skysim.sources.dome.surface import (Surface, build_surface)
-
-
+from skysim.sources.dome.surface import Surface, build_surface
 
 PATCHES = 700  # on the wall, and as many on the floor
 MAX_DIRECTIONS = 20_000  # from the bearing, for a wall that fills little of its sky
@@ -37,7 +33,10 @@ LOBE_SAMPLES = 2049  # of a lobe, at even cosines: within 1e-5 of cos^10
 class Emitters(NamedTuple):
     """N small emitters: places, unit normals, strengths in e- s^-1 sr^-1 along the normals, and their common lobe.
 
-    lobe : (K,) relative intensity at even cosines of the emission angle, from 0 to 1
+    Attributes
+    ----------
+    lobe
+        (K,) relative intensity at even cosines of the emission angle, from 0 to 1
     """
 
     place_m: Floats
@@ -195,8 +194,6 @@ def _irradiance(
     return out
 
 
-
-
 # A dome that reflects, as a scene describes it.
 
 
@@ -220,5 +217,3 @@ def reflecting_dome(light: object, leds: Sources) -> ReflectingDome | None:
         else None
     )
     return ReflectingDome(config, wall, diffuse)
-
-

@@ -23,15 +23,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import ReflectionConfig
-from skysim.sources.dome.surface import (Surface, perpendicular)
+from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
-
-
 
 STEP_RAD = 1e-5  # of the differences: error 1e-10
 STEPS = 12  # of Newton's method
@@ -52,7 +52,12 @@ class Rays(NamedTuple):
 class Image(NamedTuple):
     """K images: rows of their LEDs, directions from the camera, virtual distances, and cosines of the incidence.
 
-    wall_m : (K, 3) where they are mirrored;  along : (K, 3) from there toward the LED
+    Attributes
+    ----------
+    wall_m
+        (K, 3) where they are mirrored
+    along
+        (K, 3) from there toward the LED
     """
 
     led: NDArray[np.int64]
@@ -68,8 +73,14 @@ def mirrored(
 ) -> Sources:
     """The images of the LEDs that the camera sees in the wall; their numbers are in `false_lights.MIRRORED`.
 
-    camera_m : (3,) the entrance pupil;  grid : (h, w, 3) unit vectors that cover the field
     Images closer together than the grid's directions, near a caustic, can be missed. None for a camera outside.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil
+    grid
+        (h, w, 3) unit vectors that cover the field
     """
     if not wall.inside(camera_m):
         return leds.take(np.zeros(0, np.int64))
@@ -239,5 +250,3 @@ def cosines_to_grid(toward: Floats, grid: Floats) -> Floats:
     middle = grid.reshape(-1, 3).mean(axis=0)
     middle /= np.linalg.norm(middle)
     return np.asarray(toward @ middle - (grid @ middle).min() * (1 - 1e-12))
-
-

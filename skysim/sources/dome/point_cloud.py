@@ -12,13 +12,13 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
 import scipy
+
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-
-
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -39,8 +39,13 @@ class FittedSphere(NamedTuple):
 class FittedEllipsoid(NamedTuple):
     """The ellipsoid, with axes along the lab's, that is nearest to a surface.
 
-    center_m, semi_axes_m : (3,) each
-    rms_m                 : of the surface's distances from it, over the surface within its rim as the bearing sees it
+    Attributes
+    ----------
+    center_m, semi_axes_m
+        (3,) each
+    rms_m
+        Of the surface's distances from it, over the surface within its rim as the bearing sees
+        it
     """
 
     center_m: Floats
@@ -51,7 +56,10 @@ class FittedEllipsoid(NamedTuple):
 def fit_sphere(points_m: Floats) -> FittedSphere:
     """The sphere with the least sum of squared distances from points (N, 3), iterated from the algebraic fit.
 
-    Raises ValueError for points in a plane.
+    Raises
+    ------
+    ValueError
+        For points in a plane.
     """
     mean_m = points_m.mean(axis=0)
     scale_m = np.ptp(points_m, axis=0).max()
@@ -77,7 +85,11 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
     """The ellipsoid, with axes along the lab's, nearest to points: least squares of (|w| - 1) / |grad |w||.
 
-    points_m : (N, 3), N > 6;  w = (x - center) / semi_axes. To first order the residual is the distance.
+    Parameters
+    ----------
+    points_m
+        (N, 3), N > 6;  w = (x - center) / semi_axes. To first order the residual is the
+        distance.
     """
     sphere = fit_sphere(points_m)
 
@@ -100,9 +112,13 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
 def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
     """Zernike polynomials over the unit disk to a degree, (N, K), and their gradients, (N, K, 2).
 
-    disk : (N, 2). K = (degree + 1)(degree + 2) / 2; none exceeds 1 in the disk. The first is 1.
     Z = Re or Im of w^m R(q), w = x + iy, q = |w|^2,
     R(q) = sum_k (-1)^k (n - k)! / (k! ((n + m)/2 - k)! ((n - m)/2 - k)!) q^((n - m)/2 - k)  (Born & Wolf, sec. 9.2.1)
+
+    Parameters
+    ----------
+    disk
+        (N, 2). K = (degree + 1)(degree + 2) / 2; none exceeds 1 in the disk. The first is 1.
     """
     w = disk[:, 0] + 1j * disk[:, 1]
     q = np.abs(w) ** 2
@@ -135,9 +151,14 @@ class Zernike:
 
     The disk's radius is sin(angle / 2) / sin(half / 2), so the polynomials are orthogonal over the cap too.
 
-    half_rad     : the cap's half angle, 1 in the disk; beyond it the radius keeps its value at the edge
-    cover_rad    : angle to which the points reach in every azimuth
-    coefficient_m : (K,)
+    Attributes
+    ----------
+    half_rad
+        The cap's half angle, 1 in the disk; beyond it the radius keeps its value at the edge
+    cover_rad
+        Angle to which the points reach in every azimuth
+    coefficient_m
+        (K,)
     """
 
     half_rad: float
@@ -174,10 +195,16 @@ def to_disk(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
 class SurfaceFit:
     """Measured points and the smooth surface fitted to them.
 
-    center_m   : (3,) of their best sphere, in the points' own frame
-    radius     : radius over direction about it
-    residual_m : (N,) points' radii minus the surface's
-    sphere     : that best sphere, with its own rms
+    Attributes
+    ----------
+    center_m
+        (3,) of their best sphere, in the points' own frame
+    radius
+        Radius over direction about it
+    residual_m
+        (N,) points' radii minus the surface's
+    sphere
+        That best sphere, with its own rms
     """
 
     center_m: Floats
@@ -224,10 +251,19 @@ def read(file: str, unit: str) -> Floats:
 def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     """Smooth surface fitted to points of a dome whose axis is about +z: linear least squares in the radius.
 
-    points_m : (N, 3) in the arm's own frame
-    degree   : of the polynomials over direction, seen from the center of the points' best sphere
-    file     : to name in messages
-    Raises InputError for too few points, for points in a plane, and if parts of the surface have no points.
+    Parameters
+    ----------
+    points_m
+        (N, 3) in the arm's own frame
+    degree
+        Of the polynomials over direction, seen from the center of the points' best sphere
+    file
+        To name in messages
+
+    Raises
+    ------
+    InputError
+        For too few points, for points in a plane, and if parts of the surface have no points.
     """
     terms = (degree + 1) * (degree + 2) // 2
     needed = max(POINTS_PER_TERM * terms, 8)
@@ -267,5 +303,3 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
         radius_m - design @ coefficient,
         sphere,
     )
-
-

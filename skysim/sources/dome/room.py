@@ -8,14 +8,14 @@ shell bulges by 1.5e-4 of its radius at most.
 from __future__ import annotations
 
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.light import RoomConfig
-from skysim.sources.dome.surface import (Plane, Surface)
-
-
+from skysim.sources.dome.surface import Plane, Surface
 
 TILTS = 91  # from the zenith to the nadir
 MERIDIANS = 72  # of the whole shell, divisible by 4
@@ -61,9 +61,15 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
 def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
     """Size of a dome in its room, m.
 
-    extent_m : (3,) along x, y, z, thickness included
-    top_m, rim_m : above the floor, if the room has bearing_height
-    part_m   : sides of the box about the part that fits the door least, ascending, if the room has a door
+    Returns
+    -------
+    extent_m
+        (3,) along x, y, z, thickness included
+    top_m, rim_m
+        Above the floor, if the room has bearing_height
+    part_m
+        Sides of the box about the part that fits the door least, ascending, if the room has a
+        door
     """
     points_m = shell_m(
         room, surface, cap_deg, np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
@@ -127,9 +133,13 @@ def best_box(
 ) -> tuple[Floats, float]:
     """The box about (N, 3) points that goes best through the door: ascending sides, m, and the ratio to the door.
 
-    middle_rad : azimuth of the vertical plane in which the box is turned
     A box goes through if its smallest side is within the door's smaller one and its next within the larger one; the
     ratio is the greater of the two.
+
+    Parameters
+    ----------
+    middle_rad
+        Azimuth of the vertical plane in which the box is turned
     """
     across = np.array([-np.sin(middle_rad), np.cos(middle_rad), 0.0])
     outward = np.array([np.cos(middle_rad), np.sin(middle_rad), 0.0])
@@ -193,5 +203,3 @@ def find_edges(surface: Surface, on_rad: Floats, off_rad: Floats, azimuth_rad: F
         on_rad = np.where(met, middle_rad, on_rad)
         off_rad = np.where(met, off_rad, middle_rad)
     return meet(surface, on_rad, azimuth_rad)
-
-

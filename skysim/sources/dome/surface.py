@@ -14,16 +14,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
-from skysim.sources.dome.point_cloud import (FittedEllipsoid, fit_ellipsoid)
-
-
+from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
 
 FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
 # of the samples to which an ellipsoid is fitted
@@ -37,9 +37,14 @@ SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 class Rim:
     """Where a surface ends, in its own frame.
 
-    bearing_m : (3,) the bearing's center before the surface was displaced
-    lowest_m  : height of the lowest point
-    half_rad  : greatest angle from the upright axis, seen from the bearing
+    Attributes
+    ----------
+    bearing_m
+        (3,) the bearing's center before the surface was displaced
+    lowest_m
+        Height of the lowest point
+    half_rad
+        Greatest angle from the upright axis, seen from the bearing
     """
 
     bearing_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -64,10 +69,16 @@ class Rim:
 class Surface(ABC):
     """A surface seen from inside: a level set, negative inside, in its own displaced and tilted frame.
 
-    center_m       : (3,) origin of its own frame, in the lab
-    rim            : where it ends
-    lab_from_own   : its tilt
-    survey_sigma_m : standard deviation, along the normal, of the lab's survey of it
+    Attributes
+    ----------
+    center_m
+        (3,) origin of its own frame, in the lab
+    rim
+        Where it ends
+    lab_from_own
+        Its tilt
+    survey_sigma_m
+        Standard deviation, along the normal, of the lab's survey of it
     """
 
     center_m: Floats
@@ -188,7 +199,10 @@ class Ellipsoid(Surface):
 class Plane(Surface):
     """A panel at z = 0 in its own frame, seen from below.
 
-    half_m : (2,) half its extent along its own x and y
+    Attributes
+    ----------
+    half_m
+        (2,) half its extent along its own x and y
     """
 
     half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
@@ -222,8 +236,12 @@ class Plane(Surface):
 class Cylinder(Surface):
     """sum((x_i / radius)^2) = 1 over the two axes i across, in its own frame.
 
-    axis          : 0, 1, 2 for its own x, y, z
-    half_length_m : half its extent along the axis
+    Attributes
+    ----------
+    axis
+        0, 1, 2 for its own x, y, z
+    half_length_m
+        Half its extent along the axis
     """
 
     radius_m: float
@@ -257,11 +275,19 @@ class Cylinder(Surface):
 class Shell:
     """Inner radius of a formed wall: r = R - f t(angle), t linear from apex to base and constant beyond.
 
-    max_m          : R, the upper bound of the radius;  cover_rad : angle from the axis to which the radius is defined
-    inner_fraction : f, the part of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if the mid-wall's
     AFIT's design contour, 48.033 in at the apex and 48.010 in at 40 deg (Padro 2012, sec. 3.7), follows from its
     0.2036 in and 0.25 in of acrylic about R = 48.135 in as the mid-wall radius. With R as the outer radius it does
     not.
+
+    Attributes
+    ----------
+    max_m
+        R, the upper bound of the radius
+    cover_rad
+        Angle from the axis to which the radius is defined
+    inner_fraction
+        F, the part of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if the
+        mid-wall's
     """
 
     max_m: float
@@ -290,7 +316,10 @@ class Shell:
 class Radial(Surface):
     """|x| = r(x / |x|) in its own frame: one radius in every direction from its center.
 
-    fit : the measured points that it was fitted to, if any
+    Attributes
+    ----------
+    fit
+        The measured points that it was fitted to, if any
     """
 
     radius: Shell | point_cloud.Zernike
@@ -439,7 +468,10 @@ SURFACES: dict[str, Callable[[Any], Surface]] = {
 def build_surface(config: light.SurfaceConfig) -> Surface:
     """The surface that a scene describes.
 
-    Raises InputError unless the bearing's center is inside the surface and sees a part of it.
+    Raises
+    ------
+    InputError
+        Unless the bearing's center is inside the surface and sees a part of it.
     """
     surface = SURFACES[config.kind](config)
     if not surface.inside(np.zeros(3)):
@@ -451,8 +483,6 @@ def build_surface(config: light.SurfaceConfig) -> Surface:
             "light.surface", "no part of it is above the bearing; check rim, width, height, length"
         )
     return surface
-
-
 
 
 # Area of a dome's surface over a cap of directions from the bearing.
@@ -489,5 +519,3 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     element_m2 = np.sum(place_m**2, axis=1) / -np.sum(rays * surface.inward(place_m), axis=1)
     solid = np.repeat(weight, AREA_SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / AREA_SECTORS)
     return float(element_m2 @ solid)
-
-

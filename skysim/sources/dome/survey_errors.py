@@ -8,18 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
-from skysim.scene.sections.tracker import TotalStationConfig
-from skysim.core.random_streams import random_stream
-from skysim.scene.sections.tracker import SurveyErrorsConfig
+from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.sources.dome.surface import Surface
-
-
-
-
 
 # Errors of a survey of LEDs by a total station: a horizontal direction, a zenith angle and a
 # distance to each.
@@ -31,7 +27,10 @@ SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
 def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, Floats]:
     """Horizontal direction from the lab's x toward its y and zenith angle, rad, and distance, m, (N,) each.
 
-    Raises InputError for an LED at the station.
+    Raises
+    ------
+    InputError
+        For an LED at the station.
     """
     sight_m = place_m - np.array(config.position_m)
     level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
@@ -94,8 +93,12 @@ def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Float
 def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
     """(N, 3) places in the lab that the survey yields for LEDs at place_m.
 
-    own   : (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
-    setup : (8,) of `draw_setup`
+    Parameters
+    ----------
+    own
+        (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
+    setup
+        (8,) of `draw_setup`
     """
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])
@@ -180,9 +183,7 @@ def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig
     displaced_m = place_m - offset_m * surface.inward(place_m) if offset_m else place_m
     if config.instrument is not None:
         sights = standard_normals(config.seed, "sights", place_m.shape)
-        displaced_m = surveyed_m(
-            config.instrument, displaced_m, sights, setup_errors(config)
-        )
+        displaced_m = surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
     return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
 
 
@@ -197,9 +198,7 @@ def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | N
     """(N, 3, 3) covariance of each LED's own error; None if it is that of led_sigma alone."""
     if config.instrument is None:
         return None
-    return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(
-        3
-    )
+    return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
 
 
 def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
@@ -254,5 +253,3 @@ def assumed_focal_length_m(focal_length_m: float, config: SurveyErrorsConfig) ->
         return focal_length_m
     drawn = standard_normals(config.seed, "focal", (1,))
     return focal_length_m + float(scaled_errors(config.focal_length_sigma_m, drawn)[0])
-
-

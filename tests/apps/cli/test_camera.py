@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skysim.scene import (loader)
-from skysim.scene import opencv_calibration
+from skysim.scene import loader, opencv_calibration
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

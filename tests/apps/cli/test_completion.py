@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.apps.cli.options import (complete_scene, complete_study)
+from skysim.apps.cli.options import complete_scene, complete_study
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from astropy.wcs import WCS
 
 from skysim.apps.cli import main
 from skysim.apps.cli.options import load
-from skysim.core.errors import InputError
 from skysim.core import images
+from skysim.core.errors import InputError
 from skysim.core.files import SCENES
 from skysim.scene import loader
 

@@ -20,16 +20,21 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import published_catalogs
 from estimator.core.checks import Ints
 from estimator.core.types import ra_dec_roll_rad
-from estimator.identification.published.fialho import (VERSIONS, MagnitudeMatch, fialho_2, fialho_4)
+from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
 from estimator.identification.registry import IDENTIFIERS
+from skysim.core import files, images
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core import files
-from skysim.core import images
-from skysim.core.files import (CATALOGS, ROOT)
+from skysim.core.files import CATALOGS, ROOT
 from skysim.core.types import Floats
-from skysim.experiments.papers.ptase_monte_carlo import (SIGMA_MAG, TOLERANCE_RAD, catalog, drawings, run_version, version)
-from skysim.results.plots import png
-from skysim.results.plots import to_8bit
+from skysim.experiments.papers.ptase_monte_carlo import (
+    SIGMA_MAG,
+    TOLERANCE_RAD,
+    catalog,
+    drawings,
+    run_version,
+    version,
+)
+from skysim.results.plots import png, to_8bit
 
 SCENE = ("shefex2", "--frames", "1", "--set", "motion.rate_deg_s=[0,0,0]")
 STUDY = """schema: 1

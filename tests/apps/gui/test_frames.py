@@ -19,12 +19,21 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 import httpx
 from astropy.io import fits
 
-from skysim.apps.gui.messages import (ALL_PIXELS, LIMITS, Display, LightColumns, Pixels)
+from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, LightColumns, Pixels
 from skysim.apps.gui.server import Guard
-from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views import overlay as served_module
-from skysim.apps.gui.views.overlay import (FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of)
-from skysim.apps.gui.worker.pixels import (BINS, HEADER_BYTES, SATURATED, SHADES, levels_of, limits_of, pixels_for, shades)
+from skysim.apps.gui.views.live import Contents
+from skysim.apps.gui.views.overlay import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
+from skysim.apps.gui.worker.pixels import (
+    BINS,
+    HEADER_BYTES,
+    SATURATED,
+    SHADES,
+    levels_of,
+    limits_of,
+    pixels_for,
+    shades,
+)
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.results import plots

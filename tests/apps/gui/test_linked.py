@@ -29,11 +29,9 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import (Detection, LightColumns, MotionLog, TrackerResult)
-from skysim.apps.gui.page import readouts
-from skysim.apps.gui.page import strips
-from skysim.apps.gui.worker import playback
-from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.messages import Detection, LightColumns, MotionLog, TrackerResult
+from skysim.apps.gui.page import readouts, strips
+from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 

@@ -21,34 +21,34 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui import server
-from skysim.apps.gui.messages import (Detection, LightColumns, TrackerResult)
-from skysim.apps.gui.server import (FILES, Guard, KeptFiles, host_of, report_path, user_of)
-from skysim.apps.gui.views import forms
-from skysim.apps.gui.views import keys
-from skysim.apps.gui.views import overlay
+from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
+from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
+from skysim.apps.gui.views import forms, keys, overlay
+from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
 from skysim.apps.gui.views.sensor import SensorView
-from skysim.apps.gui.views.overlay import (FRAMES, TabFrames)
-from skysim.apps.gui.views.overlay import NAMES
-from skysim.apps.gui.worker import (photo, playback, study_process, tasks)
-from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker import image_export
-from skysim.apps.gui.worker import workbench
-from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.worker import (
+    geometry,
+    image_export,
+    photo,
+    pixels,
+    playback,
+    study_process,
+    tasks,
+    workbench,
+)
 from skysim.apps.gui.worker import geometry as lenses
-from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
+from skysim.core.files import ROOT, SCENES
 from skysim.core.images import IMAGE_SUFFIXES
-from skysim.core.files import (ROOT, SCENES)
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import study_file as study_loader
-from skysim.results import (scoring)
-from skysim.results import plots
+from skysim.results import plots, scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight, simulate_motion
-from skysim.sources import (stars)
-from skysim.sources import catalog
+from skysim.sources import catalog, stars
 
 
 def test_a_body_has_its_name_and_magnitude() -> None:
@@ -823,7 +823,9 @@ def test_a_histogram_counts_every_trial_once() -> None:
 
 
 def test_a_saved_scene_names_its_base_first() -> None:
-    text = image_export.scene_yaml("shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T")
+    text = image_export.scene_yaml(
+        "shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T"
+    )
     assert re.match(
         r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n",
         text,

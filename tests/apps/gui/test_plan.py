@@ -12,11 +12,17 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import (AmbiguityMap, SurveyFound, SurveyPlan)
-from skysim.apps.gui.page.plan_panel import (ambiguity_text, greatest_tilt_deg, prediction_text, survey_flight, survey_lines)
+from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
+from skysim.apps.gui.page.plan_panel import (
+    ambiguity_text,
+    greatest_tilt_deg,
+    prediction_text,
+    survey_flight,
+    survey_lines,
+)
 from skysim.apps.gui.views.style import color_scale
-from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker import survey_flight as survey
+from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core import quaternion
 from skysim.core.errors import InputError

@@ -25,11 +25,9 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.apps.stream import (http)
-from skysim.apps.stream import sinks
-from skysim.apps.stream import sender
+from skysim.apps.stream import http, sender, sinks
 from skysim.apps.stream.sender import Pace
-from skysim.apps.stream.sinks import (Packet, unpack)
+from skysim.apps.stream.sinks import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight

@@ -10,14 +10,10 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import (nearfield, rolling)
-from estimator.attitude import rate
-from estimator.attitude import rate
-from estimator.attitude import rate
-from estimator.attitude.rate import (STARS, Sight)
-from estimator.core.checks import Floats
+from estimator.attitude import nearfield, rate, rolling
+from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, RateEstimate
 from estimator.detection import classify
 from estimator.detection.detect import local
@@ -118,9 +114,7 @@ def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(
 
 
 @pytest.mark.slow
-@law(
-    rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, rate.streak_factor
-)
+@law(rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, rate.streak_factor)
 @given(rng=SEEDS)
 def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generator) -> None:
     for camera in CAMERA, GLOBAL:

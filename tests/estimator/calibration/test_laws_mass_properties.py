@@ -9,11 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as some
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration import mass_properties
-from estimator.calibration import mass_dynamics
-from estimator.calibration import mass_properties
-from estimator.calibration.mass_dynamics import (STATE, EquationsOfMotion, States)
-from estimator.calibration.mass_dynamics import (BearingRecord, MassEstimate, Prior, inertia_matrix, inertia_six)
+from estimator.calibration import mass_dynamics, mass_properties
+from estimator.calibration.mass_dynamics import (
+    STATE,
+    BearingRecord,
+    EquationsOfMotion,
+    MassEstimate,
+    Prior,
+    States,
+    inertia_matrix,
+    inertia_six,
+)
 from tests.helpers.bearing_motion import SMALL, prior, record
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn
 
@@ -40,18 +46,27 @@ def test_a_change_of_states_is_found_again(rng: np.random.Generator) -> None:
     change = 0.1 * rng.standard_normal((STATE, 5))
     np.testing.assert_allclose(states.moved(change).minus(states), change, rtol=0, atol=1e-12)
     a, b = rng.standard_normal((2, 3, 5))
-    np.testing.assert_allclose(mass_dynamics.cross(a, b), np.cross(a, b, axis=0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        mass_dynamics.cross(a, b), np.cross(a, b, axis=0), rtol=0, atol=1e-12
+    )
     np.testing.assert_allclose(
         mass_dynamics.turn(states.quaternion, a).T, states.rotation.apply(a.T), rtol=0, atol=1e-12
     )
-    back = mass_dynamics.turn(states.quaternion, mass_dynamics.turn(states.quaternion, a), inverse=True)
+    back = mass_dynamics.turn(
+        states.quaternion, mass_dynamics.turn(states.quaternion, a), inverse=True
+    )
     np.testing.assert_allclose(back, a, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(states.take(slice(1, 3)).momentum, states.momentum[:, 1:3])
     moved = mass_dynamics.moved_on(states, states, 2.0)
     np.testing.assert_allclose(moved.torque, 3 * states.torque, rtol=1e-12)
 
 
-@law(EquationsOfMotion.stored, EquationsOfMotion.rate, EquationsOfMotion.slope, EquationsOfMotion.integrate)
+@law(
+    EquationsOfMotion.stored,
+    EquationsOfMotion.rate,
+    EquationsOfMotion.slope,
+    EquationsOfMotion.integrate,
+)
 @given(rng=SEEDS)
 def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Generator) -> None:
     """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
@@ -157,7 +172,8 @@ def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
     turns[at] = error
     turned = replace(RECORD, lab_from_body=RECORD.lab_from_body * Rotation.from_rotvec(turns))
     before, after, considered = (
-        mass_properties.estimate_mass([one], vehicle.lab, assumed) for one in (RECORD, turned, shared)
+        mass_properties.estimate_mass([one], vehicle.lab, assumed)
+        for one in (RECORD, turned, shared)
     )
     change = (after.values - before.values) / before.sigma
     added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
@@ -203,7 +219,9 @@ def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
         assert_covariance(one.covariance / np.outer(assumed.sigma, assumed.sigma))
         assert (one.sigma <= last * (1 + 1e-9)).all()
         last = one.sigma
-    begun = mass_properties.estimate_mass([mass_properties.cut(RECORD, slice(0, 20))], vehicle.lab, assumed)
+    begun = mass_properties.estimate_mass(
+        [mass_properties.cut(RECORD, slice(0, 20))], vehicle.lab, assumed
+    )
     whole = mass_properties.first_covariance(begun, RECORD, vehicle.lab)
     scale = np.sqrt(np.diag(whole))
     assert_covariance(whole / np.outer(scale, scale))
@@ -216,7 +234,9 @@ def test_a_longer_record_is_surer() -> None:
     assumed, vehicle = prior(SMALL, np.random.default_rng(3))
     short, long = (
         mass_properties.estimate_mass(
-            [mass_properties.cut(RECORD, slice(0, n))], vehicle.lab, Prior(SMALL.truth, assumed.sigma)
+            [mass_properties.cut(RECORD, slice(0, n))],
+            vehicle.lab,
+            Prior(SMALL.truth, assumed.sigma),
         ).sigma
         for n in (12, 26)
     )

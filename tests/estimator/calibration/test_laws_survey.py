@@ -16,15 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import (dome_survey)
-from estimator.calibration import star_field
+from estimator.calibration import dome_survey, star_field
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import Gauge, Subset, align_attitudes
-from estimator.calibration.star_field import (LensPrior, StarFrame)
+from estimator.calibration.star_field import LensPrior, StarFrame
 from estimator.catalog.catalog import StarCatalog
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, StarMatch
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 

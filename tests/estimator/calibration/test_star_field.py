@@ -10,8 +10,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from estimator.calibration.star_field import magnitude_zero
-from estimator.calibration.star_field import (LENS_PRIOR, Calibration, StarFrame, calibrate, disagreement_px, self_calibrate)
+from estimator.calibration.star_field import (
+    LENS_PRIOR,
+    Calibration,
+    StarFrame,
+    calibrate,
+    disagreement_px,
+    magnitude_zero,
+    self_calibrate,
+)
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera

@@ -12,13 +12,7 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from estimator.catalog import (catalog, quad_index)
-from estimator.catalog import sky_index
-from estimator.catalog import sky_index
-from estimator.catalog import pair_index
-from estimator.catalog import pair_index
-from estimator.catalog import published_catalogs
-from estimator.catalog import published_catalogs
+from estimator.catalog import catalog, pair_index, published_catalogs, quad_index, sky_index
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
@@ -75,7 +69,12 @@ def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.d
     np.testing.assert_allclose(same.position_au, there.position_au, rtol=0, atol=1e-15)
 
 
-@law(StarCatalog.take, catalog.brighter_than, catalog.limit_for_density, published_catalogs.asymmetric)
+@law(
+    StarCatalog.take,
+    catalog.brighter_than,
+    catalog.limit_for_density,
+    published_catalogs.asymmetric,
+)
 @given(rng=SEEDS, limit=some.floats(-2, 7), wanted=some.floats(0, 1e3))
 def test_a_catalog_s_subset_is_what_was_asked_for(
     rng: np.random.Generator, limit: float, wanted: float
@@ -167,7 +166,9 @@ def test_a_prepared_catalog_counts_every_star(
     rng: np.random.Generator, near_rad: float, step_mag: float
 ) -> None:
     stars = drawn(rng)
-    raw = published_catalogs.OnBoard(stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0)
+    raw = published_catalogs.OnBoard(
+        stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0
+    )
     told = published_catalogs.proc_cat(raw, near_rad)
     assert told.components.sum() == len(stars)
     assert (np.diff(told.magnitude) >= 0).all()

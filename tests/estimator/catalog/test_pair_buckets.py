@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimator.catalog.pair_index import (ARCSEC_RAD, PairCatalog)
+from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog
 from estimator.core.checks import Floats
 from tests.helpers.interpreted import interpreted
 

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from estimator.catalog.published_catalogs import (BYTES_PER_ENTRY, Color, OnBoard, histogram, log, proc_cat, read_cat)
+from estimator.catalog.published_catalogs import (
+    BYTES_PER_ENTRY,
+    Color,
+    OnBoard,
+    histogram,
+    log,
+    proc_cat,
+    read_cat,
+)
 from estimator.core.checks import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
+from estimator.catalog import catalog, pair_index
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.published_catalogs import (BRIGHT_MAG, CATALOGS, COUNT, asymmetric, chosen, thin, uniform)
+from estimator.catalog.published_catalogs import (
+    BRIGHT_MAG,
+    CATALOGS,
+    COUNT,
+    asymmetric,
+    chosen,
+    thin,
+    uniform,
+)
 from estimator.core.checks import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"

@@ -18,8 +18,7 @@ from estimator.attitude import dome_map
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
-from estimator.core import (lazy)
-from estimator.core import checks
+from estimator.core import checks, lazy
 from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection import detect

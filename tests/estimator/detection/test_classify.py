@@ -10,9 +10,8 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
-from estimator.detection import (detect)
-from estimator.detection import classify
-from estimator.detection.classify import (NO_STAR, Flag)
+from estimator.detection import classify, detect
+from estimator.detection.classify import NO_STAR, Flag
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid, process_frame
 from tests.helpers import drawn_frames as frames
 

@@ -18,16 +18,13 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import camera
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import NO_SPREAD, Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
-from estimator.detection import (background, components, detect, windows)
-from estimator.detection import classify
-from estimator.detection import classify
+from estimator.detection import background, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
-from estimator.identification.star_detections import (FlatCentroids, Sensor, detections_of)
+from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units

@@ -14,7 +14,7 @@ from estimator.core.types import FilterState
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
 from estimator.filter.states import inverse_response
 from estimator.trackers import exposure_control
-from estimator.trackers.exposure_control import (Control, NextExposure, Observation)
+from estimator.trackers.exposure_control import Control, NextExposure, Observation
 from tests.helpers import laws
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 

@@ -15,12 +15,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter import correct
-from estimator.filter import consistency
-from estimator.filter import consistency
-from estimator.filter import states
+from estimator.filter import consistency, correct, states
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import (STATES, GyroModel, JumpModel, TrackerModel)
+from estimator.filter.states import STATES, GyroModel, JumpModel, TrackerModel
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -111,7 +108,8 @@ def test_samples_keep_what_was_measured_and_say_how(
     limited = saturated | (rate_rad_s >= consistency.NEAR_LIMIT * 3.0)
     np.testing.assert_array_equal(samples[:, 4], np.where(lost, 2, limited))
     np.testing.assert_array_equal(
-        consistency.checked_samples(0.0, t_s, angle, saturated, None, gyro)[:, 4], limited.astype(float)
+        consistency.checked_samples(0.0, t_s, angle, saturated, None, gyro)[:, 4],
+        limited.astype(float),
     )
 
 
@@ -372,7 +370,9 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
     samples = np.column_stack([t_s, 0.01 * rate, np.zeros(20)])
     assert consistency.shock_rad(5.0, samples, 1e-9) < 1e-6
     samples[at:, 1:4] += 0.01 * step * turn(rng).apply([1.0, 0, 0])
-    np.testing.assert_allclose(consistency.shock_rad(5.0, samples, 1e-9), 0.01 * step, rtol=1e-3, atol=0)
+    np.testing.assert_allclose(
+        consistency.shock_rad(5.0, samples, 1e-9), 0.01 * step, rtol=1e-3, atol=0
+    )
     assert consistency.shock_rad(5.0, samples, 1.0) == 0.0
 
 

@@ -4,12 +4,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
-from estimator.core.checks import Floats
-from estimator.core.checks import ImageError
+from estimator.catalog import catalog, pair_index
+from estimator.core.checks import Floats, ImageError
+from estimator.identification.published.fialho import (
+    MAG_GATE_SIGMA,
+    MIN_SIDE_FRACTION,
+    fialho_1,
+    fialho_2,
+    fialho_3,
+    fialho_4,
+    search_options,
+    triplets,
+)
 from estimator.identification.solver_options import Options
-from estimator.identification.published.fialho import (MAG_GATE_SIGMA, MIN_SIDE_FRACTION, fialho_1, fialho_2, fialho_3, fialho_4, search_options, triplets)
 
 pytestmark = pytest.mark.slow  # much is compiled
 

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
-from estimator.core.checks import (Floats, Ints)
-from estimator.core.checks import ImageError
+from estimator.catalog import catalog, pair_index
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.types import StarMatch
 from estimator.identification.registry import IDENTIFIERS
 

@@ -11,14 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from estimator.attitude.dome_map import Lever, project
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification import led_codes
-from estimator.identification import led_naming
-from estimator.identification.led_codes import (GROSS, LedCode)
-from estimator.identification.led_codes import LightTracks
+from estimator.identification import led_codes, led_naming
+from estimator.identification.led_codes import GROSS, LedCode, LightTracks
 from tests.helpers.laws import SEEDS, answered, law, turn, units
 
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
@@ -134,7 +131,9 @@ def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied
     if lied:
         misfit[0] = 40.0 * (np.arange(100) != rng.integers(100))
     rays = CAMERA.rays(xy_px + rng.normal(0, 0.1, xy_px.shape))
-    found = led_naming.identify(led_naming.NamedLights(rays, np.full(len(seen), 3e-4), misfit), sphere)
+    found = led_naming.identify(
+        led_naming.NamedLights(rays, np.full(len(seen), 3e-4), misfit), sphere
+    )
     if isinstance(found, str):
         assert known < 25 or lied
         return

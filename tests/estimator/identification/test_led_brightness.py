@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from estimator.attitude.dome_map import LedMap, Lever, project
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids
 from estimator.identification import led_search
-from estimator.identification.led_evidence import (STRAY, STRAY_DENSITY)
+from estimator.identification.led_evidence import STRAY, STRAY_DENSITY
 from estimator.identification.led_index import build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.interpreted import interpreted

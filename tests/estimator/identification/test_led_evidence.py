@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betaln
 
 from estimator.attitude.dome_map import LedMap, Lever, project
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.identification import led_evidence
-from estimator.identification import led_search
+from estimator.core.checks import Floats
+from estimator.identification import led_evidence, led_search
 from estimator.identification.led_evidence import LedDetections
-from estimator.identification.led_index import (DomeIndex, build_dome_index)
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from tests.helpers.interpreted import interpreted
 
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
@@ -49,7 +48,9 @@ def test_matches_on_one_board_count_little(boards: list[int], second: int, furth
     )
     boarded = dome._replace(pairs=dome.pairs._replace(group=np.array(boards)))
     apart = dome._replace(pairs=dome.pairs._replace(group=np.arange(6)))
-    found = [led_evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)]
+    found = [
+        led_evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)
+    ]
     assert [len(hypothesis.star) for hypothesis in found] == [6, 6]
     area = CAMERA.width_px * CAMERA.height_px / CAMERA.focal_px**2
     in_full = np.log10(area / 6 / (2 * np.pi * sigma**2))
@@ -69,7 +70,11 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
     rays = WIDE.rays(project(level_from_lab, place_m, ASIDE, WIDE))
     sigma = np.full(6, 0.01)
     R_cam_from_lab = (ASIDE.cam_from_body * level_from_lab).as_matrix()
-    return dome, led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma), R_cam_from_lab
+    return (
+        dome,
+        led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma),
+        R_cam_from_lab,
+    )
 
 
 @pytest.mark.slow

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, project
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids, StarMatch
 from estimator.identification import led_search
-from estimator.identification.led_index import (DomeIndex, build_dome_index)
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
 from tests.helpers.interpreted import interpreted

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.checks import Floats
-from estimator.identification.solver_options import Options
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa import (UNMATCHED_COST, Gates, Primary, SearchInput)
-from estimator.identification.published.shefex import (FOURTH_STAR, ShefexOptions)
+from estimator.identification.published.saa import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions
 from estimator.identification.registry import IDENTIFIERS
+from estimator.identification.solver_options import Options
 from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS

@@ -7,13 +7,12 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
-from estimator.core.checks import Floats
+from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
-from estimator.identification.published.pyramid import (_scale_tangents, pyramid)
+from estimator.identification.published.pyramid import _scale_tangents, pyramid
 
 pytestmark = pytest.mark.long  # an algorithm of the papers: compiles for fifteen seconds
 

@@ -9,12 +9,10 @@ import pytest
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import (quad_index)
-from estimator.catalog import sky_index
+from estimator.catalog import quad_index, sky_index
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
-from estimator.identification import star_quads
-from estimator.identification import star_search
+from estimator.identification import star_quads, star_search
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from tests.helpers.star_fields import (

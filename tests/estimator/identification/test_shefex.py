@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import (catalog)
-from estimator.catalog import pair_index
+from estimator.catalog import catalog, pair_index
 from estimator.core.checks import Floats
 from estimator.identification.published.master_star import master_star
-from estimator.identification.published.shefex import (ShefexOptions, angle_interval, cos_error, search)
+from estimator.identification.published.shefex import (
+    ShefexOptions,
+    angle_interval,
+    cos_error,
+    search,
+)
 
 pytestmark = pytest.mark.slow  # much is compiled
 

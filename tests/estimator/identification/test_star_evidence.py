@@ -170,8 +170,12 @@ def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
         assert star_evidence.magnitude_density(sky, value) == pytest.approx(
             wanted, rel=0.1
         )  # of bins of MAG_STEP
-    assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(sky, mag[0])
-    assert star_evidence.magnitude_density(sky, 30.0) == star_evidence.magnitude_density(sky, mag[-1] + 2)
+    assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(
+        sky, mag[0]
+    )
+    assert star_evidence.magnitude_density(sky, 30.0) == star_evidence.magnitude_density(
+        sky, mag[-1] + 2
+    )
 
 
 @pytest.mark.parametrize("star", [0, 20, 59])
@@ -183,7 +187,9 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     mag = np.arange(-2, 10, 1e-3)
     share = 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
-    ratio = [star_evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))]
+    ratio = [
+        star_evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))
+    ]
     density = [star_evidence.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
     assert np.dot(ratio, density) * 1e-3 == pytest.approx(

@@ -12,9 +12,8 @@ from estimator.core.checks import ImageError
 from estimator.core.types import NO_SPREAD
 from estimator.core.vectors import quaternion_xyzw
 from estimator.identification import star_detections as detections_module
-from estimator.identification import star_evidence
-from estimator.identification import star_search
-from estimator.identification.star_detections import (FlatCentroids, Sensor, changed, gates_of)
+from estimator.identification import star_evidence, star_search
+from estimator.identification.star_detections import FlatCentroids, Sensor, changed, gates_of
 from estimator.identification.star_evidence import Solution
 from tests.helpers.interpreted import interpreted
 from tests.helpers.star_fields import (
@@ -440,7 +439,9 @@ def test_all_lights_must_confirm_what_the_brightest_tell(limit_mag: float, match
         np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0))
     )
     few = changed(lights, 4, 1.0, 0.0)
-    candidate = star_evidence.evaluate(few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf)
+    candidate = star_evidence.evaluate(
+        few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf
+    )
     assert candidate.dex > star_search.ACCEPT_DEX
     found = star_search.fit_to_all(
         lights._replace(limit_mag=limit_mag), SKY, candidate, star_search.ACCEPT_DEX, True, False

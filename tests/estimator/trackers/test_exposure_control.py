@@ -7,12 +7,12 @@ import pytest
 
 from estimator.core.checks import ImageError
 from estimator.detection.detect import DETECTORS
-from estimator.trackers.exposure_control import (Control, NextExposure, Observation, observe, step)
+from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
 from skysim.camera.detector import saturation_dn
 from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight
 
 CONTROL = Control(mean_dn=100.0)

@@ -12,9 +12,9 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.identification.star_detections import information_of
-from estimator.trackers.pipeline import Settings
 from estimator.trackers import misfit
-from estimator.trackers.misfit import (ARCSEC_RAD, ERROR_RAD, SHARE)
+from estimator.trackers.misfit import ARCSEC_RAD, ERROR_RAD, SHARE
+from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.files import CATALOGS
 from tests.helpers.laws import law
@@ -119,9 +119,7 @@ def test_a_star_loses_information_only_by_what_companions_explain(
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
     own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
     residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[
-        0
-    ]
+    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[0]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()

@@ -19,12 +19,10 @@ from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
 from estimator.calibration.home_position import HomeCatalog, Sighting
 from estimator.catalog import pair_index
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids
-from estimator.identification import led_index
-from estimator.identification import led_search
+from estimator.identification import led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
@@ -196,7 +194,12 @@ def eye() -> DomeTracker:
     return DomeTracker(CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()))
 
 
-@law(DomeTracker.solve_centroids, led_search.identify, led_search.build_detections, dome_tracker.led_pairs)
+@law(
+    DomeTracker.solve_centroids,
+    led_search.identify,
+    led_search.build_detections,
+    dome_tracker.led_pairs,
+)
 @given(rng=SEEDS, false=some.integers(0, 4))
 def test_lights_are_named_as_they_are_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, false: int
@@ -308,7 +311,12 @@ def test_a_field_holds_its_inner_one(
     assert 0 < right - left < 2 * half[0]
     assert 0 < bottom - top < 2 * half[1]
     directions = units(rng, 5)
-    assert 0 <= led_index.cap_height(directions, 0.0) <= led_index.cap_height(directions, margin_rad) <= 2
+    assert (
+        0
+        <= led_index.cap_height(directions, 0.0)
+        <= led_index.cap_height(directions, margin_rad)
+        <= 2
+    )
 
 
 # The claimed error

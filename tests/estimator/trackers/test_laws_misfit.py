@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import covariance
 from estimator.catalog import catalog
-from estimator.core.checks import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
-from estimator.identification import star_evidence
-from estimator.identification import star_search
+from estimator.identification import star_evidence, star_search
 from estimator.identification.star_detections import changed
-from estimator.trackers.pipeline import Settings
 from estimator.trackers import misfit
+from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from tests.helpers.laws import law
 
@@ -107,7 +106,9 @@ def test_wider_errors_without_new_matches_need_no_match(
     found = star_search.lost_in_space(wide, tracker.sky, 80, 100_000)
     R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
     gates = np.full(len(centroids), 0.01)
-    hypothesis = star_evidence.evaluate(detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf)
+    hypothesis = star_evidence.evaluate(
+        detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf
+    )
     kept = centroids.take(hypothesis.observed)
     detections = tracker.detections(kept, tracker.sigma_px(kept))
     hypothesis = star_evidence.evaluate(

@@ -16,9 +16,8 @@ from astropy.io import fits
 
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.characterize import frame_files
-from skysim.experiments.characterize import characterize_camera
-from skysim.experiments.characterize.frame_files import (Setting, read_frames, read_stack)
+from skysim.experiments.characterize import characterize_camera, frame_files
+from skysim.experiments.characterize.frame_files import Setting, read_frames, read_stack
 
 SIDE = 64
 SHAPE = (SIDE, SIDE)

@@ -13,14 +13,11 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.star_field import disagreement_px
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.characterize import characterize_camera
-from skysim.experiments.characterize import night_sky
-from skysim.experiments.characterize import night_sky
-from skysim.experiments.characterize.night_sky import NightFrame
-from skysim.experiments.characterize.night_sky import StarImages
+from skysim.experiments.characterize import characterize_camera, night_sky
+from skysim.experiments.characterize.night_sky import NightFrame, StarImages
 from skysim.experiments.characterize.photon_transfer import Transfer
 from skysim.experiments.dome_survey.survey_frames import render_stops
 from skysim.scene import loader
@@ -127,9 +124,7 @@ def test_slopes_of_the_image_are_differences() -> None:
     for n in range(6):
         step = np.zeros(6)
         step[n] = 1e-5 * max(abs(p[0, n]), 1)
-        difference = (night_sky.model(p + step)[0] - night_sky.model(p - step)[0]) / (
-            2 * step[n]
-        )
+        difference = (night_sky.model(p + step)[0] - night_sky.model(p - step)[0]) / (2 * step[n])
         np.testing.assert_allclose(
             slopes[:, :, n], difference, rtol=1e-6, atol=1e-7 * np.abs(slopes[:, :, n]).max()
         )

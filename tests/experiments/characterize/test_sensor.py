@@ -11,15 +11,16 @@ from scipy import stats
 from skysim.camera import detector
 from skysim.camera.detector import Detector
 from skysim.core.types import Floats
-from skysim.experiments.characterize import frame_files
-from skysim.experiments.characterize import fixed_pattern
-from skysim.experiments.characterize import photon_transfer
-from skysim.experiments.characterize import sensor_fit
-from skysim.experiments.characterize import fixed_pattern
+from skysim.experiments.characterize import fixed_pattern, frame_files, photon_transfer, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import RateNoise
-from skysim.experiments.characterize.photon_transfer import (Estimate, propagate)
-from skysim.experiments.characterize.photon_transfer import (Level, Moments, level)
-from skysim.experiments.characterize.photon_transfer import TransferPoint
+from skysim.experiments.characterize.photon_transfer import (
+    Estimate,
+    Level,
+    Moments,
+    TransferPoint,
+    level,
+    propagate,
+)
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 from tests.helpers.two_samples import histogram_p
@@ -128,7 +129,9 @@ def exact_points(
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
             points.append(
-                TransferPoint(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance))
+                TransferPoint(
+                    t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance)
+                )
             )
     return points
 

@@ -9,14 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
 from skysim.camera import detector
-from skysim.camera.detector import (PARTICLES, SMEAR, AddedCharge)
+from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.yaml_reader import parse_yaml
 from skysim.core.types import SourceTruth
-from skysim.experiments import dataset_labels
-from skysim.experiments import dataset_shards
+from skysim.core.yaml_reader import parse_yaml
+from skysim.experiments import dataset_labels, dataset_shards
 from skysim.experiments.study.execution import trials
-from skysim.experiments.study.execution.setups import (TrialSetup, prepared_setup)
+from skysim.experiments.study.execution.setups import TrialSetup, prepared_setup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
 from skysim.tracking.onboard_model import assumed_camera
@@ -204,7 +203,9 @@ def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:
     base = dict.fromkeys(("camera.detector.cti_parallel", "camera.detector.cti_serial"), 0.0)
     base |= {"camera.detector.blooming": "none"}
     well_e = 1500
-    shallow = dataset_labels.label_frame(setup_with(base | {"camera.detector.full_well_e": well_e}), 5)
+    shallow = dataset_labels.label_frame(
+        setup_with(base | {"camera.detector.full_well_e": well_e}), 5
+    )
     deep = setup_with(base)
     mask = decoded(shallow.masks[dataset_labels.SATURATED], (HEIGHT, WIDTH))
     config = deep.lab.scene.camera.detector

@@ -19,10 +19,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
-from skysim.experiments import dataset_run
-from skysim.experiments import dataset_run
-from skysim.experiments import dataset_shards
-from skysim.experiments import dataset_shards
+from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.study.execution import engines, workers
 from tests.helpers.small_dataset import HEIGHT, VARY, WIDTH, contents, small
 
@@ -126,7 +123,9 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
         ]
         names = {one["id"]: one["file_name"] for one in coco["images"]}
         for one in coco["annotations"]:
-            assert names[one["image_id"]].endswith(f"{dataset_shards.key_of(one['image_id'])}.image.npy")
+            assert names[one["image_id"]].endswith(
+                f"{dataset_shards.key_of(one['image_id'])}.image.npy"
+            )
             if one["category_id"] != 1:
                 continue
             sample = made[dataset_shards.key_of(one["image_id"])]
@@ -359,8 +358,14 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
             lambda folder: (folder / dataset_run.MANIFEST).write_text("[" * 10_000),
             "is not that of a dataset",
         ),
-        (lambda folder: (folder / dataset_run.MANIFEST).write_text("[]"), "is not that of a dataset"),
-        (lambda folder: (folder / dataset_run.MANIFEST).write_text("{}"), "is not that of a dataset"),
+        (
+            lambda folder: (folder / dataset_run.MANIFEST).write_text("[]"),
+            "is not that of a dataset",
+        ),
+        (
+            lambda folder: (folder / dataset_run.MANIFEST).write_text("{}"),
+            "is not that of a dataset",
+        ),
         (
             lambda folder: (folder / dataset_run.MANIFEST).rename(folder / "mine.txt"),
             r"contains \w+; allowed: an empty folder",

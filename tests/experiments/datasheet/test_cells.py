@@ -7,7 +7,14 @@ from collections import Counter
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet.cells import (FULL, QUICK, Designer, check_scene, states_c, unit_seeds)
+from skysim.experiments.datasheet.cells import (
+    FULL,
+    QUICK,
+    Designer,
+    check_scene,
+    states_c,
+    unit_seeds,
+)
 from skysim.scene.loader import load
 
 

@@ -7,7 +7,14 @@ import itertools
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.variance_components import (Components, components, mean_square_ratio, of_axes, sum_over_total, with_intervals)
+from skysim.experiments.datasheet.variance_components import (
+    Components,
+    components,
+    mean_square_ratio,
+    of_axes,
+    sum_over_total,
+    with_intervals,
+)
 
 
 def generated(rng, shape, bias=0.0, **sigma):

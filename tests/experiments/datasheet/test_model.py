@@ -12,12 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.cells import (QUICK, Designer)
 from skysim.experiments.datasheet import model_fit
-from skysim.experiments.datasheet import model_fit
-from skysim.experiments.datasheet import model_fit
-from skysim.experiments.datasheet.error_model import (ErrorModel, State, correlated)
-from skysim.experiments.datasheet.cells import (AXES, MeasuredFrames)
+from skysim.experiments.datasheet.cells import AXES, QUICK, Designer, MeasuredFrames
+from skysim.experiments.datasheet.error_model import ErrorModel, State, correlated
 from skysim.scene.loader import load
 
 CONSTANTS: dict[str, Any] = {

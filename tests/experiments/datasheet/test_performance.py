@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy
 
-from skysim.experiments.datasheet import (performance)
 from skysim.experiments.datasheet import cells as datasheet_run
+from skysim.experiments.datasheet import performance
 from skysim.experiments.datasheet.cells import DatasheetCell
 from skysim.experiments.datasheet.performance import (
     Counts,
@@ -95,7 +95,9 @@ def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> datasheet_run.Me
     """A sheet of 4,000 frames with these errors about x, y and roll, whose covariance says 1."""
     rng = np.random.default_rng(3)
     errors = np.asarray(errors_over_sigma)[:, None, None] * rng.standard_normal((3, 10, 400))
-    columns = dict(zip(datasheet_run.AXES, errors, strict=True)) | {"nees": np.sum(errors**2, axis=0)}
+    columns = dict(zip(datasheet_run.AXES, errors, strict=True)) | {
+        "nees": np.sum(errors**2, axis=0)
+    }
     columns |= {"solved": np.ones((10, 400)), "wrong": np.zeros((10, 400))}
     columns["solved"][0, :5] = 0
     columns["nees"][0, :5] = np.nan

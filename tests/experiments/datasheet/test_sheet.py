@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import (performance)
-from skysim.experiments.datasheet import cells
-from skysim.experiments.datasheet import datasheet_report
-from skysim.experiments.datasheet import cells
-from skysim.experiments.datasheet.cells import (Designer, Size)
+from skysim.experiments.datasheet import cells, datasheet_report, performance
+from skysim.experiments.datasheet.cells import Designer, Size
+from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
 from skysim.experiments.datasheet.variance_components import components
-from skysim.experiments.datasheet.statement import (Statement, numbers, sections, state)
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.loader import load

@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey import survey_prior
-from skysim.experiments.dome_survey import survey_procedure
-from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey import survey_images
-from skysim.experiments.dome_survey import survey_images
+from skysim.experiments.dome_survey import (
+    survey_frames,
+    survey_images,
+    survey_prior,
+    survey_procedure,
+)
 from skysim.scene import loader
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 
 DEAD = 44
 FAR = 20
@@ -404,4 +405,8 @@ def test_attitudes_with_a_slip_are_one_line(tmp_path: Path, text: str, says: str
 def test_of_two_formats_of_one_image_one_is_read(tmp_path: Path) -> None:
     for name in ("b.png", "a.png", "a.fits", "c.jpg", "notes.txt", ".d.png"):
         (tmp_path / name).touch()
-    assert [path.name for path in survey_images.image_files(tmp_path)] == ["a.fits", "b.png", "c.jpg"]
+    assert [path.name for path in survey_images.image_files(tmp_path)] == [
+        "a.fits",
+        "b.png",
+        "c.jpg",
+    ]

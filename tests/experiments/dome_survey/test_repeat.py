@@ -12,9 +12,7 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import (adjust)
-from skysim.experiments.dome_survey import survey_prior
-from skysim.experiments.dome_survey import survey_procedure
+from skysim.experiments.dome_survey import adjust, survey_prior, survey_procedure
 from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 

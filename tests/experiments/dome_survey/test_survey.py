@@ -23,17 +23,12 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import (adjust)
-from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey import survey_procedure
-from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey import survey_prior
+from skysim.experiments.dome_survey import adjust, survey_frames, survey_prior, survey_procedure
 from skysim.experiments.dome_survey import survey_frames as survey_stops
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.tracking import (dome_map_file)
-from skysim.tracking import factory
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.tracking import dome_map_file, factory
 from tests.helpers.surveyed_dome import NOISE_PX, attitudes, model, pixels
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone

@@ -7,11 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import INCH_M
-from skysim.experiments.tracker_comparison import with_config
-from skysim.experiments.papers.afit import (led_tests, test1)
-from skysim.experiments.papers.afit import test2
-from skysim.experiments.papers.afit import afit_surface
-from skysim.experiments.papers.afit.test2 import (PAIR_M, BoardPlace, geometric_angle_arcsec)
+from skysim.experiments.papers.afit import afit_surface, led_tests, test1, test2
+from skysim.experiments.papers.afit.test2 import PAIR_M, BoardPlace, geometric_angle_arcsec
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
     gray_levels,
@@ -20,6 +17,7 @@ from skysim.experiments.papers.afit.test_stand import (
     separations_arcsec,
 )
 from skysim.experiments.papers.compare import confidence_interval
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.loader import load
 from skysim.simulation.lab import Lab
 
@@ -66,7 +64,9 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> No
 
 def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
     board = test2.place_pair(pair, BoardPlace(28.0))
-    frame, truth = render_at_attitude(board, test2.point_at(BoardPlace(28.0)), np.random.default_rng(1))
+    frame, truth = render_at_attitude(
+        board, test2.point_at(BoardPlace(28.0)), np.random.default_rng(1)
+    )
     lights = measure_lights(gray_levels(frame, board))
     assert separations_arcsec(lights.xy_px, board)[0] == pytest.approx(
         geometric_angle_arcsec(pair, BoardPlace(28.0)), abs=1.0

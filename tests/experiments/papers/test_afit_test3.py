@@ -7,10 +7,14 @@ import pytest
 from scipy import stats
 
 from estimator.calibration.home_position import Sighting, calibrate
-from skysim.experiments.papers.afit import test3_attitude
-from skysim.experiments.papers.afit import test3_attitude
-from skysim.experiments.papers.afit import test3
-from skysim.experiments.papers.afit.test3 import (IMU_DEG, build_test3, lab_from_body, measure, photograph)
+from skysim.experiments.papers.afit import test3, test3_attitude
+from skysim.experiments.papers.afit.test3 import (
+    IMU_DEG,
+    build_test3,
+    lab_from_body,
+    measure,
+    photograph,
+)
 from skysim.experiments.papers.compare import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.simulation.lab import Lab

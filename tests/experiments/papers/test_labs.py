@@ -7,9 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.experiments.papers import other_domes
-from skysim.experiments.papers import nps
-from skysim.experiments.papers import other_domes
+from skysim.experiments.papers import nps, other_domes
 from skysim.simulation.lab import build_lab
 
 pytestmark = pytest.mark.slow  # much is compiled
@@ -64,7 +62,8 @@ def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> N
 def test_noise_falls_with_the_root_of_the_lights() -> None:
     """Twice the lights, 1 / sqrt(2) of the noise, to four sigmas of 150 trials."""
     few, many = (
-        other_domes.solve_random_attitudes(other_domes.build_setup(lights), range(150)) for lights in (20, 40)
+        other_domes.solve_random_attitudes(other_domes.build_setup(lights), range(150))
+        for lights in (20, 40)
     )
     ratio = few.error_arcsec.std(axis=0) / many.error_arcsec.std(axis=0)
     assert np.abs(ratio / np.sqrt(2) - 1).max() < 4 / np.sqrt(150)

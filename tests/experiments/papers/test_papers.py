@@ -13,18 +13,20 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
-from skysim.core.errors import InputError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.files import ROOT
-from skysim.experiments.papers import (papers_report)
-from skysim.experiments.papers import published
-from skysim.experiments.papers import compare
-from skysim.experiments.papers import compare
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.published import (Experiment, PublishedRow)
+from skysim.experiments.papers import compare, papers_report, published
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+)
+from skysim.experiments.papers.published import Experiment, PublishedRow
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
-from skysim.results import (metrics)
-from skysim.results import plots
+from skysim.results import metrics, plots
 from skysim.results.metrics import Summary, exact, proportion
 
 # The law of the verdict.

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from estimator.catalog.pair_index import PairIndex
 from skysim.apps.cli.main import app
 from skysim.core.constants import ARCSEC_RAD
-from skysim.experiments.papers import ptase_ground
-from skysim.experiments.papers import ptase_monte_carlo
+from skysim.experiments.papers import ptase_ground, ptase_monte_carlo
 from skysim.results.metrics import rms
 
 
@@ -50,7 +49,9 @@ def sky() -> PairIndex:
 @pytest.mark.slow
 def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
     """P = sigma^2 [sum(I - b b')]^-1: across 1 / sqrt(N), roll by the stars' distance from the axis."""
-    truly, told, stars = ptase_monte_carlo.simulate(sky, ptase_monte_carlo.version("fialho_2"), 600, 7)
+    truly, told, stars = ptase_monte_carlo.simulate(
+        sky, ptase_monte_carlo.version("fialho_2"), 600, 7
+    )
     found = np.isfinite(told[:, 0, 0])
     off = np.einsum("nij,nkj->nik", told[found], truly[found])
     x, y, roll = (off[:, a, b] - off[:, b, a] for a, b in ((2, 1), (0, 2), (1, 0)))

@@ -9,13 +9,14 @@ from scipy.special import erf
 
 from estimator.identification.published.shefex import FOURTH_STAR
 from skysim.core.types import Frame
-from skysim.experiments.papers.compare import ExperimentOptions
-from skysim.experiments.papers.compare import bootstrap_of_means
-from skysim.experiments.papers import shefex_camera
-from skysim.experiments.papers import shefex_setup
-from skysim.experiments.papers import shefex_identification
-from skysim.experiments.papers import shefex_nights
-from skysim.experiments.papers.shefex_setup import (StarField, pairs, random_fields, shefex_lab)
+from skysim.experiments.papers import (
+    shefex_camera,
+    shefex_identification,
+    shefex_nights,
+    shefex_setup,
+)
+from skysim.experiments.papers.compare import ExperimentOptions, bootstrap_of_means
+from skysim.experiments.papers.shefex_setup import StarField, pairs, random_fields, shefex_lab
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
 from skysim.tracking.factory import ExposureController
@@ -52,14 +53,20 @@ def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> Non
 @pytest.mark.long
 def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
     field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
-    told = shefex_identification.identify(field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1))
+    told = shefex_identification.identify(
+        field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1)
+    )
     assert (told.right, told.wrong) == (1.0, 0.0)
     assert np.abs(told.error_deg).max() < 1e-3
 
 
 def test_three_stars_are_no_success() -> None:
-    field = StarField(np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity())
-    told = shefex_identification.identify(field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1))
+    field = StarField(
+        np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity()
+    )
+    told = shefex_identification.identify(
+        field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1)
+    )
     assert (told.right, told.wrong) == (0.0, 0.0)
 
 
@@ -76,7 +83,10 @@ def test_where_a_line_passes_the_limit() -> None:
     yaw_deg = 0.2 * shefex_identification.ERRORS_PX
     assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
     assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(0.25, abs=0.01)
-    assert shefex_identification.error_at_limit(1.0, 1e-4 * yaw_deg**2) == shefex_identification.ERRORS_PX[-1]
+    assert (
+        shefex_identification.error_at_limit(1.0, 1e-4 * yaw_deg**2)
+        == shefex_identification.ERRORS_PX[-1]
+    )
 
 
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
@@ -135,13 +145,16 @@ def test_a_planet_s_light_is_pogson_s() -> None:
     changed = after.strength != before.strength
     assert changed.sum() == 3
     gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])
-    np.testing.assert_allclose(gained_mag, before.magnitude[changed] - shefex_camera.PLANET_MAG, rtol=1e-9)
+    np.testing.assert_allclose(
+        gained_mag, before.magnitude[changed] - shefex_camera.PLANET_MAG, rtol=1e-9
+    )
 
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_numbers() -> None:
     first, again = (
-        shefex_camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results for _ in range(2)
+        shefex_camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results
+        for _ in range(2)
     )
     assert first == again
 

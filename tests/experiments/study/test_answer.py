@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from skysim.experiments.study import study_file
-from skysim.experiments.study import answer
-from skysim.experiments.study.table import (PointRow, format_summary)
+from skysim.experiments.study import answer, study_file
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
+from skysim.experiments.study.table import PointRow, format_summary
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks

@@ -11,12 +11,8 @@ from scipy.stats import qmc
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.files import SCENES
-from skysim.experiments.study import study_file
-from skysim.experiments.study import table
-from skysim.experiments.study import table
-from skysim.experiments.study.execution import (engines, store)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import study_file, table
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.report import study_export
 from skysim.results import metrics

@@ -23,9 +23,7 @@ import skysim.experiments.study.execution
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import (engines, store, trials)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study.execution import engines, runner, setups, store, trials
 from skysim.experiments.study.execution.engines import Engine
 from tests.helpers.clusters import ENVIRONMENT, STUDY, Cluster, cluster_of, dask, on_dask, study
 from tests.helpers.study_stores import contents, done

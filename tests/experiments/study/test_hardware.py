@@ -10,13 +10,8 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
-from skysim.experiments.study import table
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study import plan, study_file, table
+from skysim.experiments.study.execution import runner, setups, store
 from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {

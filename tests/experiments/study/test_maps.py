@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.dynamics import guidance
-from skysim.experiments.study import study_file
-from skysim.experiments.study import worst
-from skysim.experiments.study.table import PointRow
+from skysim.experiments.study import study_file, worst
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report import maps
+from skysim.experiments.study.table import PointRow
 from skysim.results.metrics import Columns
 from skysim.scene.sections.motion import AttitudeConfig
 

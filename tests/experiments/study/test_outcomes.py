@@ -13,8 +13,7 @@ from estimator.core.types import StarMatch, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.types import Floats
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import (outcomes, trials)
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study.execution import outcomes, setups, trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX, Outcome, TrueLights
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.plan import TrialSpec

@@ -18,15 +18,11 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
-from skysim.experiments.study import worst
-from skysim.experiments.study import table
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import (engines, store, workers)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import plan, study_file, table, worst
+from skysim.experiments.study.execution import engines, runner, store, workers
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.report import study_export
 from skysim.results.files import row_parts
 from tests.helpers.study_stores import STRAYS, done

@@ -3,8 +3,7 @@
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
+from skysim.experiments.study import plan, study_file
 
 STUDY = """schema: 1
 title: a question
@@ -164,7 +163,9 @@ responses: [identified]
 def test_codes_of_leds_need_a_flight(tmp_path):
     """One frame shows one bit."""
     assert (
-        study_file.load(written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))).trials
+        study_file.load(
+            written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))
+        ).trials
         == 2
     )
     single = FLIGHT.format(scene="coded_spiral", start="scene").replace(

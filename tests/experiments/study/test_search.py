@@ -14,20 +14,14 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
-from skysim.experiments.study import search
-from skysim.experiments.study import search
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import (engines, store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import plan, search, study_file
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
-from skysim.experiments.study.execution.setups import (code_version, seed_of)
+from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import REFUSED, Row, TrialJob
-from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.report.study_report import front_table
-from skysim.results.files.parts import parts_list
-from skysim.results.files.parts import (find_prices, read_prices)
+from skysim.results.files.parts import find_prices, parts_list, read_prices
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
 from skysim.scene import loader as scene_loader

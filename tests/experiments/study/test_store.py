@@ -19,15 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (plan)
-from skysim.experiments.study import study_file
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution import (store, trials)
-from skysim.experiments.study.execution import runner
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study import plan, study_file
+from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 from tests.helpers.study_stores import STRAYS, contents, done
 
 

@@ -12,11 +12,10 @@ import yaml
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import study_file
-from skysim.experiments.study import thresholds
-from skysim.experiments.study.table import PointRow
-from skysim.experiments.study.thresholds import (Crossing, crossing)
+from skysim.experiments.study import study_file, thresholds
 from skysim.experiments.study.plan import Study, Threshold
+from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.thresholds import Crossing, crossing
 from skysim.results import metrics
 
 LEVELS = np.array([0.0, 1, 2, 3, 4, 6, 8, 10])

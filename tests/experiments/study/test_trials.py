@@ -15,13 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.files import SCENES
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import (trials)
-from skysim.experiments.study.execution import detections
-from skysim.experiments.study.execution import setups
+from skysim.experiments.study.execution import detections, setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation.exposure import render_at_rest
-from skysim.sources.ephemeris import observe_from
-from skysim.sources.ephemeris import place
+from skysim.sources.ephemeris import observe_from, place
 
 SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import (unused_options)
-from skysim.experiments.study import study_file
+from skysim.experiments.study import study_file, unused_options
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import build_setup
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial

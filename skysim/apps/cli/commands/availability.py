@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import (Json, Overrides, SceneArg, load)
-from skysim.apps.cli.terminal import (print_json, progress_callback)
+from skysim.apps.cli.options import Json, Overrides, SceneArg, load
+from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
 from skysim.results.report import print_table
-from skysim.results.report_blocks import (Column, Table)
+from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
-    from skysim.sources.orbit_availability import (Pointing, SkySamples)
+    from skysim.sources.orbit_availability import Pointing, SkySamples
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 LAWS = ("inertial", "zenith")
@@ -104,10 +104,9 @@ def computed(
     import numpy as np
 
     from skysim.core.constants import EARTH_MU_M3_S2
-    from skysim.sources import (stars)
-    from skysim.sources import catalog
-    from skysim.sources.orbit_availability import sample
+    from skysim.sources import catalog, stars
     from skysim.sources.camera_orbit import build_orbit
+    from skysim.sources.orbit_availability import sample
 
     orbit = build_orbit(scene.orbit, scene.start_time)
     assert orbit is not None
@@ -153,7 +152,7 @@ def write_picture(path: Path, found: SkySamples, scene: Scene) -> None:
     import numpy as np
 
     from skysim.core.files import atomic_file
-    from skysim.results.plots import (INK, png)
+    from skysim.results.plots import INK, png
 
     assert scene.orbit is not None
     assert scene.orbit.exclusion is not None

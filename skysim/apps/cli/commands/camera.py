@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skysim.apps.cli.options import (OPTIONS, as_typed)
-from skysim.apps.cli.options import (Json, Overrides, complete_scene)
-from skysim.apps.cli.terminal import (print_error, print_json, print_list)
+from skysim.apps.cli.options import OPTIONS, Json, Overrides, as_typed, complete_scene
+from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.results.report import terminal_width
-from skysim.scene.camera_sheet import QUESTIONS
-from skysim.scene.camera_sheet import PLACEHOLDER_LENS
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
     from skysim.scene.camera_sheet import Sheet
@@ -152,8 +150,7 @@ def read_camera(
 ) -> tuple[OpencvCalibration | None, dict[str, int]]:
     """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.scene import (loader)
-    from skysim.scene import opencv_calibration
+    from skysim.scene import loader, opencv_calibration
 
     if opencv_calibration.looks_like_calibration(Path(name)):
         if overrides:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
+
 import typer
+
 from skysim.apps.cli.commands.study import (
     EngineName,
     Scheduler,
@@ -13,9 +15,8 @@ from skysim.apps.cli.commands.study import (
     create_engine,
     start_workers,
 )
-from skysim.apps.cli.options import (Json, Overrides, SceneArg, Seed)
-from skysim.apps.cli.terminal import (print_error, print_json, trial_progress)
-
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
+from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
 
 def dataset(
@@ -52,7 +53,6 @@ def dataset(
     start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments import dataset_run
-    from skysim.experiments import dataset_run
     from skysim.experiments.dataset_shards import Storage
 
     Storage(out)  # refuses a wrong URL before the scene is read
@@ -81,5 +81,3 @@ def dataset(
             f"{progress.failed} frames are missing: their workers died; the same command tries them again"
         )
         raise typer.Exit(2)
-
-

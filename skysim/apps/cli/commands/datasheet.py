@@ -6,12 +6,14 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
-from skysim.apps.cli.options import (Json, OpenReport, Overrides, SceneArg, Seed, load)
-from skysim.apps.cli.terminal import (print_json, trial_progress)
+
+from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
-from skysim.results.report import (print_table, print_wrapped)
-from skysim.results.report_blocks import (Column, Table)
+from skysim.results.report import print_table, print_wrapped
+from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.model_fit import Agreement
@@ -62,12 +64,8 @@ def datasheet(
     """
     from skysim.core import files
     from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.datasheet import datasheet_report
-    from skysim.experiments.datasheet import cells
-    from skysim.experiments.datasheet import model_fit
-    from skysim.experiments.datasheet import model_fit
-    from skysim.experiments.datasheet import model_fit
-    from skysim.experiments.datasheet.statement import (numbers, state)
+    from skysim.experiments.datasheet import cells, datasheet_report, model_fit
+    from skysim.experiments.datasheet.statement import numbers, state
 
     if fmu and model is None:
         raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
@@ -99,8 +97,12 @@ def datasheet(
         files.write_text(markdown, report.markdown())
     if model:
         agreements = model_fit.agreements(sheet)
-        constants = model_fit.constants(sheet) | {"agreement": [one._asdict() for one in agreements]}
-        written = model_fit.write_model(model, constants) + ([model_fit.write_fmu(model)] if fmu else [])
+        constants = model_fit.constants(sheet) | {
+            "agreement": [one._asdict() for one in agreements]
+        }
+        written = model_fit.write_model(model, constants) + (
+            [model_fit.write_fmu(model)] if fmu else []
+        )
     if json:
         print_json(numbers(statement))
     else:
@@ -138,5 +140,3 @@ def print_agreements(agreements: list[Agreement]) -> None:
         " pairs of frames of the sequences."
     )
     print()
-
-

@@ -5,17 +5,16 @@ from __future__ import annotations
 import shlex
 import sys
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
+
 import typer
-from skysim.apps.cli.options import (Json, Out, Overrides, SceneArg, Seed, load, output_folder)
-from skysim.apps.cli.terminal import (print_json, progress_callback)
+
+from skysim.apps.cli.commands.camera import complete_camera
+from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.terminal import print_json, progress, progress_callback
 from skysim.core.errors import InputError
 from skysim.results.report import print_wrapped
-from pathlib import Path
-from skysim.apps.cli.commands.camera import complete_camera
-from skysim.apps.cli.options import (Json, Out)
-from skysim.apps.cli.terminal import (print_json, progress)
-
 
 
 class Excitation(StrEnum):
@@ -83,10 +82,7 @@ def balance(
 
     The star tracker is the instrument. Every flight is simulated, its frames are rendered and solved.
     """
-    from skysim.experiments import balance_flight
-    from skysim.experiments import balance_report
-    from skysim.experiments import balance_flight
-    from skysim.experiments import balance_procedure
+    from skysim.experiments import balance_flight, balance_procedure, balance_report
 
     if estimate_only and flights is not None:
         raise InputError("--flights", "has no effect with --estimate-only", "none")
@@ -95,7 +91,9 @@ def balance(
     )
     bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
     loaded = load(scene, None, seed, set_)
-    plan = balance_procedure.BalancePlan(excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only)
+    plan = balance_procedure.BalancePlan(
+        excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only
+    )
     folder = output_folder(out, loaded.name)
     iterations = []
     with progress_callback("flying") as watch:
@@ -137,8 +135,6 @@ def print_flight(row: dict[str, Any]) -> None:
         f" center of mass at {offset_text(row)} um;"
         f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
     )
-
-
 
 
 # Command `skysim characterize`: a camera preset from darks, flats and night frames.
@@ -207,5 +203,3 @@ def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
         print_json({"frames": len(paths), "folder": str(folder)})
     else:
         print_wrapped(f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}")
-
-

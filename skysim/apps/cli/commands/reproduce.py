@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import (Json, OpenReport)
-from skysim.apps.cli.terminal import (print_json, print_list, progress_callback)
+from skysim.apps.cli.options import Json, OpenReport
+from skysim.apps.cli.terminal import print_json, print_list, progress_callback
 from skysim.core.errors import InputError
 from skysim.results.report import print_blocks
 

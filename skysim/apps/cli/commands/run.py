@@ -10,8 +10,28 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skysim.apps.cli import terminal
-from skysim.apps.cli.options import with_location
-from skysim.apps.cli.options import (LOADED, TRACKER_HELP, Centroider, Detector, Frames, Identifier, Json, OpenReport, Out, Overrides, Programs, SceneArg, Seed, SolverName, load, output_folder, scene_names, selected_stages, used_programs)
+from skysim.apps.cli.options import (
+    LOADED,
+    TRACKER_HELP,
+    Centroider,
+    Detector,
+    Frames,
+    Identifier,
+    Json,
+    OpenReport,
+    Out,
+    Overrides,
+    Programs,
+    SceneArg,
+    Seed,
+    SolverName,
+    load,
+    output_folder,
+    scene_names,
+    selected_stages,
+    used_programs,
+    with_location,
+)
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
@@ -39,7 +59,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.results.report import Facts
+    from skysim.results.report_blocks import Facts
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
     from skysim.simulation.checks.facts import TRACKER_KNOWS
@@ -134,8 +154,7 @@ def compare(
     from skysim.experiments import tracker_comparison
     from skysim.results.run import Recorder
     from skysim.simulation.flight import Flight
-    from skysim.simulation.lab import build_lab
-    from skysim.simulation.lab import UserParts
+    from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, frames, seed, set_, tracker)
     programs = used_programs(program, [*tracker, *scene_names(loaded)])

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
-from skysim.apps.cli.options import (Frames, Json, Overrides, SceneArg, Seed, load)
+
+from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
 from skysim.core.errors import InputError
-from typing import Annotated
-from skysim.apps.cli.options import SceneArg
 
 if TYPE_CHECKING:
     from skysim.apps.stream.http import FrameHub
@@ -56,7 +56,7 @@ def stream(
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
     from skysim.apps.stream import sender
     from skysim.apps.stream.sender import Pace
-    from skysim.apps.stream.sinks import (READER_GONE, Sink, folder_writer, pipe_writer)
+    from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
@@ -133,8 +133,6 @@ def counts(receiver: str, counters: dict[str, Any]) -> str:
     return f"{receiver}: {counters['sent']} sent, {counters['dropped']} dropped"
 
 
-
-
 # Command `skysim gui`.
 
 
@@ -180,5 +178,3 @@ def gui(
     server.serve(
         scene, host, port, token, folder.resolve(), out.resolve(), camera or [], workers, show
     )
-
-

@@ -7,8 +7,16 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import (Centroider, Detector, Identifier, Json, SolverName, datetime_from_iso, selected_stages)
-from skysim.apps.cli.terminal import (print_error, print_json, print_solutions, progress)
+from skysim.apps.cli.options import (
+    Centroider,
+    Detector,
+    Identifier,
+    Json,
+    SolverName,
+    datetime_from_iso,
+    selected_stages,
+)
+from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
 from skysim.core.errors import InputError
 
 

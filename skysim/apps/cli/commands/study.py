@@ -9,9 +9,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import (Json, OpenReport, Out, Overrides, Programs, complete_study, output_folder, study_names, used_programs)
-from skysim.apps.cli.terminal import (print_replay, print_study_status, print_worst, study_status)
-from skysim.apps.cli.terminal import (print_error, print_json, print_titles, trial_progress)
+from skysim.apps.cli.options import (
+    Json,
+    OpenReport,
+    Out,
+    Overrides,
+    Programs,
+    complete_study,
+    output_folder,
+    study_names,
+    used_programs,
+)
+from skysim.apps.cli.terminal import (
+    print_error,
+    print_json,
+    print_replay,
+    print_study_status,
+    print_titles,
+    print_worst,
+    study_status,
+    trial_progress,
+)
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
@@ -243,7 +261,7 @@ def worst(
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.yaml_reader import (parse_overrides, parse_yaml)
+    from skysim.core.yaml_reader import parse_overrides, parse_yaml
 
     return {
         key: parse_yaml(text)[1]
@@ -272,12 +290,15 @@ def run_and_report(
 ) -> None:
     """Run the missing trials of a study or a search with a progress bar, then report.
 
-    resumed       : the store may hold trials already
-    repeat_failed : repeat the failed trials too
+    Parameters
+    ----------
+    resumed
+        The store may hold trials already
+    repeat_failed
+        Repeat the failed trials too
     """
     from skysim.experiments.study import search
-    from skysim.experiments.study.execution import (store)
-    from skysim.experiments.study.execution import runner
+    from skysim.experiments.study.execution import runner, store
 
     path = folder_of(study, out) / store.STORE
     total = plan.study.trial_count(len(plan.points))
@@ -314,8 +335,7 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study import search
-    from skysim.experiments.study import table
+    from skysim.experiments.study import search, table
     from skysim.experiments.study.report import study_report
 
     path = folder_of(study, out) / "report.html"
@@ -366,11 +386,19 @@ def load_stored_plan(
 ) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
-    program : external trackers of the command line; None if no trial will be run
-    set_    : more overrides
-    grows   : whether the study may have more replicates than its store
+    Parameters
+    ----------
+    program
+        External trackers of the command line; None if no trial will be run
+    set_
+        More overrides
+    grows
+        Whether the study may have more replicates than its store
 
-    Raises InputError if the store holds another study, or this one before it was changed.
+    Raises
+    ------
+    InputError
+        If the store holds another study, or this one before it was changed.
     """
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.study import study_file
@@ -380,7 +408,9 @@ def load_stored_plan(
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)
         plan = study_file.load(
-            study, overrides, None if program is None else tracker_interface.program_commands(program)
+            study,
+            overrides,
+            None if program is None else tracker_interface.program_commands(program),
         )
         kept = runner.stored_replicates(plan, stored)
         path = stored.path

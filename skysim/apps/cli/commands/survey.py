@@ -10,22 +10,23 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
+
 from skysim.apps.cli import terminal
-from skysim.apps.cli.options import (Json, Out, Overrides, SceneArg, Seed, load, output_folder)
-from skysim.apps.cli.terminal import (print_error, print_json, progress, progress_callback)
+from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.terminal import print_error, print_json, progress, progress_callback
 from skysim.core.errors import InputError
-from skysim.results.report import (print_blocks, print_wrapped)
+from skysim.results.report import print_blocks, print_wrapped
 
 if TYPE_CHECKING:
     from estimator.core.camera import Camera
     from estimator.trackers.pipeline import Settings
-    from skysim.experiments.dome_survey.survey_images import SurveyImage
+    from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
     from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-    from skysim.experiments.dome_survey.survey_prior import (CalibrationPrior, SurveyUncertainty)
+    from skysim.experiments.dome_survey.survey_images import SurveyImage
+    from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
     from skysim.experiments.dome_survey.survey_procedure import HeldAttitudes
-    from skysim.experiments.dome_survey.survey_findings import Coverage
-    from skysim.experiments.dome_survey.survey_findings import SurveyRun
     from skysim.scene.scene import Scene
     from skysim.simulation.lab import Lab
 
@@ -239,8 +240,7 @@ def planned(request: Request) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
 def plan_only(request: Request) -> dict[str, Any]:
     """The attitudes of a plan and the errors predicted."""
     from skysim.core import files
-    from skysim.experiments.dome_survey import survey_procedure
-    from skysim.experiments.dome_survey import survey_findings
+    from skysim.experiments.dome_survey import survey_findings, survey_procedure
 
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
@@ -281,12 +281,13 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
 
 def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
     """A simulated survey, compared with the truth."""
-    from skysim.experiments.dome_survey import (adjust)
-    from skysim.experiments.dome_survey import survey_frames
-    from skysim.experiments.dome_survey import survey_prior
-    from skysim.experiments.dome_survey import survey_procedure
-    from skysim.experiments.dome_survey import survey_frames
-    from skysim.experiments.dome_survey import survey_findings
+    from skysim.experiments.dome_survey import (
+        adjust,
+        survey_findings,
+        survey_frames,
+        survey_prior,
+        survey_procedure,
+    )
     from skysim.experiments.dome_survey import survey_report as report
     from skysim.simulation.lab import build_tracker
     from skysim.tracking import factory
@@ -306,7 +307,9 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         survey_prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources
     )
     tests = survey_frames.render_stops(
-        lab, survey_frames.stop_attitudes(lab.scene, "checks", checks, request.tilt_deg), len(plan.shown)
+        lab,
+        survey_frames.stop_attitudes(lab.scene, "checks", checks, request.tilt_deg),
+        len(plan.shown),
     )
     statistics |= report.truth_statistics(run, before, lab)
     statistics |= report.compare_trackers(
@@ -325,9 +328,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
 
 def from_images(request: Request, images: Path, camera_file: Path, watch: bool) -> dict[str, Any]:
     """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
-    from skysim.experiments.dome_survey import survey_prior
-    from skysim.experiments.dome_survey import survey_procedure
-    from skysim.experiments.dome_survey import survey_images
+    from skysim.experiments.dome_survey import survey_images, survey_prior, survey_procedure
     from skysim.simulation.lab import build_lab
     from skysim.tracking import factory
 
@@ -375,14 +376,16 @@ def print_so_far(
     request: Request, pictures: list[SurveyImage], before: CalibrationPrior, stages: Settings
 ) -> None:
     """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
-    from skysim.experiments.dome_survey.survey_images import frames_with_attitude
     from skysim.experiments.dome_survey import survey_findings
+    from skysim.experiments.dome_survey.survey_images import frames_with_attitude
     from skysim.experiments.dome_survey.survey_report import coverage_blocks
 
     found = frames_with_attitude(pictures, before, request.uncertainty, stages)
     print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
     if found:
-        so_far = survey_findings.coverage_before(found, before, request.uncertainty, before.floor_px)
+        so_far = survey_findings.coverage_before(
+            found, before, request.uncertainty, before.floor_px
+        )
         print_blocks(coverage_blocks(with_next(request, so_far, before)))
 
 
@@ -422,8 +425,8 @@ def coverage_shown(
 
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
     """Statistics of a coverage with the attitudes to hold next, and what they will reach."""
-    from skysim.experiments.dome_survey.survey_prior import image_sizes
     from skysim.experiments.dome_survey import survey_findings
+    from skysim.experiments.dome_survey.survey_prior import image_sizes
 
     margin_px = image_sizes(prior).margin_px
     further = survey_findings.next_stops(
@@ -442,9 +445,7 @@ def write_results(
 ) -> dict[str, Any]:
     """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
     from skysim.core import files
-    from skysim.experiments.dome_survey import (adjust)
-    from skysim.experiments.dome_survey import survey_frames
-    from skysim.experiments.dome_survey import survey_findings
+    from skysim.experiments.dome_survey import adjust, survey_findings, survey_frames
     from skysim.experiments.dome_survey import survey_report as report
     from skysim.tracking import dome_map_file
 
@@ -483,5 +484,3 @@ def write_report(request: Request, run: SurveyRun, statistics: dict[str, Any]) -
         report.print()
         print_wrapped(f"{statistics['map']}: for tracker.map; report: {path}")
     return statistics
-
-

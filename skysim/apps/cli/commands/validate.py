@@ -6,24 +6,32 @@ will show and how accurate its tracker will be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-from pydantic import BaseModel
-from skysim.experiments.study.plan import Study
-from skysim.scene.scene import NAME_ALIAS, Scene
-from skysim.scene.sections.camera import CameraConfig
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
 import typer
-from skysim.apps.cli.options import with_location
-from skysim.apps.cli.options import (Json, Overrides, Programs, SceneArg, load, scene_names, study_names, used_programs)
-from skysim.apps.cli.terminal import (print_check, print_error, print_json)
+from pydantic import BaseModel
+
+from skysim.apps.cli.options import (
+    Json,
+    Overrides,
+    Programs,
+    SceneArg,
+    load,
+    scene_names,
+    study_names,
+    used_programs,
+    with_location,
+)
+from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
+from skysim.experiments.study.plan import Study
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS
-
-
+from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.camera import CameraConfig
 
 # JSON Schema of scene and study files, for editors.
 
@@ -69,7 +77,10 @@ def json_schema(kind: str) -> dict[str, Any]:
 def relaxed(node: Any, name: str = "") -> Any:
     """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
 
-    name : of the definition that `node` is, for which EXTRA_KEYS may add keys
+    Parameters
+    ----------
+    name
+        Of the definition that `node` is, for which EXTRA_KEYS may add keys
     """
     if isinstance(node, list):
         return [relaxed(item) for item in node]
@@ -128,7 +139,6 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     if schema is not None:
-
         if schema not in KINDS:
             raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
         print_json(json_schema(schema))
@@ -162,8 +172,7 @@ def check(
     Nothing is simulated or rendered; everything is computed at sampled attitudes.
     """
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.lab import build_lab
-    from skysim.simulation.lab import UserParts
+    from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, None, None, set_)
     result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
@@ -186,7 +195,7 @@ def describe_file(
     path: Path, programs: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
-    from skysim.core.yaml_reader import (is_file, read_yaml)
+    from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
 
     path = path if path.suffix else find_shipped(path)
@@ -226,7 +235,7 @@ def names_in_file(path: Path) -> set[str | None]:
 
     path = path if path.suffix else find_shipped(path)
     with contextlib.suppress(InputError):
-        return set(scene_names(study_file.load(path)))
+        return set(scene_names(loader.load(path)))
     with contextlib.suppress(InputError):
         return study_names(studies.load(path))
     return set()
@@ -234,8 +243,8 @@ def names_in_file(path: Path) -> set[str | None]:
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
+    from skysim.core.files import DATA, SCENES, STUDIES
     from skysim.core.yaml_reader import find_file
-    from skysim.core.files import (DATA, SCENES, STUDIES)
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
     return next((file for file in names if file.is_file()), None) or find_file(
@@ -247,10 +256,9 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.lab import (build_lab, build_tracker)
-    from skysim.simulation.lab import UserParts
+    from skysim.simulation.lab import UserParts, build_lab, build_tracker
 
-    scene = study_file.load(path)
+    scene = loader.load(path)
     try:
         lab = build_lab(scene, UserParts(programs))
         build_tracker(lab.camera, programs)
@@ -276,5 +284,3 @@ def describe_table(path: Path) -> str:
     if "{name: hip," in first:
         return f"a catalog of {len(catalog.read(path).hip)} stars"
     return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"
-
-

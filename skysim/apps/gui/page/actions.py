@@ -51,7 +51,12 @@ def matching(commands: list[Command], text: str) -> list[Command]:
 class Palette:
     """The dialog. Arrows choose, Enter or a click does.
 
-    found : commands that match;  chosen : index of the one that Enter does
+    Attributes
+    ----------
+    found
+        Commands that match
+    chosen
+        Index of the one that Enter does
     """
 
     def __init__(self, commands: Callable[[], list[Command]]) -> None:
@@ -113,11 +118,18 @@ class Palette:
 class Actions:
     """What keys and commands do on a page.
 
-    step : shows the next or the previous frame of the flight (1 or -1)
-    performers : by the action of a key, of those that are also commands
-    others : commands that are not in `keys.KEYS`
-    steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
-    moving : whether such a frame is being rendered
+    Attributes
+    ----------
+    step
+        Shows the next or the previous frame of the flight (1 or -1)
+    performers
+        By the action of a key, of those that are also commands
+    others
+        Commands that are not in `keys.KEYS`
+    steps
+        (3,) right, up, roll: movements requested by keys that no frame shows yet
+    moving
+        Whether such a frame is being rendered
     """
 
     def __init__(

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
+
 from nicegui import ui
+
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import forms
-from skysim.apps.gui.views import keys
+from skysim.apps.gui.views import forms, keys
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import (Contents, LiveText)
+from skysim.apps.gui.views.live import Contents, LiveText
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.core.files import SCENES
 
 
-
 class Head:
     """The elements of the head, and what they do.
 
-    folder : where scenes are saved;  message_text : the message
+    Attributes
+    ----------
+    folder
+        Where scenes are saved
+    message_text
+        The message
     """
 
     def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
@@ -130,8 +135,6 @@ class Head:
             self.page.show_message(f"{item}: {reason}")
 
 
-
-
 # How a user arranges the page: the sizes of its panes and its theme, remembered by the browser.
 
 
@@ -198,7 +201,10 @@ window.skysimSplitter = (() => {
 class Arrangement:
     """The splitters between the frame, the 3-D view and the panels, and the theme.
 
-    charts : that are drawn again in another theme
+    Attributes
+    ----------
+    charts
+        That are drawn again in another theme
     """
 
     def __init__(self, charts: list[ui.echart]) -> None:
@@ -210,7 +216,10 @@ class Arrangement:
     def splitter(kind: str, orientation: str, label: str) -> None:
         """A line that is dragged or moved by arrow keys; a double click or Enter gives the pane its first size.
 
-        kind : side (the column of panels) or space (the 3-D view)
+        Parameters
+        ----------
+        kind
+            Side (the column of panels) or space (the 3-D view)
         """
         line = (
             ui.element("div")
@@ -240,5 +249,3 @@ class Arrangement:
         self.dark.set_value(dark)
         for chart in self.charts:
             chart.update()
-
-

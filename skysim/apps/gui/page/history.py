@@ -50,10 +50,22 @@ document.addEventListener("keydown", event => {
 class History:
     """Writes a page's view to the browser, and shows the view of an address.
 
-    home : the server's scene; a stored view is that of a server for the same one
-    show_query : shows the view of an address;  is_settling : whether the page does not show its view yet
-    written : the view in the address;  pending : the newest query that is asked for while another is being shown
-    moving : whether the last change was of attitude or time alone;  unchanged : times of the timer since then
+    Attributes
+    ----------
+    home
+        The server's scene; a stored view is that of a server for the same one
+    show_query
+        Shows the view of an address
+    is_settling
+        Whether the page does not show its view yet
+    written
+        The view in the address
+    pending
+        The newest query that is asked for while another is being shown
+    moving
+        Whether the last change was of attitude or time alone
+    unchanged
+        Times of the timer since then
     """
 
     def __init__(

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from pathlib import Path
 from typing import Any
+
 from nicegui import ui
-from skysim.apps.gui.messages import (FrameView, SceneInfo)
+
+from skysim.apps.gui.messages import FrameView, SceneInfo
 from skysim.apps.gui.views.context import Shown
 from skysim.apps.gui.views.live import csv_table
-
-
 
 MAX_LINES = 500
 MAX_ROWS = 10_000
@@ -107,5 +107,3 @@ def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
         *errors,
         result.wrong,
     )
-
-

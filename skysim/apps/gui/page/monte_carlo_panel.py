@@ -8,13 +8,14 @@ import time
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
 from nicegui import run, ui
 from pydantic import ValidationError
-from skysim.apps.gui.views import forms
-from skysim.apps.gui.views import keys
+
+from skysim.apps.gui.views import forms, keys
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.style import (CURVE_COLORS, TOOLTIP, chart_color)
-from skysim.apps.gui.views.live import (for_page, format_number)
+from skysim.apps.gui.views.live import for_page, format_number
+from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
     RESPONSES,
@@ -24,16 +25,14 @@ from skysim.apps.gui.worker.study_process import (
     is_shown,
     monte_carlo,
 )
-from skysim.core.errors import InputError
 from skysim.core import files
-from skysim.core.files import (STUDIES, title_of)
-from skysim.experiments.study import (unused_options)
+from skysim.core.errors import InputError
+from skysim.core.files import STUDIES, title_of
 from skysim.experiments.study import study_file as loader
+from skysim.experiments.study import unused_options
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.plan import Plan, TrialSection
 from skysim.scene.loader import load
-
-
 
 POLL_S = 0.5
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
@@ -42,10 +41,22 @@ TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 class MonteCarloPanel:
     """Panel that runs one study at a time.
 
-    out : folder of the studies;  user, tab : the browser and its tab, which are in the names of their folders
-    process : the study;  run_number : of the tab's last Monte Carlo study
-    failed : trials that the page lists, see `StudyResults`
-    stopped : whether the study was stopped and can be continued;  starting : whether its process is being started
+    Attributes
+    ----------
+    out
+        Folder of the studies
+    user, tab
+        The browser and its tab, which are in the names of their folders
+    process
+        The study
+    run_number
+        Of the tab's last Monte Carlo study
+    failed
+        Trials that the page lists, see `StudyResults`
+    stopped
+        Whether the study was stopped and can be continued
+    starting
+        Whether its process is being started
     """
 
     def __init__(self, page: PageContext, out: Path, user: str, tab: str) -> None:
@@ -213,7 +224,10 @@ class MonteCarloPanel:
     def study_file(self) -> Path:
         """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.
 
-        Raises InputError for a wrong number of runs.
+        Raises
+        ------
+        InputError
+            For a wrong number of runs.
         """
         if self.study_select.value:
             return STUDIES / f"{self.study_select.value}.yaml"
@@ -427,5 +441,3 @@ def options() -> dict[str, Any]:
             }
         ],
     }
-
-

@@ -5,11 +5,11 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
+
 from nicegui import ui
+
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
-
-
 
 LIMIT_BYTES = 64 * 2**20
 
@@ -28,7 +28,14 @@ def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
 class PhotoPanel:
     """Panel with upload area, live camera and result text.
 
-    cameras : that it may watch;  live : whether it watches one;  logged : the status that was logged last
+    Attributes
+    ----------
+    cameras
+        That it may watch
+    live
+        Whether it watches one
+    logged
+        The status that was logged last
     """
 
     def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:
@@ -151,5 +158,3 @@ class PhotoPanel:
     def show_text(self, text: str, color: str) -> None:
         self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)
-
-

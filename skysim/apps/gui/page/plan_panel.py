@@ -8,24 +8,24 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from nicegui import run, ui
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skysim.apps.gui.messages import (AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan)
+
+from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import forms
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.style import color_scale
 from skysim.apps.gui.views.live import for_page
 from skysim.apps.gui.views.space import Scene3D
+from skysim.apps.gui.views.style import color_scale
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
 from skysim.scene.sections.motion import PRESCRIBED
-
-
 
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ = 0.5
@@ -46,9 +46,19 @@ UNPLANNED = (
 class PlanPanel:
     """Panel with three parts, each computed at a button's press and cleared when the scene changes.
 
-    scene_3d : in which it colors LEDs;  run_panel : which flies the survey
-    taken : frames of the survey, once they are adjusted;  colored : its LEDs and how well it knows each
-    legends : what the colors of the LEDs in the 3-D view mean, by what has colored them; the last one is shown
+    Attributes
+    ----------
+    scene_3d
+        In which it colors LEDs
+    run_panel
+        Which flies the survey
+    taken
+        Frames of the survey, once they are adjusted
+    colored
+        Its LEDs and how well it knows each
+    legends
+        What the colors of the LEDs in the 3-D view mean, by what has colored them; the last one
+        is shown
     """
 
     def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
@@ -375,5 +385,3 @@ def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
             first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
         ).max()
     )
-
-

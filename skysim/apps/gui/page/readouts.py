@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
-from nicegui import ui
-from skysim.apps.gui.messages import (FrameView, SceneInfo, TrackerResult)
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import (Contents, LiveInput, LiveText)
-from skysim.apps.gui.views.live import format_number
-from skysim.apps.gui.worker.photo import Photo
 from collections.abc import Callable, Collection, Iterator
+from typing import Any
+
 import numpy as np
-from skysim.apps.gui.messages import (Detection, LightRow)
-from skysim.apps.gui.views.overlay import (MAX_TRUTH_MARKS, NEAR_PX)
+from nicegui import ui
+
+from skysim.apps.gui.messages import Detection, FrameView, LightRow, SceneInfo, TrackerResult
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
+from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 from skysim.apps.gui.views.sensor import SensorView
-
-
+from skysim.apps.gui.worker.photo import Photo
 
 ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
 
@@ -24,8 +22,12 @@ ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field =
 class AttitudeCard:
     """True and estimated angles with the error, and the algorithms of the tracker's four stages.
 
-    contents : of the tab's live fields
-    shows_photo : whether the card shows an image that is not of the current scene
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    shows_photo
+        Whether the card shows an image that is not of the current scene
     """
 
     def __init__(self, page: PageContext, contents: Contents) -> None:
@@ -149,8 +151,6 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
     return "good", f"solved; {counts}"
 
 
-
-
 # Lights panel: a table of the true lights of the frame and of what the tracker made of each.
 
 
@@ -187,7 +187,11 @@ def rows(
 ) -> Iterator[dict[str, Any]]:
     """Rows of the table: every true light with its detection, the brightest first, then detections of no light.
 
-    state : good if the light was identified, warn if a detection is false or taken for another light, else quiet
+    Returns
+    -------
+    state
+        Good if the light was identified, warn if a detection is false or taken for another
+        light, else quiet
     """
     found = list(detections)
     found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
@@ -230,5 +234,3 @@ def state(light: LightRow, spot: Detection | None) -> str:
     if spot is None or spot.id < 0:
         return "quiet"
     return "good" if spot.id == light.id else "warn"
-
-

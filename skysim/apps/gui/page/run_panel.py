@@ -9,17 +9,16 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+
 from nicegui import ui
-from skysim.apps.gui.messages import (FlightStep, FlightRow, MotionLog)
-from skysim.apps.gui.page.strips import (StripChart, rms_line, strips)
+
+from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
+from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import keys
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.forms import (FEEDBACKS, loop_overrides)
-from skysim.apps.gui.views.live import (Contents, LiveInput, LiveText)
-from skysim.apps.gui.views.live import csv_table
+from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
+from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
 from skysim.apps.gui.views.sensor import SensorView
-
-
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
@@ -31,16 +30,37 @@ DRAW_S = 0.7  # between two drawings of the strips while frames come
 class RunPanel:
     """Panel that computes the flight, plays, pauses, steps and seeks.
 
-    sensor : which shows its frames;  contents : of the tab's live fields
-    feedback : of the scene's controller; None without a controller
-    rows, log : of the computed frames and of the motion;  residuals : of the identified lights, see `FlightStep`
-    computing, stopping : whether the flight is being computed, and whether it shall end
-    playing, showing : whether it plays, and whether `play_on` shows its frames;  slot : of the panel in the page
-    wanted_s : time to be shown once the flight is computed; None: play it from its start;  when_shown : called then
-    sought : place of the slider while its frame is not shown yet
-    index : of the frame on the page;  started_s, from_s : time of the last start of playback, and in the flight there
-    closed_scene, closed_overrides : last scene with a closed loop and its overrides, with which an opened loop is
-        closed again
+    Attributes
+    ----------
+    sensor
+        Which shows its frames
+    contents
+        Of the tab's live fields
+    feedback
+        Of the scene's controller; None without a controller
+    rows, log
+        Of the computed frames and of the motion
+    residuals
+        Of the identified lights, see `FlightStep`
+    computing, stopping
+        Whether the flight is being computed, and whether it shall end
+    playing, showing
+        Whether it plays, and whether `play_on` shows its frames
+    slot
+        Of the panel in the page
+    wanted_s
+        Time to be shown once the flight is computed; None: play it from its start
+    when_shown
+        Called then
+    sought
+        Place of the slider while its frame is not shown yet
+    index
+        Of the frame on the page
+    started_s, from_s
+        Time of the last start of playback, and in the flight there
+    closed_scene, closed_overrides
+        Last scene with a closed loop and its overrides, with which an opened loop is closed
+        again
     """
 
     def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
@@ -251,7 +271,10 @@ class RunPanel:
     async def restore(self, t_s: float, when_shown: Callable[[], None]) -> None:
         """Show a moment of the flight again; compute the flight first if it is not kept.
 
-        when_shown : called after this computation
+        Parameters
+        ----------
+        when_shown
+            Called after this computation
         """
         if self.rows and not self.computing:
             await self.show_moment(t_s)
@@ -364,7 +387,6 @@ class RunPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(FlightRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv"
+            csv_table(FlightRow._fields, self.rows),
+            f"{Path(self.page.state.scene).stem}_flight.csv",
         )
-
-

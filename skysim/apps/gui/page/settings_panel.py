@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+
 from nicegui import run, ui
+
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.views import forms
-from skysim.apps.gui.views import keys
+from skysim.apps.gui.views import forms, keys
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import for_page
 from skysim.core.errors import InputError
-
-
 
 SENSOR = "sensor, F6"
 IDENTIFIER = "identifier, F7"
@@ -46,10 +45,20 @@ MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of th
 class KeyForm:
     """Form with one expandable part per group of keys; values that differ from the file are marked.
 
-    label  : of a field, from its key;  opens : the group that is open at first
-    scene, fields : the scene whose fields are shown, and these by key
-    last_typed : by key the last typed value, accepted or refused
-    rows, labels, inputs : by key its elements;  expansions : by group
+    Attributes
+    ----------
+    label
+        Of a field, from its key
+    opens
+        The group that is open at first
+    scene, fields
+        The scene whose fields are shown, and these by key
+    last_typed
+        By key the last typed value, accepted or refused
+    rows, labels, inputs
+        By key its elements
+    expansions
+        By group
     """
 
     def __init__(
@@ -179,8 +188,14 @@ class KeyForm:
 class ScenePanel:
     """The form, one part per section of the scene, a field that finds keys, and a button that saves a new scene file.
 
-    folder : of the saved scenes;  saved : called when one is there
-    shown : scene and overrides in the form
+    Attributes
+    ----------
+    folder
+        Of the saved scenes
+    saved
+        Called when one is there
+    shown
+        Scene and overrides in the form
     """
 
     def __init__(self, page: PageContext, folder: Path, saved: Callable[[], None]) -> None:
@@ -267,8 +282,12 @@ class TrackerPanel:
 
     A form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights.
 
-    study : the panel of that simulation
-    shown : scene and overrides in the form
+    Attributes
+    ----------
+    study
+        The panel of that simulation
+    shown
+        Scene and overrides in the form
     """
 
     def __init__(self, page: PageContext, study: MonteCarloPanel) -> None:
@@ -328,5 +347,3 @@ class TrackerPanel:
             )
             if entry:
                 ui.timer(FOCUS_S, partial(keys.focus, entry), once=True)
-
-

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
 from nicegui import ui
-from skysim.apps.gui.messages import (FlightRow, MotionLog)
+
+from skysim.apps.gui.messages import FlightRow, MotionLog
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.style import (CURVE_COLORS, TOOLTIP, chart_color)
-
-
+from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
@@ -67,7 +67,10 @@ class StripCurve:
 class Strip:
     """One chart with its unit in the title.
 
-    dots : of lights, drawn by strips.js: time, value, and the light's number
+    Attributes
+    ----------
+    dots
+        Of lights, drawn by strips.js: time, value, and the light's number
     """
 
     title: str
@@ -148,7 +151,12 @@ def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
 class StripChart:
     """The chart; a click on a strip emits the page's event `moment` with the time there.
 
-    contents : of the tab's live fields;  strips : that are drawn
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    strips
+        That are drawn
     """
 
     def __init__(self, contents: Contents) -> None:
@@ -314,5 +322,3 @@ def rms_line(rows: Sequence[FlightRow]) -> str:
         for values in ([row.cross_arcsec for row in solved], [row.roll_arcsec for row in solved])
     )
     return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
-
-

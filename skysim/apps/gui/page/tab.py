@@ -13,30 +13,24 @@ from typing import Any
 
 from nicegui import run, ui
 
-from skysim.apps.gui.messages import (FrameView, SceneInfo, Triple)
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.page import monte_carlo_panel, readouts
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.page.head import Arrangement
-from skysim.apps.gui.page.head import Head
+from skysim.apps.gui.page.head import Arrangement, Head
 from skysim.apps.gui.page.history import History
 from skysim.apps.gui.page.log_panel import LogPanel
-from skysim.apps.gui.page import readouts
-from skysim.apps.gui.page import monte_carlo_panel
-from skysim.apps.gui.page.readouts import AttitudeCard
-from skysim.apps.gui.page.readouts import LightsPanel
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
 from skysim.apps.gui.page.photo_panel import PhotoPanel
 from skysim.apps.gui.page.plan_panel import PlanPanel
+from skysim.apps.gui.page.readouts import AttitudeCard, LightsPanel
 from skysim.apps.gui.page.run_panel import RunPanel
-from skysim.apps.gui.page.settings_panel import (ScenePanel, TrackerPanel)
-from skysim.apps.gui.views import forms
-from skysim.apps.gui.views import keys
-from skysim.apps.gui.views import style
-from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.state import PageView
-from skysim.apps.gui.views.live import for_page
-from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.page.settings_panel import ScenePanel, TrackerPanel
+from skysim.apps.gui.views import forms, keys, style
+from skysim.apps.gui.views.live import Contents, for_page
 from skysim.apps.gui.views.overlay import FRAMES
+from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.space import Scene3D
+from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
@@ -50,13 +44,26 @@ PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "
 class Tab:
     """One tab: its worker, its scene, and its page elements. It is the `PageContext` of its parts.
 
-    session : its worker, set when it has got one
-    new_session : gives another worker, None if there are too many
-    folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
-    user : its browser, see `server.user_of`
-    state, scene_info, view, is_open : see `Shown`
-    contents : of the fields that change with every frame
-    editing, filling : held while the scene is changed, or a form of its keys is filled
+    Attributes
+    ----------
+    session
+        Its worker, set when it has got one
+    new_session
+        Gives another worker, None if there are too many
+    folder
+        Where scenes are saved
+    out
+        Where studies are
+    cameras
+        Live ones that it may watch
+    user
+        Its browser, see `server.user_of`
+    state, scene_info, view, is_open
+        See `Shown`
+    contents
+        Of the fields that change with every frame
+    editing, filling
+        Held while the scene is changed, or a form of its keys is filled
     """
 
     session: Session
@@ -399,7 +406,10 @@ class Tab:
     def show_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
 
-        state : see `show_frame`
+        Parameters
+        ----------
+        state
+            See `show_frame`
         """
         self.set_state(**state)
         self.attitude.show_photo(photo)

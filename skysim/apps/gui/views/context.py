@@ -4,19 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol
-from skysim.apps.gui.messages import (FrameView, SceneInfo, Triple)
+
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
-
 
 
 class Shown(Protocol):
     """What the page shows.
 
-    state : as an address holds it;  scene_info : of the open scene, None before the first is open
-    view : newest frame of the scene, None before the first
-    message_text : message in the head;  solving : whether every frame is solved
-    is_open : whether the browser still has the page
+    Attributes
+    ----------
+    state
+        As an address holds it
+    scene_info
+        Of the open scene, None before the first is open
+    view
+        Newest frame of the scene, None before the first
+    message_text
+        Message in the head
+    solving
+        Whether every frame is solved
+    is_open
+        Whether the browser still has the page
     """
 
     @property
@@ -86,5 +96,3 @@ class Notified(Protocol):
 
 class PageContext(Shown, Asked, Notified, Protocol):
     """The page for its parts: what it shows, what it asks of its worker, and how it is notified."""
-
-

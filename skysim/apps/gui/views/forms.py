@@ -9,19 +9,19 @@ from math import isfinite, radians, tan
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
 import yaml
 from pydantic import BaseModel, ValidationError
+
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import (read_yaml, set_key)
 from skysim.core.files import SCENES
 from skysim.core.units import SI_SUFFIX, si_unit
+from skysim.core.yaml_reader import read_yaml, set_key
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.motion import expand_control
 from skysim.tracking import factory as tracker_settings
-
-
 
 # Units of bare numbers by suffix of a key.
 DISPLAY_UNITS = {
@@ -88,11 +88,22 @@ ONE_KIND = ("light",)
 class FormField(NamedTuple):
     """One key of a scene.
 
-    key   : dotted;  text: its value as YAML, from the file, or else the default
-    unit  : of a bare number;  allowed_values: those of an enumeration
-    is_set: whether a file or an override sets it
-    meaning   : what `null` stands for, if that is one of the allowed values
-    no_effect : why the key does nothing in this scene; empty if it does something
+    Attributes
+    ----------
+    key
+        dotted
+    text
+        Its value as YAML, from the file, or else the default
+    unit
+        Of a bare number
+    allowed_values
+        Those of an enumeration
+    is_set
+        Whether a file or an override sets it
+    meaning
+        What `null` stands for, if that is one of the allowed values
+    no_effect
+        Why the key does nothing in this scene; empty if it does something
     """
 
     key: str
@@ -141,7 +152,10 @@ def section_fields(
 ) -> Iterator[FormField]:
     """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
 
-    kinds : that the section could have instead of its own
+    Parameters
+    ----------
+    kinds
+        That the section could have instead of its own
     """
     for name, info in type(model).model_fields.items():
         file_key = info.alias or SI_SUFFIX.sub("", name)
@@ -351,7 +365,9 @@ FEEDBACKS = {
 def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
     """Override by which a scene's horizontal field of view becomes another: f = width / (2 tan(field / 2)).
 
-    Raises InputError.
+    Raises
+    ------
+    InputError
     """
     if not 0.5 <= field_deg <= 120:
         raise InputError("field", "", "0.5 to 120 deg")
@@ -375,7 +391,7 @@ def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> di
 
 def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
-    from skysim.apps.gui.worker.image_export import (base_reference, scene_yaml)
+    from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
     from skysim.core import files
 
     if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):
@@ -386,5 +402,3 @@ def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title
     validated_scene(base, overrides)
     files.write_text(path, scene_yaml(base_reference(base, folder), dict(overrides), title))
     return path
-
-

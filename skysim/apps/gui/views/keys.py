@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from typing import NamedTuple
-from nicegui import ui
 
+from nicegui import ui
 
 
 class Key(NamedTuple):
@@ -114,5 +114,3 @@ def help_dialog() -> ui.dialog:
                 ui.html(label, sanitize=False)
                 ui.label(key.help)
     return dialog
-
-

@@ -8,14 +8,14 @@ a message brings them.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from typing import Any
-from nicegui import ui
 import csv
 import io
-from collections.abc import Iterable, Sequence
-from skysim.core.errors import OVERRIDES, InputError
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
+from nicegui import ui
+
+from skysim.core.errors import OVERRIDES, InputError
 
 
 class Contents:
@@ -46,7 +46,7 @@ class Contents:
             self.send(self.take())
 
 
-class LiveField(ui.element, component="js/live_field.js", esm={"skysim-live": "js"}):  # type: ignore[call-arg]
+class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
     """An element whose content travels with the frames."""
 
     def __init__(self, contents: Contents, tag: str, type: str = "") -> None:
@@ -76,8 +76,6 @@ class LiveInput(LiveField):
 
     def set_value(self, value: object) -> None:
         self.contents.set(self.id, {"value": str(value)})
-
-
 
 
 # Texts of the page: errors in its words, numbers, and tables as CSV files.
@@ -119,5 +117,3 @@ def cell(value: Any) -> str:
     if value is None or value != value:
         return ""
     return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from itertools import compress
-from typing import Any
-import numpy as np
-from numpy.typing import NDArray
-from skysim.apps.gui.messages import (LightColumns, TrackerResult)
-from skysim.core.types import Floats
 import asyncio
 import math
 import struct
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any, Protocol
+
+import numpy as np
 from nicegui import json
-from skysim.apps.gui.messages import (LIMITS, Display, Pixels)
+from numpy.typing import NDArray
+
+from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, TrackerResult
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.results.plots import CURVES
-
-
 
 COLORS = {
     "truth": "#7a8cff",
@@ -43,7 +40,10 @@ Points = list[list[float]]  # to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: LightColumns, result: TrackerResult | None, shown: Collection[str], name: Callable[[int], str]
+    lights: LightColumns,
+    result: TrackerResult | None,
+    shown: Collection[str],
+    name: Callable[[int], str],
 ) -> dict[str, Any]:
     """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any identified one,
     squares for detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows),
@@ -90,7 +90,13 @@ def bright_count(lights: LightColumns, identified: Collection[int], near: NDArra
     """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
 
     In a field of hundreds of faint stars some detection of noise is beside one of them.
-    identified : number of the light of each detection, or -1;  near : (lights, detections) whether they are near
+
+    Parameters
+    ----------
+    identified
+        Number of the light of each detection, or -1
+    near
+        (lights, detections) whether they are near
     """
     if not len(identified) or not len(lights):
         return UNSOLVED_TICKS
@@ -101,8 +107,6 @@ def bright_count(lights: LightColumns, identified: Collection[int], near: NDArra
 
 def rounded(xy_px: Floats) -> Points:
     return np.round(xy_px, 1).tolist()
-
-
 
 
 # Proper names of bright stars (IAU Working Group on Star Names) by Hipparcos number.
@@ -202,8 +206,6 @@ NAMES = {
 }
 
 
-
-
 # A frame as the browser gets it: its pixels, then marks and texts that are drawn with them.
 
 
@@ -226,7 +228,10 @@ class Source(Protocol):
 class ServedFrame:
     """A frame of a tab.
 
-    fields : what frame.js needs beside the pixels: pointing, marks, contents of live fields
+    Attributes
+    ----------
+    fields
+        What frame.js needs beside the pixels: pointing, marks, contents of live fields
     """
 
     pixels: Pixels
@@ -237,9 +242,14 @@ class ServedFrame:
         """Header, pixels, fields as JSON, and the length of these as an unsigned integer of 32 bits. So a frame comes
         with its marks, and little goes over the websocket, whose messages are compiled as code.
 
-        display : for which the worker makes the next frames;  whole : whether all pixels of this one are needed
-
         None if pixels are missing, and the worker has newer images.
+
+        Parameters
+        ----------
+        display
+            For which the worker makes the next frames
+        whole
+            Whether all pixels of this one are needed
         """
         self.source.display = display
         pixels = self.pixels
@@ -261,11 +271,20 @@ class TabFrames:
 
     A stream is one response for many frames: a request for each would take a fifth of the time that a frame may take.
 
-    announce : sends the number of a frame to the browser, which then requests it
-    newest : by number;  waiting : numbers of those to be sent over the stream; None: no stream is open
-    drawn : number of the last frame that the browser has drawn
-    alone : of the last one that did not go over the stream, which later ones must not overtake
-    added_s : when the newest one was added, by `time.monotonic`
+    Attributes
+    ----------
+    announce
+        Sends the number of a frame to the browser, which then requests it
+    newest
+        By number
+    waiting
+        Numbers of those to be sent over the stream; None: no stream is open
+    drawn
+        Number of the last frame that the browser has drawn
+    alone
+        Of the last one that did not go over the stream, which later ones must not overtake
+    added_s
+        When the newest one was added, by `time.monotonic`
     """
 
     announce: Callable[[int], Any]
@@ -316,7 +335,16 @@ class TabFrames:
 def display_of(query: Mapping[str, str]) -> Display | None:
     """The display that a browser asks for; None if the query has a value that is not allowed.
 
-    screen : width and height;  near : column and row;  limits : a name or two values in DN;  curve : a name
+    Returns
+    -------
+    screen
+        Width and height
+    near
+        Column and row
+    limits
+        A name or two values in DN
+    curve
+        A name
     """
     try:
         screen_px = pair(query.get("screen", "0,0"))
@@ -342,5 +370,3 @@ def limits_from(text: str) -> str | tuple[float, float] | None:
         return text
     low, high = (float(word) for word in text.split(","))
     return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None
-
-

@@ -11,21 +11,31 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
+
 import cv2
 import numpy as np
 from nicegui import ui
-from skysim.apps.gui.messages import (LIMITS, NO_LIGHTS, Detection, FrameView, Lens, LightRow, LightColumns, Pixels, Pose, SceneInfo, TrackerResult)
-from skysim.apps.gui.views import keys
-from skysim.apps.gui.views.live import (Contents, LiveText)
-from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.overlay import (FRAMES, ServedFrame, Source, TabFrames, display_of)
-from skysim.apps.gui.views.overlay import NAMES
+
+from skysim.apps.gui.messages import (
+    LIMITS,
+    NO_LIGHTS,
+    Detection,
+    FrameView,
+    Lens,
+    LightColumns,
+    LightRow,
+    Pixels,
+    Pose,
+    SceneInfo,
+    TrackerResult,
+)
+from skysim.apps.gui.views import keys, overlay
+from skysim.apps.gui.views.live import Contents, LiveText
+from skysim.apps.gui.views.overlay import FRAMES, NAMES, ServedFrame, Source, TabFrames, display_of
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
-
-
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
@@ -49,9 +59,18 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
 class SensorView:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
-    hover_px : place of the light under the mouse, or None
-    sent_number : of the last frame sent to the browser;  frames : the newest ones
+    Attributes
+    ----------
+    id, contents
+        Of the tab, and its live fields
+    source
+        Of pixels, set when the tab has got a worker
+    hover_px
+        Place of the light under the mouse, or None
+    sent_number
+        Of the last frame sent to the browser
+    frames
+        The newest ones
     """
 
     source: Source
@@ -308,5 +327,3 @@ def statistics_text(
     detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     rows += [(*lights, *detected, "", "", "", "")[:4]]
     return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)
-
-

@@ -15,10 +15,10 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import (FrameView, LabGeometry, SceneInfo, Triple)
+from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.style import (DARK, color_scale)
 from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.views.style import DARK, color_scale
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
@@ -43,7 +43,12 @@ class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  #
 class Scene3D:
     """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
 
-    newest_view : that is not sent yet;  waits : whether `send_newest` will be called
+    Attributes
+    ----------
+    newest_view
+        That is not sent yet
+    waits
+        Whether `send_newest` will be called
     """
 
     def __init__(self, page: PageContext, sensor: SensorView) -> None:
@@ -114,9 +119,18 @@ class Scene3D:
 class PushControl:
     """The drag, and the label and the button that are shown while the vehicle moves.
 
-    moved  : called after each frame of the motion
-    grip   : the newest one; None while the vehicle is not held;  held_s : when there was one last
-    before : attitude before the push, deg;  motion : of which frames are being computed; None if there is none
+    Attributes
+    ----------
+    moved
+        Called after each frame of the motion
+    grip
+        The newest one; None while the vehicle is not held
+    held_s
+        When there was one last
+    before
+        Attitude before the push, deg
+    motion
+        Of which frames are being computed; None if there is none
     """
 
     def __init__(

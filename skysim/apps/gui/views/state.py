@@ -10,10 +10,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 from urllib.parse import parse_qsl, urlencode
+
 from skysim.apps.gui.messages import Triple
 from skysim.core.errors import InputError
-
-
 
 Kind = Literal["live", "flight", "replay", "photo"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -23,12 +22,21 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 class PageView:
     """What a page shows.
 
-    scene, overrides : the scene and the keys that differ from its file
-    kind     : live scene at rest, a moment of its flight, a study's trial again, or an image from elsewhere
-    angles_deg : attitude of the live scene; None: the scene's own start
-    t_s      : begin of the shown frame of a flight
-    study, trial : folder of the study in the Monte Carlo panel, and the trial that is replayed
-    photo    : name of the image from elsewhere
+    Attributes
+    ----------
+    scene, overrides
+        The scene and the keys that differ from its file
+    kind
+        Live scene at rest, a moment of its flight, a study's trial again, or an image from
+        elsewhere
+    angles_deg
+        Attitude of the live scene; None: the scene's own start
+    t_s
+        Begin of the shown frame of a flight
+    study, trial
+        Folder of the study in the Monte Carlo panel, and the trial that is replayed
+    photo
+        Name of the image from elsewhere
     """
 
     scene: str
@@ -63,7 +71,11 @@ class PageView:
     def from_query(cls, query: str, scenes: Collection[str]) -> PageView | None:
         """The view that an address names; None if it names none.
 
-        scenes : those that the page offers. An address from elsewhere opens no other file. Raises InputError.
+        Parameters
+        ----------
+        scenes
+            Those that the page offers. An address from elsewhere opens no other file. Raises
+            InputError.
         """
         pairs = parse_qsl(query.removeprefix("?"))
         one: dict[str, Any] = dict(pairs)
@@ -107,5 +119,3 @@ class PageView:
             "replay": f"trial {self.trial} of {self.study}",
             "photo": f"image {self.photo}",
         }[self.kind]
-
-

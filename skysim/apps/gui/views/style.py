@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+
 from skysim.core.types import Floats
-
-
 
 # Color-blind people can distinguish the colors of states, marks and curves too: tests/apps/gui/test_shell.py.
 DARK = {
@@ -217,5 +216,3 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 }}
 .empty {{ color: {COLORS["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """
-
-

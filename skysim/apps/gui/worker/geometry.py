@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from skysim.apps.gui.messages import (LabGeometry, LookFrom)
-from skysim.core.types import Floats, Sources
-from skysim.dynamics import multibody
-from skysim.dynamics.multibody.mjcf_export import (FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M)
-from skysim.simulation.lab import Lab
+from scipy.spatial.transform import Rotation
+
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude
-from skysim.apps.gui.messages import (Lens, Pose)
-from skysim.core.types import Floats, Truth
-from skysim.scene.sections.light import DomeConfig
-from skysim.sources.dome import surface
-from skysim.tracking.onboard_model import calibration
-from scipy.spatial.transform import Rotation
+from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
 from skysim.core.errors import InputError
-from skysim.core.types import Mount
+from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
+from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
 from skysim.results import scoring
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.scene.sections.motion import AttitudeConfig
-from skysim.sources import stars
-from typing import NamedTuple
-from skysim.core.types import Floats, Trajectory
-from skysim.scene.sections.light import CollimatedDisplayConfig
+from skysim.simulation.lab import Lab
 from skysim.simulation.timing import MARGIN_S, exposure_window
-
-
+from skysim.sources import stars
+from skysim.sources.dome import surface
+from skysim.tracking.onboard_model import calibration
 
 MAX_STARS = 600
 MAX_LEDS = 4000
@@ -89,8 +82,6 @@ def look_from(
     return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
 
 
-
-
 # Where a frame's pixels point, for the browser.
 
 
@@ -140,8 +131,6 @@ def solved_pose(attitude: Attitude) -> Pose | None:
     return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
 
 
-
-
 # Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no
 # singularity.
 
@@ -163,7 +152,10 @@ RANGES = {  # degrees
 def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
-    Raises InputError for an angle out of range, or a tilt beyond the vehicle's stop.
+    Raises
+    ------
+    InputError
+        For an angle out of range, or a tilt beyond the vehicle's stop.
     """
     for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
         low, high = RANGES[name]
@@ -203,8 +195,6 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
     return lab_from_body
 
 
-
-
 # Pushing the vehicle: a user pulls at a point of it, and its multibody dynamics are integrated in
 # real time.
 
@@ -224,9 +214,15 @@ class Grip(NamedTuple):
 class Push:
     """The motion of a lab's vehicle from rest at an attitude, as long as the user lets it go on.
 
-    simulation    : with gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and controller
-    lab_from_body : the present attitude
-    torque_nm     : (3,) of the grip in the last period, body axes
+    Attributes
+    ----------
+    simulation
+        With gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and
+        controller
+    lab_from_body
+        The present attitude
+    torque_nm
+        (3,) of the grip in the last period, body axes
     """
 
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
@@ -296,5 +292,3 @@ def require_vehicle(scene: Scene) -> None:
         raise InputError("", "the camera of this scene is on a bench: there is no vehicle to push")
     if scene.motion.is_prescribed:
         raise InputError("", "the motion of this scene is prescribed: its vehicle cannot be pushed")
-
-

@@ -8,24 +8,24 @@ from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+
 import cv2
 import numpy as np
 import yaml
 from astropy.io import fits
 from numpy.typing import NDArray
+
 from skysim.apps.gui.messages import TrackerResult
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
-from skysim.core.errors import InputError
 from skysim.core import files as file_io
-from skysim.core.yaml_reader import (VERSION, set_key)
+from skysim.core.errors import InputError
 from skysim.core.files import SCENES
+from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
-from skysim.results.plots import annotate
 from skysim.results.files import recording
+from skysim.results.plots import annotate
 from skysim.scene.loader import find
-
-
 
 FILE_BY_ITEM = {  # file by menu entry
     "frame, FITS": "frame.fits",
@@ -104,5 +104,3 @@ def zip_archive(contents: dict[str, bytes]) -> bytes:
         for name, data in contents.items():
             archive.writestr(name, data)
     return buffer.getvalue()
-
-

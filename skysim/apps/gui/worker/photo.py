@@ -15,29 +15,51 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import (NO_LIGHTS, NO_PIXELS, Lens, LightColumns, Pixels, Pose, TrackerResult, Triple)
+from skysim.apps.gui.messages import (
+    NO_LIGHTS,
+    NO_PIXELS,
+    Lens,
+    LightColumns,
+    Pixels,
+    Pose,
+    TrackerResult,
+    Triple,
+)
 from skysim.apps.gui.worker import geometry as lenses
-from skysim.apps.gui.worker.workbench import (detection_views, id_prefix, magnitude_by_id, matches_by_row, tracker_result, true_lights)
-from skysim.core.errors import InputError
+from skysim.apps.gui.worker.workbench import (
+    detection_views,
+    id_prefix,
+    magnitude_by_id,
+    matches_by_row,
+    tracker_result,
+    true_lights,
+)
 from skysim.core import images
+from skysim.core.errors import InputError
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import (store)
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
-from skysim.results import (scoring)
-from skysim.results import plots
+from skysim.results import plots, scoring
 
 
 @dataclass(frozen=True, slots=True)
 class Photo:
     """An image that is not of the current scene, and its solution.
 
-    pixels, saturation_dn, pose : see `FrameView`;  lens : of the pose; both are None if the image was not solved
-    names, true_deg : of its three angles, and their true values if known
-    lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
-    hint : of a refused file the likely cause, of a solved one what was assumed
+    Attributes
+    ----------
+    pixels, saturation_dn, pose
+        See `FrameView`
+    lens
+        Of the pose; both are None if the image was not solved
+    names, true_deg
+        Of its three angles, and their true values if known
+    lights, prefix
+        True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
+    hint
+        Of a refused file the likely cause, of a solved one what was assumed
     """
 
     size_px: tuple[int, int]

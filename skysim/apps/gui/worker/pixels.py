@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
+
 import numba
 import numpy as np
 from astropy.visualization import ZScaleInterval
 from numba import float32, int32, uint32, uint64
 from numpy.typing import NDArray
-from skysim.apps.gui.messages import (Display, Pixels)
+
+from skysim.apps.gui.messages import Display, Pixels
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
 from skysim.results import plots
-
-
 
 LEVELS = 2**16 - 1
 HEADER_BYTES = 16
@@ -36,7 +36,10 @@ LOUPE_PX = 11  # most rows and columns in the loupe
 class PixelLevels(NamedTuple):
     """An image as unsigned integers n: pixel = offset + step n.
 
-    integers : (H, W), of 8 or 16 bits
+    Attributes
+    ----------
+    integers
+        (H, W), of 8 or 16 bits
     """
 
     integers: NDArray
@@ -72,11 +75,18 @@ def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
     )
 
 
-def pixels_for(display: Display, levels: PixelLevels, saturation_dn: float, number: int = 0) -> Pixels:
+def pixels_for(
+    display: Display, levels: PixelLevels, saturation_dn: float, number: int = 0
+) -> Pixels:
     """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
     columns than the image.
 
-    saturation_dn : from which a pixel is saturated;  number : of the image in its worker
+    Parameters
+    ----------
+    saturation_dn
+        From which a pixel is saturated
+    number
+        Of the image in its worker
     """
     integers = levels.integers
     (height, width) = levels.integers.shape
@@ -210,7 +220,12 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     """Counts of a sample of the pixels, in BINS of an axis that is an inverse hyperbolic sine about the sky, in units
     of its scatter: linear there, logarithmic for stars.
 
-    sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
+    Returns
+    -------
+    sky, scatter
+        Of the axis
+    range
+        Least and greatest value of all pixels, over which it reaches
     """
     sample = integers[:: 2 * plots.SAMPLE_STRIDE, :: plots.SAMPLE_STRIDE].astype(float)
     low = float(integers.min())
@@ -221,5 +236,3 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
     return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts.tolist()}
-
-

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import (NAN, FlightStep, FlightRow, FrameView, MotionLog)
+from skysim.apps.gui.messages import NAN, FlightRow, FlightStep, FrameView, MotionLog
 from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.workbench import (Workbench, tracker_result)
+from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
@@ -32,7 +32,11 @@ KEPT_BYTES = (
 class KeptFrame:
     """A frame of a flight without its pixels.
 
-    place : of these in the file, and their number of bytes; None: they are rendered again, bit for bit
+    Attributes
+    ----------
+    place
+        Of these in the file, and their number of bytes; None: they are rendered again, bit for
+        bit
     """
 
     view: FrameView
@@ -45,8 +49,14 @@ class Playback:
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
-    file  : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
-    reported : number of frames reported by `advance`
+    Attributes
+    ----------
+    file
+        Pixels of the first frames, so that playing them costs no rendering
+    shown
+        Number of the shown frame
+    reported
+        Number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:

@@ -6,34 +6,34 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from estimator.core.types import Centroids
-from skysim.apps.gui.messages import (FrameView, SurveyFound, SurveyPlan)
+from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.experiments.dome_survey import (adjust)
-from skysim.experiments.dome_survey import survey_prior
-from skysim.experiments.dome_survey import survey_procedure
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_findings,
+    survey_prior,
+    survey_procedure,
+    survey_report,
+)
 from skysim.experiments.dome_survey import survey_frames as stops
-from skysim.experiments.dome_survey.survey_frames import (SurveyFrame, detect_lights, imu_attitudes)
+from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights, imu_attitudes
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
-from skysim.experiments.dome_survey import survey_findings
-from skysim.experiments.dome_survey import survey_report
-from skysim.experiments.dome_survey.survey_findings import Coverage
-from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import Lab
-from skysim.tracking import (dome_map_file)
-from skysim.tracking import onboard_model
+from skysim.tracking import dome_map_file, onboard_model
 from skysim.tracking import factory as tracker_settings
-
-
 
 SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
 MAX_STOPS = 200
@@ -45,9 +45,16 @@ UNCERTAINTY = survey_prior.survey_uncertainty()  # that `skysim survey` assumes
 class Survey:
     """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
 
-    lab, before : with the errors of the onboard model before the survey, and this model
-    noise_px : standard deviation of a centroid's coordinates, by which attitudes are chosen
-    taken : the frames that were flown;  run : the newest adjustment that succeeded
+    Attributes
+    ----------
+    lab, before
+        With the errors of the onboard model before the survey, and this model
+    noise_px
+        Standard deviation of a centroid's coordinates, by which attitudes are chosen
+    taken
+        The frames that were flown
+    run
+        The newest adjustment that succeeded
     """
 
     scene: Scene
@@ -67,9 +74,15 @@ class Survey:
     def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
 
-        views : the frames of the flight so far, in order
+        Parameters
+        ----------
+        views
+            The frames of the flight so far, in order
 
-        Raises InputError if the flight has no further frames; the survey is then as before.
+        Raises
+        ------
+        InputError
+            If the flight has no further frames; the survey is then as before.
         """
         allow(count)
         new, missed = self.new_frames(flight, views)
@@ -82,7 +95,9 @@ class Survey:
         except InputError as error:
             run = None
             refusal = str(error)
-            so_far = survey_findings.coverage_before(frames, self.before, UNCERTAINTY, self.noise_px)
+            so_far = survey_findings.coverage_before(
+                frames, self.before, UNCERTAINTY, self.noise_px
+            )
         counts = survey_findings.coverage_statistics(so_far)
         truth = survey_report.truth_statistics(run, self.before, self.lab) if run else {}
         found = SurveyFound(
@@ -96,7 +111,9 @@ class Survey:
             sigma_mm=1e3 * run.accuracy.led_rms_m if run else None,
             before_mm=truth.get("led_mm_before"),
             error_mm=truth.get("led_mm_after"),
-            faults=tuple(survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))) if run else (),
+            faults=tuple(survey_findings.fault_lines(asdict(survey_findings.find_faults(run))))
+            if run
+            else (),
             refusal=refusal,
             ids=so_far.model.leds.id,
             known=known_share(run),
@@ -111,7 +128,10 @@ class Survey:
     ) -> tuple[list[TakenFrame], int]:
         """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
 
-        Raises InputError if there are none, or the survey has them already.
+        Raises
+        ------
+        InputError
+            If there are none, or the survey has them already.
         """
         rows, holds = frames_at_rest(flight, views)
         if not rows:
@@ -147,7 +167,9 @@ class Survey:
     def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
         margin_px = survey_prior.image_sizes(self.before).margin_px
-        further = survey_findings.next_stops(self.scene, so_far, margin_px, count, tilt_deg(self.scene))
+        further = survey_findings.next_stops(
+            self.scene, so_far, margin_px, count, tilt_deg(self.scene)
+        )
         shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
         return survey_plan(
             further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),)
@@ -239,5 +261,3 @@ def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int
             if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
                 by_hold[leg] = row
     return list(by_hold.values()), len(holds)
-
-

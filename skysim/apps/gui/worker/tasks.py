@@ -10,17 +10,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import (ALL_PIXELS, AmbiguityMap, Display, FlightStep, FrameView, Pixels, PlanCheck, PushedView, SceneInfo, SurveyFound, SurveyPlan, Triple)
-from skysim.apps.gui.worker import (photo, playback)
-from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.messages import (
+    ALL_PIXELS,
+    AmbiguityMap,
+    Display,
+    FlightStep,
+    FrameView,
+    Pixels,
+    PlanCheck,
+    PushedView,
+    SceneInfo,
+    SurveyFound,
+    SurveyPlan,
+    Triple,
+)
+from skysim.apps.gui.worker import geometry, image_export, photo, pixels, playback, survey_flight
 from skysim.apps.gui.worker import workbench as planning
-from skysim.apps.gui.worker import geometry
-from skysim.apps.gui.worker import survey_flight
-from skysim.apps.gui.worker.geometry import (Grip, Push)
+from skysim.apps.gui.worker.geometry import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
-from skysim.core.errors import InputError
 from skysim.core import images
+from skysim.core.errors import InputError
 
 KEPT_IMAGES = 3  # the page may still show one before the newest
 
@@ -29,11 +38,22 @@ KEPT_IMAGES = 3  # the page may still show one before the newest
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    display : of the browser, for which frames are made, as far as it is known
-    shown : the newest images for the page by number, and from where each is saturated;  number : of the last one
-    pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
-    surveyed : the survey of the scene's dome, if one was planned
-    other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
+    Attributes
+    ----------
+    display
+        Of the browser, for which frames are made, as far as it is known
+    shown
+        The newest images for the page by number, and from where each is saturated
+    number
+        Of the last one
+    pushed
+        The motion of the pushed vehicle, as long as the workbench has its attitude
+    surveyed
+        The survey of the scene's dome, if one was planned
+    other, image
+        An image that is not of the scene, and its (H, W) pixels
+    camera
+        An open live camera
     """
 
     current: Workbench | None = None

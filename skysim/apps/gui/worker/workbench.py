@@ -5,38 +5,43 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import project
 from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import (Detection, FrameView, LabGeometry, Lens, LightColumns, SceneInfo, TrackerResult)
+from skysim.apps.gui.messages import (
+    AmbiguityMap,
+    Detection,
+    FrameView,
+    LabGeometry,
+    Lens,
+    LightColumns,
+    PlanCheck,
+    SceneInfo,
+    TrackerResult,
+)
 from skysim.apps.gui.worker import geometry
 from skysim.apps.gui.worker import geometry as lens
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.results import (scoring)
-from skysim.results import plots
+from skysim.experiments.dome_survey import survey_prior
+from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation import exposure
+from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
-from skysim.simulation.lab import (Lab, StarCamera, build_lab, build_tracker)
+from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import frame_end_s
-from skysim.tracking import factory
+from skysim.tracking import factory, onboard_model
 from skysim.tracking import factory as tracker_settings
-from skysim.apps.gui.messages import (AmbiguityMap, PlanCheck)
-from skysim.experiments.dome_survey import survey_prior
-from skysim.simulation import checks
-from skysim.simulation.lab import Lab
-from skysim.tracking import onboard_model
-
-
 
 STAGES = ("detector", "centroider", "identifier", "solver")
 
@@ -45,9 +50,16 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    lens : where its camera's pixels point;  geometry : of the laboratory
-    rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
-    magnitude : V magnitude by a light's number
+    Attributes
+    ----------
+    lens
+        Where its camera's pixels point
+    geometry
+        Of the laboratory
+    rendered_count
+        Number of frames rendered; it changes the seed, so that each frame has independent noise
+    magnitude
+        V magnitude by a light's number
     """
 
     scene: Scene
@@ -69,7 +81,9 @@ class Workbench:
         """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
         kept; if tracker or camera, its attitude.
 
-        Raises InputError.
+        Raises
+        ------
+        InputError
         """
         scene = load(name, overrides)
         if before and before.scene == scene:
@@ -271,8 +285,6 @@ def search_windows_px(
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
 
 
-
-
 # What a lab wants to know before it runs a scene: its check and its ambiguous fields.
 
 
@@ -296,5 +308,3 @@ def ambiguity(lab: Lab) -> AmbiguityMap:
     return AmbiguityMap(
         ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m
     )
-
-

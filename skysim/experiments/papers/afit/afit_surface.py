@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
+
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+
 from skysim.core.constants import INCH_M
 from skysim.core.types import Floats
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    with_cause,
+)
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
-from skysim.scene.sections.light import (FlatSurfaceConfig, SphereSurfaceConfig)
+from skysim.scene.sections.light import FlatSurfaceConfig, SphereSurfaceConfig
 from skysim.sources.dome.point_cloud import fit_sphere
-from skysim.sources.dome.surface import (Rim, Surface, build_surface)
-
-
+from skysim.sources.dome.surface import Rim, Surface, build_surface
 
 FIELD_RAD = np.radians(10.45)
 STATED_HEIGHT_IN = 14.0
@@ -183,5 +189,3 @@ def best_sphere(dome: Surface) -> dict[str, RowResult]:
             exact(float(np.sqrt(np.mean(error_in**2)))), f"weighted by area {sphere.rms_m:.3f}"
         ),
     }
-
-

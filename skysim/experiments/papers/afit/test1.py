@@ -14,7 +14,6 @@ from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.experiments.tracker_comparison import with_config
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
     gray_levels,
@@ -23,9 +22,16 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
-from skysim.experiments.papers.compare import confidence_interval
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    confidence_interval,
+    with_cause,
+)
 from skysim.experiments.papers.published import published_values
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
 from skysim.scene.loader import load

@@ -10,13 +10,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from estimator.attitude.dome_map import project
 from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.tracker_comparison import with_config
 from skysim.experiments.papers.afit.afit_surface import contour
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
@@ -24,20 +25,28 @@ from skysim.experiments.papers.afit.test_stand import (
     measure_frame,
     separations_arcsec,
 )
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
-from skysim.experiments.papers.compare import (bootstrap_interval, confidence_interval, sample_std, symmetric_interval)
+from skysim.experiments.papers.compare import (
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+    confidence_interval,
+    sample_std,
+    symmetric_interval,
+    with_cause,
+)
 from skysim.experiments.papers.published import experiments
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import Summary, exact
-from skysim.results.plots import (INK, MARKS)
+from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import MoffatPsfConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.surface import (Surface, build_surface)
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking import onboard_model
-
-
 
 PLACES_DEG = (
     0.0,
@@ -337,5 +346,3 @@ def draw_angles(fig: Any, lab: Lab, places: Sequence[PlaceSeries]) -> None:
     axes.errorbar(published_deg, mean, sd, fmt="o", capsize=3, color=INK[1], label="published")
     axes.set(xlabel="tilt of the board (deg)", ylabel="angle of the pair (arcsec)")
     axes.legend()
-
-

@@ -7,48 +7,45 @@ faults of the camera, and with the IMU errors of Tables 10-14.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import project
 from estimator.calibration.home_position import Sighting, instrument_brightness
+from estimator.catalog.catalog import unit
+from estimator.catalog.pair_index import bucket_of, build_pair_catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.checks import Ints
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
+from skysim.core.constants import ARCSEC_RAD
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance
 from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_angles_arcsec
-from skysim.experiments.papers.published import experiments
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    bootstrap_interval,
+)
+from skysim.experiments.papers.published import experiments, published_values
+from skysim.results.metrics import Summary, exact, extremum
+from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.motion import AttitudeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
-from skysim.tracking import onboard_model
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import factory as tracker_settings
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple
-from scipy.optimize import least_squares
-from estimator.attitude.dome_map import project
-from estimator.calibration.home_position import Sighting
-from estimator.catalog.catalog import unit
-from estimator.catalog.pair_index import (bucket_of, build_pair_catalog)
-from skysim.core.constants import ARCSEC_RAD
-from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
-from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import bootstrap_interval
-from skysim.experiments.papers.published import (experiments, published_values)
-from skysim.results.metrics import Summary, exact, extremum
-from skysim.results.plots import (INK, MARKS)
-from skysim.simulation.lab import Lab
-
-
-
-
+from skysim.tracking import onboard_model
 
 # AFIT's Test 3 at fixed attitudes (Padro 2012, 3.7.3): five LEDs imaged from five attitudes, and
 # his measurements.
@@ -142,8 +139,14 @@ def photograph(
 class Measurements:
     """F images of all five LEDs as the thesis measures them (eqs 43-45).
 
-    position : (F,) of the vehicle, from 0;  magnitude : (F, 5)
-    body_m, lab_m : (F, 5, 3) LED positions in body axes, and rotated to the lab frame by the IMU's attitude
+    Attributes
+    ----------
+    position
+        (F,) of the vehicle, from 0
+    magnitude
+        (F, 5)
+    body_m, lab_m
+        (F, 5, 3) LED positions in body axes, and rotated to the lab frame by the IMU's attitude
     """
 
     position: Ints
@@ -319,7 +322,11 @@ def stratified_bootstrap(
     """A statistic of (F, ...) values of the images, with a bootstrap interval stratified by position.
 
     Images are resampled within each position only, because the differences between positions are systematic.
-    statistic : of (..., F, K) values to (...), over the last two axes
+
+    Parameters
+    ----------
+    statistic
+        Of (..., F, K) values to (...), over the last two axes
     """
     position = measurements.position
     rows = np.arange(len(values))
@@ -535,5 +542,3 @@ def draw_scatter(fig: Any, bumped: Measurements) -> None:
     )
     axes.set(xlabel="X (mm)", ylabel="Y (mm)", aspect="equal")
     fig.legend(loc="outside right upper")
-
-

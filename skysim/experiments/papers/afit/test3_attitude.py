@@ -9,37 +9,60 @@ two LEDs under a rolling shutter, drift of an LN-200 during a stay at each posit
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
+
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.solvers import quest
+from estimator.catalog.catalog import unit
+from estimator.catalog.pair_index import PairCatalog, build_pair_catalog, candidates
+from estimator.core.checks import Ints
+from estimator.identification.published.saa import (
+    Gates,
+    SearchInput,
+    build_primary,
+    gate_rad,
+    match_assumptions,
+)
+from skysim.core.constants import ARCSEC_RAD, INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.papers.afit.test3 import angles_deg
-from skysim.experiments.papers.compare import (FigureDrawing, ExperimentOptions, ExperimentResult, RowResult, with_cause)
-from skysim.experiments.papers.compare import prediction_interval
+from skysim.dynamics import guidance, imu
+from skysim.dynamics.multibody import imu_position_m
+from skysim.experiments.papers.afit.test3 import (
+    ALGORITHM_DEG,
+    EPSILON_MAG,
+    EPSILON_POS_M,
+    EPSILON_SEP_ARCSEC,
+    FITTED_IMAGING,
+    HOME,
+    IMU_DEG,
+    LEDS,
+    angles_deg,
+    build_test3,
+    lab_from_body,
+    photograph,
+)
+from skysim.experiments.papers.afit.test_stand import light_positions_m
+from skysim.experiments.papers.compare import (
+    Cause,
+    ExperimentOptions,
+    ExperimentResult,
+    FigureDrawing,
+    RowResult,
+    percent,
+    prediction_interval,
+    sample_std,
+    with_cause,
+)
 from skysim.experiments.papers.published import experiments
+from skysim.results.metrics import proportion
 from skysim.results.plots import INK
 from skysim.scene import loader
 from skysim.simulation.flight import Shot, open_flight
-from collections.abc import Callable
-from scipy.spatial.transform import Rotation
-from estimator.attitude.solvers import quest
-from estimator.catalog.catalog import unit
-from estimator.catalog.pair_index import (PairCatalog, build_pair_catalog, candidates)
-from estimator.core.checks import Ints
-from estimator.identification.published.saa import (Gates, SearchInput, build_primary, gate_rad, match_assumptions)
-from skysim.core.constants import ARCSEC_RAD, INCH_M
-from skysim.dynamics import guidance, imu
-from skysim.dynamics.multibody import imu_position_m
-from skysim.experiments.papers.afit.test3 import (ALGORITHM_DEG, EPSILON_MAG, EPSILON_POS_M, EPSILON_SEP_ARCSEC, FITTED_IMAGING, HOME, IMU_DEG, LEDS, angles_deg, build_test3, lab_from_body, photograph)
-from skysim.experiments.papers.afit.test_stand import light_positions_m
-from skysim.experiments.papers.compare import (Cause, FigureDrawing, ExperimentOptions, ExperimentResult, RowResult)
-from skysim.experiments.papers.compare import (percent, prediction_interval, sample_std)
-from skysim.results.metrics import proportion
-from skysim.simulation.lab import (Lab, build_lab)
-
-
-
-
+from skysim.simulation.lab import Lab, build_lab
 
 # AFIT's bump at position 5 (Padro 2012, 4.4, Table 14): the gyros saturate and the IMU loses part
 # of the rotation.
@@ -58,8 +81,14 @@ CAUSE = f"a bump of {FITTED_BUMP} deg/s, gyros saturated at 10"
 class BumpRun(NamedTuple):
     """A simulated motion of `simsat_bump`.
 
-    t_s, imu_deg, filter_deg : (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
-    saturated_s : how long a gyro was saturated;  tracker_error_deg : the star tracker's worst error after the bump
+    Attributes
+    ----------
+    t_s, imu_deg, filter_deg
+        (K,), (K, 3) roll, pitch and yaw of the IMU minus the true ones, (K,) the filter's error
+    saturated_s
+        How long a gyro was saturated
+    tracker_error_deg
+        The star tracker's worst error after the bump
     """
 
     t_s: Floats
@@ -97,7 +126,9 @@ def bump(options: ExperimentOptions) -> ExperimentResult:
         prediction_interval([filter_errors_after(run).max() for run in with_fitted])
     )
     caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
-    return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, with_fitted[0])),))
+    return ExperimentResult(
+        results, (FigureDrawing(caption, lambda fig: draw(fig, with_fitted[0])),)
+    )
 
 
 def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[BumpRun]:
@@ -185,8 +216,12 @@ CAUSE_BUMP = f"{CAUSE_IMU}, position 5 bumped"
 class AlgorithmErrors(NamedTuple):
     """D sets of five images, one per position; the catalog is from the home position's image.
 
-    error_deg: (D, 5, 3) roll, pitch, yaw by the algorithm minus the true ones
-    named    : number of images with all LEDs identified correctly, and number of images
+    Attributes
+    ----------
+    error_deg
+        (D, 5, 3) roll, pitch, yaw by the algorithm minus the true ones
+    named
+        Number of images with all LEDs identified correctly, and number of images
     """
 
     error_deg: Floats
@@ -196,10 +231,16 @@ class AlgorithmErrors(NamedTuple):
 class AllCauses(NamedTuple):
     """Results with all causes simulated together.
 
-    error_deg: (K, 5, 3) attitude by the algorithm minus that of the IMU
-    images : number of independent draws for positions 1 to 4 (the fewer of images and IMUs)
-    bumps : number of independent draws for position 5 (the fewest of images, IMUs and bumps)
-    earth_deg : (5, 3) what an uncorrected Earth rate in the IMU would add
+    Attributes
+    ----------
+    error_deg
+        (K, 5, 3) attitude by the algorithm minus that of the IMU
+    images
+        Number of independent draws for positions 1 to 4 (the fewer of images and IMUs)
+    bumps
+        Number of independent draws for position 5 (the fewest of images, IMUs and bumps)
+    earth_deg
+        (5, 3) what an uncorrected Earth rate in the IMU would add
     """
 
     error_deg: Floats
@@ -246,7 +287,10 @@ def with_draws(
 ) -> RowResult:
     """Prediction intervals of clean values, and of those with the causes, which have fewer independent `draws`.
 
-    with_earth : the value if the IMU also contained the Earth rate, for the note
+    Parameters
+    ----------
+    with_earth
+        The value if the IMU also contained the Earth rate, for the note
     """
     note = "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
     return RowResult(
@@ -310,7 +354,10 @@ def algorithm_errors(
 ) -> AlgorithmErrors:
     """The thesis's processing: eqs 43-44, SAA with Table 9's epsilons, QUEST with the `lights` brightest LEDs.
 
-    images : number of images per position
+    Parameters
+    ----------
+    images
+        Number of images per position
     """
     sightings = [
         photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)
@@ -357,7 +404,11 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     """(U, 5, 3) error of U random IMUs at the end of each stay: roll, pitch, yaw in degrees.
 
     The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
-    earth : measure the Earth rate and do not correct for it
+
+    Parameters
+    ----------
+    earth
+        Measure the Earth rate and do not correct for it
     """
     lab = build_lab(loader.load("afit_test3_ideal", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
     config = lab.scene.vehicle.imu
@@ -447,5 +498,3 @@ def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
         axes.set(xlabel="minutes at a position", title=f"theta_{axis + 1}")
     fig.axes[0].set(ylabel="mean difference (deg)")
     fig.axes[0].legend(loc="upper left")
-
-

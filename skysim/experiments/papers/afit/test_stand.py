@@ -23,7 +23,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import (Lab, build_lab)
+from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.light import LightPlan
 from skysim.simulation.lights.registry import build_lights
 from skysim.tracking import onboard_model
@@ -94,7 +94,10 @@ def measure_frame(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -
 def light_positions_m(lab: Lab, xy_px: Floats, camera: Camera | None = None) -> Floats:
     """(N, 3) positions of lights in body axes, by eqs 43-44 and the camera's lever arm.
 
-    camera : camera model to use; the tracker's own if left out
+    Parameters
+    ----------
+    camera
+        Camera model to use; the tracker's own if left out
     """
     assert isinstance(lab.scene.light, DomeConfig)
     leds = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)

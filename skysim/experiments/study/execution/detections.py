@@ -10,9 +10,11 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
@@ -21,14 +23,12 @@ from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
-from skysim.simulation.lab import (Lab, StarCamera)
+from skysim.simulation.lab import Lab, StarCamera
 from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.dome import LedDome
-from skysim.simulation.lights.light import (Exposure, Obstacle, any_of, find_light)
+from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
-
-
 
 LEAST_SIGMA_PX = 1e-3
 FLUX_NOISE = (
@@ -39,7 +39,14 @@ FLUX_NOISE = (
 class VisibleSources(NamedTuple):
     """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
-    rows : (N,) in `lab.camera.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
+    Attributes
+    ----------
+    rows
+        (N,) in `lab.camera.sources`
+    xy_px
+        (N, 2)
+    electrons
+        (N,) photo-electrons of an exposure
     """
 
     rows: NDArray[np.int64]
@@ -170,5 +177,3 @@ def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
     return np.asarray(shown.strength * lit_s / window.exposure_s / mean)
-
-

@@ -4,36 +4,42 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
-import numpy as np
-from numpy.typing import NDArray
-from skysim.core.errors import InputError
-from skysim.experiments.study.factors import Point
-from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
-from skysim.experiments.study.execution.setups import (code_version, scene_hash)
-from skysim.experiments.study.execution.store import Store
-from skysim.experiments.study.execution.trials import Row, Segment, TrialJob
-from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
-from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core import files as file_io
+from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
-from skysim.experiments.study.execution.setups import (TrialSetup, prepared_setup)
+from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
+from skysim.experiments.study.execution.setups import (
+    TrialSetup,
+    code_version,
+    prepared_setup,
+    scene_hash,
+)
 from skysim.experiments.study.execution.store import Store, to_sql
-from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
-from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.results.plots import (annotate, visible)
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
+from skysim.experiments.study.factors import Point
+from skysim.experiments.study.plan import (
+    CentroidTrial,
+    FlightTrial,
+    FrameTrial,
+    Plan,
+    TrialSpec,
+    resolve_point,
+)
 from skysim.results.files import recording
+from skysim.results.plots import annotate, visible
 from skysim.tracking import factory
-
-
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 MANY = 16  # workers; more have longer chunks, and complete MANY / CHUNK_S a second: a Dask scheduler handles hundreds
@@ -44,7 +50,14 @@ MAX_CHUNK = 5000  # maximum number of trials in a chunk
 class Progress:
     """Progress of a run.
 
-    trials : total;  done : in the store, of which failed and wrong;  now : done by this run since `began`
+    Attributes
+    ----------
+    trials
+        total
+    done
+        In the store, of which failed and wrong
+    now
+        Done by this run since `began`
     """
 
     trials: int
@@ -75,7 +88,12 @@ class ChunkQueue:
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
-    missing : (M,) trial numbers, ascending;  spec : of the trials, if their hardware is drawn
+    Attributes
+    ----------
+    missing
+        (M,) trial numbers, ascending
+    spec
+        Of the trials, if their hardware is drawn
     """
 
     def __init__(
@@ -139,10 +157,18 @@ def prepare_store(
 
     The store may be of the same study with fewer replicates: its trials are kept, and numbered anew.
 
-    resume    : whether to continue a store that already has trials
-    overrides : study keys from the command line, saved in the store
+    Parameters
+    ----------
+    resume
+        Whether to continue a store that already has trials
+    overrides
+        Study keys from the command line, saved in the store
 
-    Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
+    Raises
+    ------
+    InputError
+        If the store holds another study or rows of another code version, or if `resume` does
+        not fit.
     """
     stored = store.meta("digest")
     done = store.counts()["done"]
@@ -270,8 +296,6 @@ ENGINES: dict[str, Callable[[int | None, str], Engine]] = {
 }
 
 
-
-
 # Repeat one trial of a study and write its frames for inspection.
 
 
@@ -368,5 +392,3 @@ def solve_or_failed(solve: Callable[[], Report]) -> Report:
         return solve()
     except Exception as error:
         return Report(Attitude(f"failed: {error}"), Centroids.empty())
-
-

@@ -9,20 +9,19 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
+
 import numpy as np
-from skysim.core.files import (DATA, ROOT)
+
+from skysim.core.files import DATA, ROOT
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import PLUGINS
-from skysim.simulation.lab import (Lab, build_lab, build_tracker)
-from skysim.simulation.lab import UserParts
+from skysim.simulation.lab import Lab, UserParts, build_lab, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.tracker_interface import TRACKERS
-
-
 
 CACHE_SIZE = 4  # setups that a worker caches
 
@@ -55,7 +54,11 @@ def setup_key(spec: TrialSpec, settings: Settings) -> str:
 def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialSetup:
     """The setup of a design point, from the cache if it is there. Raises InputError.
 
-    key : its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the key
+    Parameters
+    ----------
+    key
+        Its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the
+        key
     """
     key = key or setup_key(spec, settings)
     cached = CACHE.setups
@@ -124,5 +127,3 @@ def seed_of(spec: TrialSpec, point: int, replicate: int) -> int:
     return int(
         np.random.SeedSequence(spec.seed, spawn_key=key).generate_state(1, np.uint64)[0] >> 1
     )
-
-

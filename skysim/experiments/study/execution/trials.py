@@ -28,7 +28,11 @@ from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
-from skysim.experiments.study.execution.detections import (simulate_detections, solve_coded, visible_rows)
+from skysim.experiments.study.execution.detections import (
+    simulate_detections,
+    solve_coded,
+    visible_rows,
+)
 from skysim.experiments.study.execution.outcomes import (
     FAILED,
     Outcome,
@@ -37,7 +41,13 @@ from skysim.experiments.study.execution.outcomes import (
     summarize_flight,
     true_lights,
 )
-from skysim.experiments.study.execution.setups import (TrialSetup, code_version, prepared_setup, seed_of, setup_key)
+from skysim.experiments.study.execution.setups import (
+    TrialSetup,
+    code_version,
+    prepared_setup,
+    seed_of,
+    setup_key,
+)
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import (
     AxisConfig,
@@ -50,12 +60,10 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import StarCamera
+from skysim.simulation.lab import StarCamera, UserParts
 from skysim.simulation.timing import MARGIN_S, exposure_window
-from skysim.simulation.lab import UserParts
 from skysim.sources.air import topocentric_axes
-from skysim.sources.ephemeris import observe_from
-from skysim.sources.ephemeris import place
+from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
@@ -67,8 +75,13 @@ REFUSED = "refused"  # in place of the hash of a scene that cannot be built
 class Row(NamedTuple):
     """One trial as stored.
 
-    scene : its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker died
-    error : an InputError's line, or the traceback of another exception
+    Attributes
+    ----------
+    scene
+        Its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker
+        died
+    error
+        An InputError's line, or the traceback of another exception
     """
 
     trial: int
@@ -145,7 +158,11 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """Run the trials of a segment together.
 
     If one of them raises an exception, each runs by itself, and the row of that one stores it.
-    key : `setup_key` of the segment, if it is known
+
+    Parameters
+    ----------
+    key
+        `setup_key` of the segment, if it is known
     """
     numbers = list(enumerate(segment.replicates, segment.first))
     seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
@@ -363,7 +380,10 @@ def render_trial_frame(
 ) -> tuple[Frame, Truth, tuple[float, float] | None]:
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center.
 
-    added : gets the masks of smear and particles
+    Parameters
+    ----------
+    added
+        Gets the masks of smear and particles
     """
     moving = moving_camera(setup, seed)
     return *moving.render(tracked_frames(setup), added), moving.streak_px

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
-import numpy as np
-from skysim.core.types import Floats
-from skysim.experiments.study.table import (is_share, label)
-from skysim.experiments.study.plan import Heat, Map
-from skysim.results.metrics import MORE_IS_BETTER, split_name
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
-from skysim.experiments.study.table import (Axis, axis, is_sampled, is_share, label, shown_points)
-from skysim.experiments.study.table import PointRow
-from skysim.experiments.study.thresholds import (crossings, thresholds_of)
-from skysim.experiments.study.plan import Curve, Heat, Study
+
+import numpy as np
+
+from skysim.core.types import Floats
+from skysim.experiments.study.plan import Curve, Heat, Map, Study
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
-from skysim.results.plots import (INK, MARKS, png)
+from skysim.experiments.study.table import (
+    Axis,
+    PointRow,
+    axis,
+    is_sampled,
+    is_share,
+    label,
+    shown_points,
+)
+from skysim.experiments.study.thresholds import crossings, thresholds_of
+from skysim.results.metrics import MORE_IS_BETTER, split_name
+from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
     from skysim.experiments.study.table import Index
-
-
 
 
 # Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes.
@@ -467,7 +471,10 @@ def pareto_png(
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 
-    also : fronts of other searches with the same objectives, (K, 2) by label
+    Parameters
+    ----------
+    also
+        Fronts of other searches with the same objectives, (K, 2) by label
     """
     from matplotlib.patheffects import withStroke
 
@@ -501,5 +508,3 @@ def pareto_png(
         fig.legend(loc="outside right upper")
 
     return png(draw, (7.0, 4.4))
-
-

@@ -7,22 +7,21 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.table import (axis, group_points, shown_points)
-from skysim.experiments.study.table import PointRow
-from skysim.experiments.study.worst import (ColumnsOf, WorstTrial, worst_trials)
 from skysim.experiments.study.plan import Map, Study
+from skysim.experiments.study.report.figures import HATCHED, add_color_bar, color_scale, halo
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.report.figures import (HATCHED, add_color_bar, color_scale, halo)
+from skysim.experiments.study.table import PointRow, axis, group_points, shown_points
+from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns
 from skysim.results.plots import png
-
-
 
 CELL_TRIALS = 25  # mean number of trials in a cell
 MAX_CELLS = 240  # of a panel
@@ -39,7 +38,12 @@ LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
 class MapCell(NamedTuple):
     """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
 
-    value : the response, NaN without values;  values : number of trials with a value
+    Attributes
+    ----------
+    value
+        The response, NaN without values
+    values
+        Number of trials with a value
     """
 
     low_deg: float
@@ -213,7 +217,10 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
 
         x = 2 sqrt(2) cos(dec) sin(l / 2) / d,    y = sqrt(2) sin(dec) / d,    d = sqrt(1 + cos(dec) cos(l / 2)).
 
-    around_deg : azimuth, or RA from 180 to 540
+    Parameters
+    ----------
+    around_deg
+        Azimuth, or RA from 180 to 540
     """
     around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
     if not sky:
@@ -338,5 +345,3 @@ def caption(
         else ""
     )
     return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")
-
-

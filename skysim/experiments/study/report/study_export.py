@@ -7,14 +7,15 @@ import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from skysim.core.errors import InputError, unknown_name
-from skysim.core import files
-from skysim.experiments.study.table import (level_columns, table, to_columns, with_levels)
-from skysim.experiments.study.execution.store import COLUMNS, Store
-from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
+from skysim.core import files
+from skysim.core.errors import InputError, unknown_name
+from skysim.experiments.study.execution.store import COLUMNS, Store
+from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
@@ -64,7 +65,10 @@ def texts(column: NDArray[Any]) -> list[Any]:
 def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write one row per trial, missing values null; title, code version and study file are in the file's metadata.
 
-    Raises InputError if pyarrow is not installed.
+    Raises
+    ------
+    InputError
+        If pyarrow is not installed.
     """
     try:
         import pyarrow.parquet
@@ -129,5 +133,3 @@ def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
         raise InputError(path, *unknown_name("file format", path.suffix, EXPORTS))
     files.make_folder(path.parent)
     EXPORTS[path.suffix](store, responses, path)
-
-

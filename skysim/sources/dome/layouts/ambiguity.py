@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from scipy.spatial import KDTree
-from skysim.core.errors import InputError
-
-
 
 Ints = NDArray[np.int64]
 
@@ -32,8 +32,16 @@ Ints = NDArray[np.int64]
 class Fields(NamedTuple):
     """The neighbors of each of C center LEDs, in polar image coordinates about it, nearest first.
 
-    center : (C,) the LED;  first : (C + 1,) neighbor n belongs to center[c] where first[c] <= n < first[c + 1]
-    radius, angle_rad : (M,) tangent of the angle from the center, and the azimuth;  tolerance : (C,) a tangent
+    Attributes
+    ----------
+    center
+        (C,) the LED
+    first
+        (C + 1,) neighbor n belongs to center[c] where first[c] <= n < first[c + 1]
+    radius, angle_rad
+        (M,) tangent of the angle from the center, and the azimuth
+    tolerance
+        (C,) a tangent
     """
 
     center: Ints
@@ -46,8 +54,13 @@ class Fields(NamedTuple):
 class Ambiguity(NamedTuple):
     """For the field about each of C LEDs, the most similar other field.
 
-    led, other : (C,) numbers of the LEDs at the centers of the field and of its most similar one
-    fraction   : (C,) fraction of LEDs that coincide, of those in the larger of the two fields; the center LEDs count
+    Attributes
+    ----------
+    led, other
+        (C,) numbers of the LEDs at the centers of the field and of its most similar one
+    fraction
+        (C,) fraction of LEDs that coincide, of those in the larger of the two fields; the
+        center LEDs count
     """
 
     led: Ints
@@ -65,15 +78,26 @@ def field_ambiguity(
 ) -> Ambiguity:
     """For every LED that the boresight can reach, the largest fraction of its field that another attitude also shows.
 
-    place_m    : (N, 3) in the lab, origin at the bearing's center
-    height_m   : of the entrance pupil above the bearing, along the boresight (its lateral offset is neglected)
-    tilt_rad   : fields are centered on the LEDs within this angle from the zenith;  radius_rad : of the field, round
-    coincidence_m : two LEDs coincide if they are nearer than this after one field is laid on the other
-    least      : fractions below are not searched, which is much faster, and returned as this
     One center LED is laid on another and the field is rotated about it. For a camera on its lever arm that is a
     rotation about the bearing. The rotations tried are those that bring a second LED to coincide. A field is also
     laid on itself, rotated. Coincidence is judged in the camera's perspective, so on a dome that is not a sphere the
     fields differ.
+
+    Parameters
+    ----------
+    place_m
+        (N, 3) in the lab, origin at the bearing's center
+    height_m
+        Of the entrance pupil above the bearing, along the boresight (its lateral offset is
+        neglected)
+    tilt_rad
+        Fields are centered on the LEDs within this angle from the zenith
+    radius_rad
+        Of the field, round
+    coincidence_m
+        Two LEDs coincide if they are nearer than this after one field is laid on the other
+    least
+        Fractions below are not searched, which is much faster, and returned as this
     """
     fields = fields_about(place_m, height_m, tilt_rad, radius_rad, coincidence_m)
     fraction, other = most_similar(fields, least)
@@ -131,8 +155,12 @@ def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
 def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bool) -> int:
     """The most neighbors of i that coincide with ones of j at any rotation, if more than `threshold`; else less.
 
-    farther : try only the rotations of the farther half of n neighbors, or of n - threshold if those are more. They
-              are more accurate than those of near ones, and of any n - threshold neighbors one must coincide.
+    Parameters
+    ----------
+    farther
+        Try only the rotations of the farther half of n neighbors, or of n - threshold if those
+        are more. They are more accurate than those of near ones, and of any n - threshold
+        neighbors one must coincide.
     """
     first = fields.first
     radius = fields.radius
@@ -198,12 +226,8 @@ def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, thresh
     return total
 
 
-
-
 # Neighborhood codes: levels of brightness by which every LED is known by its surroundings.
 
-
-Ints = NDArray[np.int64]
 
 ROUNDS = 5000  # of new levels before it is given up
 
@@ -261,5 +285,3 @@ def neighborhoods(level: Ints, around: Ints, levels: int) -> Ints:
     power = levels ** np.arange(nearest)
     ring = np.min([np.roll(level[around], turn, axis=1) @ power for turn in range(nearest)], axis=0)
     return level * levels**nearest + ring
-
-

@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-
-
 
 Ints = NDArray[np.int64]
 
@@ -36,8 +36,11 @@ MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field lac
 class Visibility(NamedTuple):
     """Which attitudes see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
 
-    information : (M, 7) J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in
-        body axes, rad^-2; and a 1, which counts LEDs when rows are added
+    Attributes
+    ----------
+    information
+        (M, 7) J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz,
+        yz in body axes, rad^-2; and a 1, which counts LEDs when rows are added
     """
 
     start: Ints
@@ -217,5 +220,3 @@ def update_costs(
         change += new_cost - attitude_cost[a]
         attitude_cost[a] = new_cost
     return change
-
-

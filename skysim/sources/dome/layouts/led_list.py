@@ -13,7 +13,7 @@ from skysim.sources.dome.display import ideal_led
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.layouts.string import wind
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.surface import (Surface, build_surface)
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
 BUILT = {

@@ -20,19 +20,28 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts
-from skysim.sources.dome.layouts.ambiguity import (Ambiguity, field_ambiguity)
-from skysim.sources.dome.layouts.fisher import (Visibility, add_led, costs, sum_information, total_information, update_costs, variances, visible_from)
+from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
+from skysim.sources.dome.layouts.fisher import (
+    Visibility,
+    add_led,
+    costs,
+    sum_information,
+    total_information,
+    update_costs,
+    variances,
+    visible_from,
+)
 from skysim.sources.dome.surface import Surface
-
-
 
 Ints = NDArray[np.int64]
 
@@ -44,38 +53,64 @@ class PlacementOptions:
     """Settings of the placement search; `OPTIONS` holds the defaults.
 
     Sites and starting layouts
-    sites_per_led      : candidate sites per LED; their spacing is then a twentieth of the LEDs' own
-    even_sites_per_led : sites per LED that suffice for an even layout
-    bisections         : steps that find its spacing, between the least spacing and the sites' extent
-    contractions       : fractions of the solid angle to which the best even layout is contracted
 
     Local search
-    sparse_below    : mean number of LEDs in a field below which the sparse settings apply, else the dense ones. With
-                      few LEDs in a field evenness matters most and steps must be small; with many, larger steps gain
-                      more.
-    sparse_steps, dense_steps : (least, greatest) step in units of the LEDs' spacing
-    sparse_field, dense_field : fraction of the field that the search uses. The margin is for attitudes between the
-                      sampled ones, which lose LEDs at the edge.
-    views_per_site  : sampled attitudes that see a site; a field's border passes it in steps of a twentieth of the field
-    min_attitudes, max_attitudes : limits of the number of sampled attitudes
-    generations     : rounds are divided into so many; after each the hardest of fresh attitudes join the sample
-    keep_every      : generations from one candidate layout to the next
 
     Hardest attitudes
-    fresh_attitudes, hardest_attitudes : size of a fresh sample, and how many of it are kept
-    perturbations, perturbation_size   : random rotations tried for each of these, and their size in half fields
 
     Comparison of layouts
-    score_attitudes : number of independent attitudes
-    tail_fraction   : fraction of them, the worst, whose mean variance is compared
-    inner_field     : part of the field in which fewer than two LEDs count as too few
 
     Ambiguity
-    max_overlap      : fraction of a field's LEDs that may coincide with another field's
-    ambiguity_trials : tries to move one LED of an ambiguous field
-    central_leds     : LEDs nearest to the field's center, one of which is moved
-    nearby_sites     : nearest sites that it may take; they reach a fifth of the LEDs' own spacing
-    variance_slack   : relative rise of the worst variances that the moves may cost in total
+
+    Attributes
+    ----------
+    sites_per_led
+        Candidate sites per LED; their spacing is then a twentieth of the LEDs' own
+    even_sites_per_led
+        Sites per LED that suffice for an even layout
+    bisections
+        Steps that find its spacing, between the least spacing and the sites' extent
+    contractions
+        Fractions of the solid angle to which the best even layout is contracted
+    sparse_below
+        Mean number of LEDs in a field below which the sparse settings apply, else the dense
+        ones. With few LEDs in a field evenness matters most and steps must be small; with many,
+        larger steps gain more.
+    sparse_steps, dense_steps
+        (least, greatest) step in units of the LEDs' spacing
+    sparse_field, dense_field
+        Fraction of the field that the search uses. The margin is for attitudes between the
+        sampled ones, which lose LEDs at the edge.
+    views_per_site
+        Sampled attitudes that see a site; a field's border passes it in steps of a twentieth of
+        the field
+    min_attitudes, max_attitudes
+        Limits of the number of sampled attitudes
+    generations
+        Rounds are divided into so many; after each the hardest of fresh attitudes join the
+        sample
+    keep_every
+        Generations from one candidate layout to the next
+    fresh_attitudes, hardest_attitudes
+        Size of a fresh sample, and how many of it are kept
+    perturbations, perturbation_size
+        Random rotations tried for each of these, and their size in half fields
+    score_attitudes
+        Number of independent attitudes
+    tail_fraction
+        Fraction of them, the worst, whose mean variance is compared
+    inner_field
+        Part of the field in which fewer than two LEDs count as too few
+    max_overlap
+        Fraction of a field's LEDs that may coincide with another field's
+    ambiguity_trials
+        Tries to move one LED of an ambiguous field
+    central_leds
+        LEDs nearest to the field's center, one of which is moved
+    nearby_sites
+        Nearest sites that it may take; they reach a fifth of the LEDs' own spacing
+    variance_slack
+        Relative rise of the worst variances that the moves may cost in total
     """
 
     sites_per_led: int = 500
@@ -116,7 +151,10 @@ OPTIONS = PlacementOptions()
 class PlacementScore(NamedTuple):
     """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
 
-    reference : tail variance of the best even layout, the unit of `tail_variance`
+    Attributes
+    ----------
+    reference
+        Tail variance of the best even layout, the unit of `tail_variance`
     """
 
     config: layouts.OptimizedConfig
@@ -165,9 +203,6 @@ def optimize_places(
 ) -> Floats:
     """(N, 3) sites, m, at which config.count LEDs make the worst attitudes within the tilt as good as possible.
 
-    sites_m  : (K, 3) allowed places in the lab, on the surface within its rim and cap; options.sites_per_led times
-               the count
-    starts_m : (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as possible, is added
     1. The best even layout by `PlacementScore.tail_variance` sets the reference. It is also contracted toward the
        zenith.
     2. From the best of these `descend` lowers sum_a c_a^HARDNESS, c_a = MISSING_LED_FACTOR^missing
@@ -178,6 +213,15 @@ def optimize_places(
        attitudes.
     4. `reduce_ambiguity` changes ambiguous fields; its result is kept if `score` prefers it.
     Raises InputError if not all LEDs find room at the spacing.
+
+    Parameters
+    ----------
+    sites_m
+        (K, 3) allowed places in the lab, on the surface within its rim and cap;
+        options.sites_per_led times the count
+    starts_m
+        (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as
+        possible, is added
     """
     few_sites_m = sites_m[: options.even_sites_per_led * config.count]
     even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
@@ -264,7 +308,10 @@ def descend(
 ) -> list[Floats]:
     """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
 
-    attitude_count : number of attitudes in the first generation's cost
+    Parameters
+    ----------
+    attitude_count
+        Number of attitudes in the first generation's cost
     """
     config = search.config
     options = search.options
@@ -523,5 +570,3 @@ def reduce_ambiguity(
 def excess_overlap(ambiguity: Ambiguity, options: PlacementOptions) -> float:
     """Sum over the fields of the overlap in excess of `max_overlap`."""
     return float(np.maximum(ambiguity.fraction - options.max_overlap, 0).sum())
-
-

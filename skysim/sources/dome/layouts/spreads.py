@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
+
 import numpy as np
+
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
+    GeodesicConfig,
     OptimizedConfig,
     PoissonDiskConfig,
     RandomPlacesConfig,
 )
 from skysim.scene.sections.leds import LedConfig
+from skysim.sources.dome.layouts import optimize
 from skysim.sources.dome.layouts.placing import (
     cap,
     dimmed_sources,
+    lit_sources,
     project_from_bearing,
     scattered_cap,
 )
-from skysim.sources.dome.layouts import optimize
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
-from collections.abc import Iterator
-from skysim.scene.sections.layouts import GeodesicConfig
-from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
-
-
 
 DARTS_PER_SPACING2 = (
     100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
@@ -135,7 +134,10 @@ def optimized_places(
 ) -> tuple[Floats, Mapping[str, Any]]:
     """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
 
-    sites, spirals : (K, 3) points, m, as bytes, because arrays have no hash
+    Parameters
+    ----------
+    sites, spirals
+        (K, 3) points, m, as bytes, because arrays have no hash
     """
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
@@ -143,8 +145,6 @@ def optimized_places(
     place_m = optimize.optimize_places(config, points[0], points[1:], rng, optimize.OPTIONS)
     place_m.flags.writeable = False
     return place_m, rng.bit_generator.state
-
-
 
 
 # LEDs at the vertices of a geodesic sphere: an icosahedron with divided faces, projected on the
@@ -216,5 +216,3 @@ def icosahedron_faces() -> list[tuple[int, int, int]]:
         faces += [(0, upper, next_upper), (upper, lower, next_upper)]
         faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
     return faces
-
-

@@ -8,26 +8,24 @@ The chords of a circle are too short by (2 pi / STEPS_PER_TURN)^2 / 24 of their 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.layouts import StringConfig
+from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.photometry import Band
-import dataclasses
-from scipy.spatial.transform import Rotation
-from skysim.core.constants import ARCSEC_RAD
-from skysim.scene.sections.layouts import AimingConfig, FibersConfig
-from skysim.sources.dome.surface import (Surface, perpendicular)
-
-
 
 STEPS_PER_TURN = 720
 STEPS_PER_PITCH = 16
@@ -41,9 +39,14 @@ GLUE_M = 0.3  # of tape over which its sideways error is the same, assumed
 class Meridian(NamedTuple):
     """The surface's mean meridian from the apex to the cap's rim, (K,) each.
 
-    tilt_rad : from the zenith, seen from the bearing
-    arc_m    : length along the surface from the apex, mean of the meridians
-    ring_m   : circumference of the circle of this tilt over 2 pi
+    Attributes
+    ----------
+    tilt_rad
+        From the zenith, seen from the bearing
+    arc_m
+        Length along the surface from the apex, mean of the meridians
+    ring_m
+        Circumference of the circle of this tilt over 2 pi
     """
 
     tilt_rad: Floats
@@ -242,8 +245,6 @@ def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Fl
     return np.append(0, np.cumsum(np.linalg.norm(np.diff(place_m, axis=0), axis=1)))
 
 
-
-
 # Optical fibers in a shell (JHU/APL's dome): their ends at another layout's points, with the errors
 # of making them.
 
@@ -321,5 +322,3 @@ def along_two_axes(unit: Floats, size: Floats) -> Floats:
     """(N, 3) vectors perpendicular to unit vectors (N, 3), with components (N, 2) along two axes across them."""
     first = perpendicular(unit)
     return np.asarray(size[:, :1] * first + size[:, 1:] * np.cross(unit, first))
-
-

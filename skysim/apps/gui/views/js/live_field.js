@@ -1,5 +1,5 @@
 // An element whose content arrives with the frames, see live.js. tag: "div" or "input"
-import { attach, detach } from "skysim-live/live.js";
+import { attach, detach } from "skysim-views/live.js";
 
 export default {
   template: `<component :is="tag" :type="type || null"></component>`,
