@@ -14,13 +14,29 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: baseline bench demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+# Extras of single targets, each installed once. `make extras`: all that CI needs, by one call of pip.
+EXTRA := .venv/.extra-
+$(EXTRA)%: $(READY)
+	$(PIP) -e '.[$(subst +,$(comma),$*)]'
+	touch $@
+
+comma := ,
+CI_EXTRAS := docs s3+query browser
+extras: $(READY)
+	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
+	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
+
+.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
 	$(BIN)/skysim run afit_simsat --out out/afit_simsat
 	$(BIN)/skysim run afit_simsat_ideal --frames 20 --out out/afit_simsat_ideal
 	$(BIN)/skysim run shefex2 --out out/shefex2
+
+# All compiled code that the tests need, in two processes; `make test` compiles what most tests need by itself.
+compile: $(READY)
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.helpers.compilation
 
 # Kept bytecode: the tests start some hundred processes, each of which would compile the sources again.
 PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
@@ -29,8 +45,7 @@ test: $(READY)
 	$(PYTEST) -m "not slow and not long and not browser"
 
 # The tests that CI runs beside those of `make test`.
-test-slow: $(READY)
-	$(PIP) -e '.[s3,query]'
+test-slow: $(READY) $(EXTRA)s3+query
 	$(PYTEST) -m "slow and not long and not browser"
 
 test-long: $(READY)
@@ -46,11 +61,15 @@ oracle: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(BIN)/python -m pytest -rs -m "not long" tests/oracles
 
-# Our speed beside other people's tools, which are installed first.
+# Our speed beside other people's tools, which are installed first. Without AREAS=... the quick part of every area.
 bench: $(READY)
 	$(PIP) -e '.[oracle]'
 	$(PIP) --no-deps cedar-solve==0.5.1 pillow  # it pins an old numpy; benchmarks/peers.py
 	$(BIN)/python -m benchmarks $(AREAS)
+
+# Every bar that a benchmark or a long test holds, in out/accept.json: hours; stopped, it goes on. QUICK=1: a minute.
+accept: $(READY)
+	NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks accept $(if $(QUICK),--quick)
 
 gui: $(READY)
 	$(BIN)/skysim gui
@@ -70,17 +89,15 @@ papers: $(READY)
 
 # The site, in out/site, with the reference of commands, keys and responses from the code. Nothing in it is fetched
 # from elsewhere.
-docs: $(READY)
-	$(PIP) -e '.[docs]'
+docs: $(READY) $(EXTRA)docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 figures: $(READY)
 	$(BIN)/python docs/site/figures.py
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
-test-browser: $(READY)
-	$(PIP) -e '.[browser]'
-	$(BIN)/pytest -m browser tests/apps/gui tests/docs -rs
+test-browser: $(READY) $(EXTRA)browser
+	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
@@ -97,7 +114,7 @@ test-lowest:
 # on by mutation alone, and says so.
 FUZZ_S ?= 60
 fuzz: fuzzer
-	$(BIN)/python -m fuzz $(FUZZ_S)
+	$(BIN)/python -m tests.fuzz $(FUZZ_S)
 
 fuzzer: $(READY)
 	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
@@ -108,7 +125,7 @@ MUTANTS ?= 300
 SEED ?= 1
 mutants: $(READY)
 	$(PIP) -e '.[mutants]'
-	$(BIN)/python -m benchmarks.mutants $(MUTANTS) $(SEED) $(AGAIN)
+	$(BIN)/python -m tests.mutants $(MUTANTS) $(SEED) $(AGAIN)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,20 +1,20 @@
 """LED identification with an uncalibrated lens and a poor map: rates of right, wrong and refused attitudes.
 
-`python -m benchmarks.dome_focal [TRIALS] [SEED]` uses AFIT's SimSat under its measured dome, as `dome_identify`. The
-focal length that the tracker assumes is wrong by up to 10 %; focal length and map are drawn anew every second frame.
+AFIT's SimSat under its measured dome, as in `dome_identify`. The focal length that the tracker assumes is wrong by up
+to 10 %; focal length and map are drawn anew every second frame.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.dome_identify import attitude, leds_m
+from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
 from estimator.core.checks import Ints
@@ -25,6 +25,7 @@ from skysim.simulation.lab import build_lab
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
+TRIALS = 1000
 NOISE_PX = 0.2
 FRAMES_A_MAP = 2
 # (identifier, whether the tracker knows that its focal length is uncertain)
@@ -48,6 +49,13 @@ class Case:
     focal: float = 0.1
     zoom: float = 1.0
     share: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """The case in a row's name."""
+        map_error = f"{1e3 * self.own_m:g} mm"
+        shared = f" and {1e3 * self.surface_m:g} mm in common" if self.surface_m else ""
+        return f"{self.leds} LEDs to {map_error}{shared}, focal length to {self.focal:.0%}, zoom {self.zoom:g}"
 
 
 CASES = (
@@ -122,8 +130,22 @@ def errors(frame: Frame, answer: Attitude, lens: Camera) -> tuple[float, float, 
     )
 
 
-def measure(case: Case, identifier: str, knows: bool, trials: int, seed: int) -> str:
-    """One table cell: found %, number of wrong ones; then mean NEES, rms errors of attitude and focal length."""
+def measure(count: int = TRIALS, seed: int = 1) -> list[dict[str, Any]]:
+    """All cases with all identifiers; `count` frames times the case's share, a tenth for the published identifiers."""
+    rows = []
+    for case in CASES:
+        frames_of_case = max(int(case.share * count), 10)
+        for identifier, knows in IDENTIFIERS:
+            share = 1 if identifier == "non_dimensional" else 10
+            trials = max(frames_of_case // share, 10)
+            rows += measure_case(case, identifier, knows, trials, seed)
+    return rows
+
+
+def measure_case(
+    case: Case, identifier: str, knows: bool, trials: int, seed: int
+) -> list[dict[str, Any]]:
+    """Found share and wrong ones of an identifier; then mean NEES, rms errors of attitude and focal length."""
     lab = build_lab(loader.load("afit_simsat"))
     surface = build_surface(lab.scene.light.surface)
     lens = calibration(lab.scene.camera).zoomed(case.zoom)
@@ -141,22 +163,17 @@ def measure(case: Case, identifier: str, knows: bool, trials: int, seed: int) ->
         if outcomes[-1] == "found":
             right.append(errors(frame, answer, lens))
     found, wrong = (outcomes.count(name) for name in ("found", "WRONG"))
-    text = f"{100 * found / trials:6.1f} {wrong:3d}"
+    what = f"{trials} frames"
+    name = f"{case.name}, {identifier}{', sigma declared' if knows else ''}"
+    rows = [
+        figure(f"{name}: found", 100 * found / trials, "%", what),
+        verdict(f"{name}: wrong", wrong, "frames", what, 0),
+    ]
     if right:
         nees, error_deg, focal = np.array(right).T
-        text += f"  {nees.mean():6.2f} {np.sqrt(np.mean(error_deg**2)):8.4f} {100 * np.sqrt(np.mean(focal**2)):7.3f}"
-    return text
-
-
-if __name__ == "__main__":
-    trials, seed = (int(one) for one in (sys.argv[1:] + ["1000", "1"][len(sys.argv) - 1 :]))
-    for case in CASES:
-        count = max(int(case.share * trials), 10)
-        print(
-            f"{case}: {count} frames; found %, wrong, NEES, attitude rms deg, focal rms %",
-            flush=True,
-        )
-        for identifier, knows in IDENTIFIERS:
-            share = 1 if identifier == "non_dimensional" else 10
-            cell = measure(case, identifier, knows, max(count // share, 10), seed)
-            print(f"  {identifier + (' (sigma)' if knows else ''):20s} {cell}", flush=True)
+        rows += [
+            figure(f"{name}: NEES", nees.mean(), "", what),
+            figure(f"{name}: attitude", np.sqrt(np.mean(error_deg**2)), "deg rms", what),
+            figure(f"{name}: focal length", 100 * np.sqrt(np.mean(focal**2)), "% rms", what),
+        ]
+    return rows

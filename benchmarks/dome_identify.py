@@ -1,18 +1,18 @@
 """LED identification without a prior attitude: rates of correct, wrong and ambiguous results, and time.
 
-`python benchmarks/dome_identify.py [TRIALS] [SEED]` uses AFIT's SimSat under its measured dome with 1,400 equal LEDs,
-at random attitudes up to 30 degrees of tilt.
+AFIT's SimSat under its measured dome with 1,400 equal LEDs, at random attitudes up to 30 degrees of tilt.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
 from estimator.identification import led_search
@@ -24,6 +24,7 @@ from skysim.sources.dome.layouts import optimize, placing
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
+TRIALS = 2000
 COUNT = 1400
 CAP_DEG = 40.0
 TILT_DEG = 30.0
@@ -112,8 +113,13 @@ def trial(
     return ("WRONG" if wrong else "identified"), elapsed_s, len(seen)
 
 
-def measure(case: Case, trials: int, seed: int) -> str:
-    """One table line."""
+def measure(count: int = TRIALS, seed: int = 1) -> list[dict[str, Any]]:
+    """Shares of results and times of all cases, `count` frames each."""
+    return [row for case in CASES for row in measure_case(case, count, seed)]
+
+
+def measure_case(case: Case, count: int, seed: int) -> list[dict[str, Any]]:
+    """The rows of one case; a wrong identification misses its bar."""
     rng = np.random.default_rng(seed)
     lab = build_lab(loader.load("afit_simsat"))
     surface = build_surface(lab.scene.light.surface)
@@ -126,22 +132,18 @@ def measure(case: Case, trials: int, seed: int) -> str:
     )
     dome = build_dome_index(leds, lever, camera)
     trial(case, truth_m, lever, camera, dome, rng)
-    results = [trial(case, truth_m, lever, camera, dome, rng) for _ in range(trials)]
+    results = [trial(case, truth_m, lever, camera, dome, rng) for _ in range(count)]
     outcomes = np.array([outcome.split(":")[0] for outcome, _, _ in results])
     ms = 1e3 * np.array([elapsed_s for _, elapsed_s, _ in results])
     counts = [n for _, _, n in results]
-    percent = {
-        name: 100 * np.mean(outcomes == name) for name in ("identified", "WRONG", "ambiguous")
-    }
-    return (
-        f"{case.name:26s} {len(truth_m):5d} {np.mean(counts):6.1f} {min(counts):4d}"
-        f" {percent['identified']:9.2f} {int(np.sum(outcomes == 'WRONG')):6d} {percent['ambiguous']:9.2f}"
-        f" {np.median(ms):8.2f} {np.percentile(ms, 99):8.2f}"
-    )
-
-
-if __name__ == "__main__":
-    trials, seed = (int(one) for one in (sys.argv[1:] + ["2000", "1"][len(sys.argv) - 1 :]))
-    print(f"{'case':26s}  LEDs   seen  min   found %  wrong  ambig. %       ms   p99 ms")
-    for case in CASES:
-        print(measure(case, trials, seed), flush=True)
+    percent = {name: 100 * np.mean(outcomes == name) for name in ("identified", "ambiguous")}
+    what = f"{count} frames"
+    return [
+        figure(f"{case.name}: LEDs seen, mean", np.mean(counts), "", what),
+        figure(f"{case.name}: LEDs seen, least", min(counts), "", what),
+        figure(f"{case.name}: identified", percent["identified"], "%", what),
+        verdict(f"{case.name}: wrong", int(np.sum(outcomes == "WRONG")), "frames", what, 0),
+        figure(f"{case.name}: ambiguous", percent["ambiguous"], "%", what),
+        figure(f"{case.name}: time, median", np.median(ms), "ms", what),
+        figure(f"{case.name}: time, 99 %", np.percentile(ms, 99), "ms", what),
+    ]

@@ -1,14 +1,7 @@
-"""Projective and affine invariants of LED groups: what they and a verified match can tell under a dome.
+"""What projective and affine invariants of LED groups, and a verified match, can tell under a dome.
 
-`python -m benchmarks.dome_invariants [FIELDS] [SEED]`: AFIT's SimSat under its measured dome with Poisson-disk LEDs, in
-AFIT's field and one four times as wide. Of a camera of which nothing is known, five lights have two invariants under
-the homography between any two images of their rays (Mundy & Zisserman 1992, Geometric Invariance in Computer Vision),
-ratios of determinants |ijk| of three rays,
-
-    I1 = |431||521| / (|421||531|),  I2 = |421||532| / (|432||521|);
-
-of a camera whose image is an affine one of the rays' tangents, four lights have the ratios of the areas of triangles
-|124| / |123| and |134| / |123|. Printed for random fields, with the errors of CASES:
+AFIT's SimSat under its measured dome with Poisson-disk LEDs, in AFIT's field and one four times as wide. The invariants
+are those of `tests.helpers.group_invariants`. Rows, for random fields with the errors of CASES:
 
 - bits: log2 of the groups of LEDs, in all orders, over those with the invariants of a group of lights by chance, within
   GATE_SIGMA of its errors, which are those of light and map and, where the pupil's place is unknown within the field,
@@ -26,14 +19,14 @@ of a camera whose image is an affine one of the rays' tangents, four lights have
 
 from __future__ import annotations
 
-import sys
 from math import comb, factorial, log2, log10, pi
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.dome_identify import attitude, leds_m
+from benchmarks.timing import figure
 from estimator.attitude.dome_map import Lever, project
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
@@ -42,6 +35,7 @@ from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 from skysim.sources.dome.surface import build_surface
 from skysim.tracking.onboard_model import calibration
+from tests.helpers.group_invariants import TRANSFORMS, invariants, predicted
 
 # LEDs, focal length relative to AFIT's, error of an LED in the map along each axis, m, and of a light, pixels
 CASES = (
@@ -52,40 +46,9 @@ CASES = (
     (400, 0.24, 0.2e-3, 0.2),
     (400, 0.24, 1e-2, 0.2),
 )
+FIELDS = 100
 DRAWS = 40  # of the errors of a group's invariants
 CHANCE_GROUPS = 60_000  # of other LEDs, compared with a group of lights
-
-
-class Transform(NamedTuple):
-    """A family of image transforms: lights of its invariants, and lights that fix it."""
-
-    lights: int
-    fixed_by: int
-
-
-TRANSFORMS = {"projective": Transform(5, 4), "affine": Transform(4, 3)}
-
-
-def determinant(rays: Floats, i: int, j: int, k: int) -> Floats:
-    """(...,) determinant of rays i, j and k of (..., L, 3)."""
-    return np.asarray(
-        np.einsum("...a,...a->...", rays[..., i, :], np.cross(rays[..., j, :], rays[..., k, :]))
-    )
-
-
-def invariants(rays: Floats, name: str) -> Floats:
-    """(..., 2) invariants of (..., L, 3) homogeneous rays (x, y, 1); see the module."""
-
-    def det(i: int, j: int, k: int) -> Floats:
-        return determinant(rays, i - 1, j - 1, k - 1)
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if name == "affine":
-            return np.stack([det(1, 2, 4) / det(1, 2, 3), det(1, 3, 4) / det(1, 2, 3)], axis=-1)
-        first = det(4, 3, 1) * det(5, 2, 1) / (det(4, 2, 1) * det(5, 3, 1))
-        return np.stack(
-            [first, det(4, 2, 1) * det(5, 3, 2) / (det(4, 3, 2) * det(5, 2, 1))], axis=-1
-        )
 
 
 class Bench:
@@ -205,17 +168,6 @@ def moved(x: Floats, sigma: float, rng: np.random.Generator) -> Floats:
     return x + np.pad(sigma * rng.standard_normal((len(x), 2)), ((0, 0), (0, 1)))
 
 
-def predicted(name: str, source: Floats, target: Floats, points: Floats) -> Floats:
-    """(K, 2) images of points under the transform that takes the source's points to the target's."""
-    if name == "affine":
-        matrix = np.linalg.lstsq(source, target, rcond=None)[0].T
-    else:
-        bases = [one[:3].T * np.linalg.solve(one[:3].T, one[3]) for one in (source, target)]
-        matrix = bases[1] @ np.linalg.inv(bases[0])
-    image = points @ matrix.T
-    return np.asarray(image[:, :2] / image[:, 2:])
-
-
 def pool_of(bench: Bench, name: str) -> Floats:
     """(CHANCE_GROUPS, 2) invariants of random groups, in random order, of LEDs that share a field."""
     found = []
@@ -228,8 +180,16 @@ def pool_of(bench: Bench, name: str) -> Floats:
     return np.array(found[:CHANCE_GROUPS])
 
 
-def measure(leds: int, zoom: float, map_m: float, noise_px: float, fields: int, seed: int) -> None:
-    """Print a row for each family of transforms."""
+def measure(count: int = FIELDS, seed: int = 1) -> list[dict[str, Any]]:
+    """All cases, `count` random fields each."""
+    return [row for case in CASES for row in measure_case(*case, count, seed)]
+
+
+def measure_case(
+    leds: int, zoom: float, map_m: float, noise_px: float, fields: int, seed: int
+) -> list[dict[str, Any]]:
+    """The rows of each family of transforms; medians over the fields."""
+    found = []
     for name, family in TRANSFORMS.items():
         bench = Bench(leds, zoom, map_m, seed)
         sigma_px = bench.sigma_px(noise_px)
@@ -255,16 +215,24 @@ def measure(leds: int, zoom: float, map_m: float, noise_px: float, fields: int, 
             rows.append((len(xy), *bits, log2(sets * factorial(family.lights)), dex))
             parallax.append((shift_px, *bounds_deg(bench, body_from_lab, seen, sigma_px)))
         lights, known, unknown, needed, dex = np.array(rows).T
-        shift, focal_deg, all_deg = np.median(parallax, axis=0)
-        print(
-            f"{leds:5d} LEDs to {1e3 * map_m:3g} mm, {noise_px} px, zoom {zoom:4g}, {name:10s}:"
-            f" {lights.mean():5.1f} lights;"
-            f" bits {np.median(known):4.1f}, {np.median(unknown):4.1f} with parallax, of {np.median(needed):4.1f};"
-            f" parallax {shift:6.2f} px; evidence {np.median(dex):6.1f} dex,"
-            f" {100 * np.mean(dex >= ACCEPT_DEX):5.1f} % of fields enough;"
-            f" attitude {focal_deg:.3f} and {all_deg:.3f} deg",
-            flush=True,
-        )
+        case = f"{leds} LEDs to {1e3 * map_m:g} mm, {noise_px} px, zoom {zoom:g}, {name}"
+        what = f"{fields} fields"
+        found += [
+            figure(f"{case}: lights, mean", lights.mean(), "", what),
+            figure(f"{case}: bits of a group", np.median(known), "", what),
+            figure(f"{case}: bits with parallax", np.median(unknown), "", what),
+            figure(f"{case}: bits needed", np.median(needed), "", what),
+            figure(f"{case}: evidence", np.median(dex), "dex", what),
+            figure(f"{case}: fields with enough", 100 * np.mean(dex >= ACCEPT_DEX), "%", what),
+        ]
+        if parallax:
+            shift_px, focal_deg, all_deg = np.median(parallax, axis=0)
+            found += [
+                figure(f"{case}: parallax", shift_px, "px", what),
+                figure(f"{case}: attitude, focal length unknown", focal_deg, "deg", what),
+                figure(f"{case}: attitude, all unknown", all_deg, "deg", what),
+            ]
+    return found
 
 
 def residual(name: str, xy: Floats, other: Floats, lens: Camera) -> Floats:
@@ -280,9 +248,3 @@ def residual(name: str, xy: Floats, other: Floats, lens: Camera) -> Floats:
     matrix = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     image = x @ matrix.T
     return np.asarray((image[:, :2] / image[:, 2:] - y[:, :2]) * lens.focal_px)
-
-
-if __name__ == "__main__":
-    fields, seed = (int(one) for one in (sys.argv[1:] + ["100", "1"][len(sys.argv) - 1 :]))
-    for leds, zoom, map_m, noise_px in CASES:
-        measure(leds, zoom, map_m, noise_px, fields, seed)

@@ -1,4 +1,4 @@
-"""Memory and time of the estimator on one core: `NUMBA_NUM_THREADS=1 python -m benchmarks.footprint`.
+"""Memory and time of the estimator on one core; with NUMBA_NUM_THREADS=1.
 
 A 1024 x 1024 camera of 13.5 degrees, 16-bit frames of some 25 stars, by the default settings; after `warm_up`.
 """
@@ -6,11 +6,13 @@ A 1024 x 1024 camera of 13.5 degrees, 16-bit frames of some 25 stars, by the def
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.timing import figure
 from estimator import Camera, Centroids, StarTracker, TrackingMode
 from estimator.trackers.warm_up import draw
 
@@ -33,19 +35,28 @@ def milliseconds(call: Callable[[], object]) -> tuple[float, float]:
     return 1e3 * float(np.median(taken)), 1e3 * float(np.quantile(taken, 0.99))
 
 
-def measured() -> Iterator[str]:
-    """The lines of the table."""
-    yield f"libraries loaded: {rss_mb():.0f} MB"
+def measure() -> list[dict[str, Any]]:
+    """Memory, and the times of building, warming up and solving."""
+    rows = [figure("libraries loaded", rss_mb(), "MB")]
     camera = Camera.from_fov(1024, 1024, fov_deg=13.5)
     begin = time.perf_counter()
     tracker = StarTracker.for_sky(camera)
-    yield f"tracker of {len(tracker.stars)} stars built: {time.perf_counter() - begin:.2f} s, {rss_mb():.0f} MB"
+    built_s = time.perf_counter() - begin
+    stars = f"{len(tracker.stars)} stars"
     pairs_mb = (tracker.sky.pair.nbytes + tracker.sky.first.nbytes) / 1e6
-    yield f"index of pairs: {pairs_mb:.1f} MB, of stars: {tracker.sky.bytes / 1e6 - pairs_mb:.1f} MB"
+    rows += [
+        figure("tracker built in", built_s, "s", stars),
+        figure("tracker built", rss_mb(), "MB", stars),
+        figure("index of pairs", pairs_mb, "MB", stars),
+        figure("index of stars", tracker.sky.bytes / 1e6 - pairs_mb, "MB", stars),
+    ]
     follower = TrackingMode(tracker)
     begin = time.perf_counter()
     follower.warm_up()
-    yield f"warm_up, compiled before: {time.perf_counter() - begin:.1f} s, {rss_mb():.0f} MB"
+    rows += [
+        figure("warm_up, compiled before", time.perf_counter() - begin, "s"),
+        figure("warmed up", rss_mb(), "MB"),
+    ]
     _, xy_px, light = tracker.rich_field()
     xy_px = xy_px[:25]
     light = light[:25]
@@ -57,10 +68,8 @@ def measured() -> Iterator[str]:
         ("frame, tracked", lambda: follower.solve(image, 0.0)),
     ):
         median, late = milliseconds(call)
-        yield f"{name}: median {median:.2f} ms, 99 % {late:.2f} ms"
-    yield f"at the end: {rss_mb():.0f} MB"
-
-
-if __name__ == "__main__":
-    for line in measured():
-        print(line, flush=True)
+        rows += [
+            figure(f"{name}: median", median, "ms", f"{REPEATS} calls"),
+            figure(f"{name}: 99 %", late, "ms", f"{REPEATS} calls"),
+        ]
+    return [*rows, figure("at the end", rss_mb(), "MB")]

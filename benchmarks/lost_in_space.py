@@ -1,7 +1,6 @@
 """Lost-in-space identification on eighteen workloads, from centroids and magnitudes, beside peers and an oracle.
 
-`python -m benchmarks.lost_in_space [FIELDS] [SEED] [SOLVER ...]` prints success, wrong attitudes and time of ours, an
-identifier's name, and of the peers on the same centroids (`peers`): tetra3rs and cedar. The sky
+Success, wrong attitudes and time of ours, and of the peers on the same centroids (`peers`): tetra3rs and cedar. The sky
 is Hipparcos to the workload's limiting magnitude, without the fainter of any two stars closer than 30". Attitudes are
 uniform over all rotations. A star's magnitude has an error of 0.25 (1 sigma); a false star's is drawn from the catalog.
 The oracle solves the attitude from the true identities of all true stars and needs at least three. A solution is
@@ -10,7 +9,6 @@ wrong if it is more than 10' off, unless the oracle's is too.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from benchmarks import peers
-from benchmarks.timing import verdict
+from benchmarks.timing import figure, verdict
 from estimator.attitude.solvers import quest
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
@@ -280,16 +278,6 @@ def score(work: Workload, count: int, seed: int, name: str) -> dict[str, float] 
     }
 
 
-def line(work: Workload, name: str, scored: dict[str, float] | None) -> str:
-    """One table line."""
-    if scored is None:
-        return f"{work.name:36s} {name:10s} not installed, or no database for this field"
-    numbers = "{found:8.2f} {wrong:7.2f} {oracle:8.2f} {ms:8.3f} {p99:8.2f} {build:7.2f}".format(
-        **scored
-    )
-    return f"{work.name:36s} {name:10s} {numbers}"
-
-
 def measure(count: int = 200, seed: int = 1) -> list[dict[str, Any]]:
     """Fields found and median times of all workloads beside the best of the peers; wrong answers of ours."""
     rows = []
@@ -308,13 +296,8 @@ def measure(count: int = 200, seed: int = 1) -> list[dict[str, Any]]:
                 f"{number + 1}. {work.name}: {key}", mine[key], unit, best or "-", bar, least
             )
             rows.append(row | {"peer_value": theirs[best][key] if best else None})
+        rows += [
+            figure(f"{number + 1}. {work.name}: oracle", mine["oracle"], "%"),
+            figure(f"{number + 1}. {work.name}: ms, 99 %", mine["p99"], "ms"),
+        ]
     return rows
-
-
-if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    count, seed = (int(text) for text in (arguments[:2] + ["1000", "1"][len(arguments[:2]) :]))
-    print(f"{'workload':36s} {'':10s}  found %  wrong % oracle %       ms   p99 ms build s")
-    for work in WORKLOADS:
-        for name in arguments[2:] or ["pyramid", "default", *PEERS]:
-            print(line(work, name, score(work, count, seed, name)), flush=True)

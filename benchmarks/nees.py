@@ -72,7 +72,7 @@ WORKS = tuple(
 def measure(
     works: tuple[Workload, ...] = WORKS,
     conditions: tuple[Condition, ...] = CONDITIONS,
-    fields: int = FIELDS,
+    count: int = FIELDS,
 ) -> list[dict[str, Any]]:
     """Solved and wrong share, mean NEES and its 99.9th percentile, for each camera and condition."""
     rows = []
@@ -85,9 +85,9 @@ def measure(
         for condition in conditions:
             frames = (
                 condition.apply(field(work, stars, np.random.default_rng([SEED, n])), work.camera)
-                for n in range(fields)
+                for n in range(count)
             )
-            rows += _rows(f"{work.name}, {condition.name}", scores(tracker, frames), fields)
+            rows += _rows(f"{work.name}, {condition.name}", scores(tracker, frames), count)
     return rows
 
 

@@ -20,7 +20,7 @@ WORK = Work("SHEFEX", "shefex2", "80 us", 200, {"exposure.time": "50 ms"})
 
 
 def measure(
-    rates_deg_s: tuple[float, ...] = RATES_DEG_S, frames: int = WORK.frames
+    rates_deg_s: tuple[float, ...] = RATES_DEG_S, count: int = WORK.frames
 ) -> list[dict[str, Any]]:
     """Share of the frames that tell the rate, its error across the boresight and its NEES, for each rate."""
     lab = WORK.lab(False)
@@ -28,7 +28,7 @@ def measure(
     for rate_deg_s in rates_deg_s:
         errors = []
         nees = []
-        for seed in range(frames):
+        for seed in range(count):
             frame, truth, tracker = frame_of(WORK, lab, rate_deg_s, seed)
             rate = factory.solve_frame(tracker, frame).attitude.rate
             if rate is None:
@@ -41,7 +41,7 @@ def measure(
             nees.append(error @ np.linalg.solve(rate.covariance_rad2_s2, error))
         name = f"SHEFEX, 50 ms, {rate_deg_s:g} deg/s"
         rows.append(
-            row(f"{name}: frames with a rate", 100 * len(errors) / frames, "%", None, None, None)
+            row(f"{name}: frames with a rate", 100 * len(errors) / count, "%", None, None, None)
         )
         if not errors:
             continue

@@ -1,22 +1,25 @@
 """Refraction in photographs of the real sky: residuals of stars with and without the air over the site.
 
-`python -m benchmarks.refraction [FOLDER]`. The four photographs of ESA's tetra3 have one camera; their lens (focal
+The four photographs of ESA's tetra3 have one camera; their lens (focal
 length, center, five coefficients of distortion) and the attitude of each are fitted to stars that a first calibration
 identified; then again to the same stars as the air of the site raises them. Time, altitude and azimuth are in the
 files' names; the altitudes (1.3 degrees off, all of them) and the time give the site: 51.98 N, 4.34 E, which is Delft.
+Their folder is named by the environment variable SKYSIM_PHOTOGRAPHS.
 """
 
 from __future__ import annotations
 
 import datetime
-import sys
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
+from benchmarks.timing import figure
 from estimator.calibration.star_field import Calibration, StarFrame, calibrate, self_calibrate
 from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir, raised, refraction_constants
@@ -26,9 +29,9 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
-from skysim.core.files import CATALOGS, ROOT
+from skysim.core.files import CATALOGS
 
-FOLDER = ROOT.parent / "shared" / "real_sky"
+FOLDER = "SKYSIM_PHOTOGRAPHS"
 DATE = datetime.datetime(2019, 7, 29, 20, 47, 26)
 PRESSURE_HPA = 1013.25
 DELFT = SiteAir(51.98, 4.34, DATE, PRESSURE_HPA, 15.0)
@@ -134,26 +137,28 @@ def fitted_scale(
     return -slope / (2 * curve), float(np.sqrt(squares.min() / (2 * reports[0].stars * curve)))
 
 
-def main(folder: Path) -> None:
-    """Print a line for each photograph: stars, altitude, and residuals without and with the air."""
-    frames, camera = star_frames(folder)
+def measure() -> list[dict[str, Any]]:
+    """Residuals of each photograph without and with the air, and what the residuals tell of the refraction."""
+    if FOLDER not in os.environ:
+        raise SystemExit(f"refraction: {FOLDER} does not name the folder of the photographs")
+    frames, camera = star_frames(Path(os.environ[FOLDER]))
     calibration, without = fitted(frames, camera)
     zenith = DELFT.zenith(0.0)
     constants = refraction_constants(PRESSURE_HPA, 15.0, 600e-9)
     _, with_air = fitted(through(frames, zenith, constants), camera)
+    rows = []
     for n, file in enumerate(FILES):
         boresight = calibration.report.cam_from_ref[n].inv().apply([0.0, 0.0, 1.0])
         altitude_deg = np.degrees(np.arcsin(boresight @ zenith))
-        stars = len(frames[n].xy_px)
-        print(
-            f"{file:45s} {stars:4d} stars  {altitude_deg:5.1f} deg  {without[n]:.3f} px  {with_air[n]:.3f} px"
-        )
+        what = f"{len(frames[n].xy_px)} stars, altitude {altitude_deg:.1f} deg"
+        rows += [
+            figure(f"{file}: residual without air", without[n], "px rms", what),
+            figure(f"{file}: residual with air", with_air[n], "px rms", what),
+        ]
     scale, sigma = fitted_scale(frames, camera, zenith)
     off_deg = np.degrees(np.arccos(best_zenith(frames, camera, zenith) @ zenith))
-    print(
-        f"refraction {scale:.2f} +- {sigma:.2f} of the model's; zenith from refraction alone {off_deg:.1f} deg off"
-    )
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER)
+    return [
+        *rows,
+        figure("refraction over the model's", scale, "x", f"sigma {sigma:.2f}"),
+        figure("zenith from refraction alone: off by", off_deg, "deg"),
+    ]

@@ -1,6 +1,6 @@
 """Success against angular rate for SHEFEX-2: the paper's processing chain and the default one on the same frames.
 
-`python -m benchmarks.smear [FRAMES] [SEED]`: the camera of scene shefex2 with 50 ms exposure, rotating about an axis
+The camera of scene shefex2 with 50 ms exposure, rotating about an axis
 perpendicular to the boresight, at random attitudes in the southern sky, for which the paper's catalog was made. Samaan
 & Theil (2011) report mostly successful identification up to 2 deg/s and rarely above 4 deg/s. Their chain: one scan of
 the frame, at most 15 centroids, center of gravity, triangles and pyramids over their 2,023 stars, QUEST. The default
@@ -9,12 +9,13 @@ chain runs twice: with the streak from a gyro, and estimating the streak itself.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.timing import figure
 from estimator.catalog import catalog, published_catalogs
 from estimator.core.checks import ImageError
 from estimator.trackers.pipeline import Settings
@@ -27,6 +28,7 @@ from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.onboard_model import calibration
 
+FRAMES = 100
 RATES_DEG_S = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 FRAME_S = 0.1
 KNOT_S = 0.5e-3
@@ -112,8 +114,9 @@ def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     }
 
 
-def measure(count: int, seed: int) -> Iterator[str]:
-    """One table line per rate."""
+def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
+    """Solved and wrong shares of `count` frames for each rate and chain."""
+    rows = []
     overrides = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
     lab = build_lab(load("shefex2", overrides))
     trackers = build_trackers(lab)
@@ -124,16 +127,12 @@ def measure(count: int, seed: int) -> Iterator[str]:
                 score[name] += is_solved(
                     tracker, frame, truth, streak_px if name == "with gyro" else None
                 )
-        cells = [
-            f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}"
-            for name in trackers
-        ]
         pixels = np.radians(rate) * 0.05 * lab.scene.camera.focal_px
-        yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(cells)
-
-
-if __name__ == "__main__":
-    count, seed = (int(one) for one in (sys.argv[1:3] + ["100", "1"][len(sys.argv[1:3]) :]))
-    print("deg/s     px    paper % wrong %   default % wrong %  with gyro % wrong %")
-    for line in measure(count, seed):
-        print(line, flush=True)
+        what = f"smear of {pixels:.1f} px, {count} frames"
+        for name, (solved, wrong) in score.items():
+            case = f"{rate:g} deg/s, {name}"
+            rows += [
+                figure(f"{case}: solved", 100 * solved / count, "%", what),
+                figure(f"{case}: wrong", 100 * wrong / count, "%", what),
+            ]
+    return rows

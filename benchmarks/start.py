@@ -51,7 +51,3 @@ def skysim(words: list[str], folder: str) -> float:
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-if __name__ == "__main__":
-    print(*measure(), sep="\n")

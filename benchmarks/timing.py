@@ -1,4 +1,7 @@
-"""Paired timing: both sides are warmed up, then timed alternately; the minimum of each counts."""
+"""Rows of results: two sides timed in turn, a value beside its bar, a value alone.
+
+A row is {name, value, unit, peer, peer_value, ratio, bar, met}; `met` is None without a bar.
+"""
 
 from __future__ import annotations
 
@@ -62,3 +65,8 @@ def verdict(
         "bar": bar,
         "met": value >= bar if least else value <= bar,
     }
+
+
+def figure(name: str, value: float, unit: str, what: str = "") -> dict[str, Any]:
+    """One result without a bar; `what` says what it is of."""
+    return verdict(name, float(value), unit, what, 0.0) | {"bar": None, "met": None}

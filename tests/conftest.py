@@ -5,18 +5,18 @@ from __future__ import annotations
 import ast
 import math
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-pytest.register_assert_rewrite("labpage", "laws")
+pytest.register_assert_rewrite("tests.helpers")
+from tests.helpers import compilation  # noqa: E402
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -70,37 +70,22 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
     return found
 
 
-COMPILED = pytest.StashKey[tuple[Path, list[Future[None]]]]()
-# Modules run as commands, one group per process. Whatever two groups need is compiled once, by the first that needs it.
-TRACKER = "skysim.simulation.compilation"
-FRAME = ("--frames", "1", "--out", "{folder}")
-BLIND = "skysim", "solve", "{folder}/frame_0000.png"
+COMPILED = pytest.StashKey[tuple[Path, Future[None]]]()
 LAST_COMPILED = "estimator/identification/stars/__pycache__/quads.identify-*.nbi"  # which `make demo` leaves out
-GROUPS: tuple[Sequence[Sequence[str]], ...] = (
-    [(TRACKER, "shefex2"), ("skysim", "render", "shefex2", *FRAME), BLIND],
-    [("skysim", "render", "afit_simsat", *FRAME), (TRACKER, "afit_simsat")],
-)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Fill numba's cache, if it is empty or the demo's, while the workers of xdist collect.
 
-    Each of them would compile everything.
+    Each of them would compile everything. `make compile` does it before.
     """
     if config.args == config.getini("testpaths") and not any(ROOT.glob(LAST_COMPILED)):
         folder = Path(tempfile.mkdtemp())
         pool = ThreadPoolExecutor()
-        groups = [pool.submit(run_modules, group, folder) for group in GROUPS]
-        pool.submit(lambda: (wait(groups), (folder / "done").touch()))
-        config.stash[COMPILED] = folder, groups
-
-
-def run_modules(group: Sequence[Sequence[str]], folder: Path) -> None:
-    """Run `python -m WORDS` for each of a group; the output appears only if one fails."""
-    for words in group:
-        command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
-        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        compiled = pool.submit(compilation.main, ["--basic"])
+        compiled.add_done_callback(lambda _: (folder / "done").touch())
+        config.stash[COMPILED] = folder, compiled
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -120,8 +105,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Remove what the compilation left, and raise what it raised."""
     if COMPILED in config.stash:
-        folder, groups = config.stash[COMPILED]
-        wait(groups)
+        folder, compiled = config.stash[COMPILED]
+        wait([compiled])
         shutil.rmtree(folder, ignore_errors=True)
-        for group in groups:
-            group.result()
+        compiled.result()

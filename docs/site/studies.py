@@ -25,8 +25,7 @@ from skysim.experiments.study.report.study_report import (
     compose,
 )
 from skysim.experiments.study.study_file import load
-from skysim.results.report import Report
-from skysim.results.report_blocks import Section, Text
+from skysim.results.report import Report, Section, Text
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
 BESIDE = {

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import photographs
 from estimator.catalog import catalog
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
@@ -19,6 +18,7 @@ from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import retries
 from skysim.core import images
 from skysim.core.files import CATALOGS
+from tests.helpers import photographs
 
 SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)
 

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import photographs
 from estimator.catalog import catalog
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
@@ -17,6 +16,7 @@ from skysim.apps import plate_solver
 from skysim.apps.plate_solver import retries
 from skysim.core import images
 from skysim.core.files import CATALOGS
+from tests.helpers import photographs
 
 SHOT = photographs.Shot(1280, 960, 22.0, 6.3)
 

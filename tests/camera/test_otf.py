@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import special
 from scipy.signal import fftconvolve
-from splatting import add_kernel
 
 from skysim.camera.psf.kernel import (
     HARMONIC_FLOOR,
@@ -40,6 +39,7 @@ from skysim.scene.sections.camera import (
     MoffatPsfConfig,
     Psf,
 )
+from tests.helpers.splatting import add_kernel
 
 INCH_M = 0.0254
 PLACES = np.random.default_rng(1).uniform(-0.5, 0.5, (6, 2))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
-from splatting import add_kernel
 
 from skysim.camera.psf import splat
 from skysim.camera.psf.kernel import Kernel, build_kernel, grid_kernel, round_kernel
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig, MoffatPsfConfig, Psf
+from tests.helpers.splatting import add_kernel
 
 CAMERA = CameraConfig.model_validate(
     {

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-import doc_pages as pages
 import mujoco
 import pytest
+
+from tests.helpers import doc_pages as pages
 
 PAGE = "docs/howto/run.md"
 pytestmark = pytest.mark.long  # every command of the page, each in a process of its own

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-import doc_pages as pages
 import numpy as np
 import pytest
 import yaml
@@ -21,6 +20,7 @@ from skysim.scene.sections import camera, motion, vehicle
 from skysim.sources.dome import led
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.surface import SURFACES
+from tests.helpers import doc_pages as pages
 
 PAGE = "docs/howto/scene.md"
 REFERENCE = "docs/reference/scenes.md"

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-import doc_pages as pages
 import pytest
+
+from tests.helpers import doc_pages as pages
 
 PAGE = "docs/howto/study.md"
 pytestmark = pytest.mark.long  # every command of the page, each in a process of its own

@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import doc_pages as pages
 import pytest
 
 import skysim
 from skysim.core.files import ROOT
+from tests.helpers import doc_pages as pages
 
 README = "README.md"
 ARCHITECTURE = "docs/reference/architecture.md"

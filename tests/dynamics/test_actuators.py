@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +16,7 @@ from skysim.dynamics.multibody.cmgs import STEERING, CmgSet
 from skysim.dynamics.multibody.fans import Desaturator, FanSet
 from skysim.dynamics.multibody.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
+from tests.helpers.interpreted import interpreted
 
 BUS = np.array(
     [[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]]

@@ -86,7 +86,7 @@ def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     here = tmp_path / "here"
     here.mkdir()
     quiet = ["-m", "pip", "--quiet", "--disable-pip-version-check"]
-    source = ROOT / "packaging/estimator"
+    source = ROOT / "estimator"
     subprocess.run([sys.executable, *quiet, "wheel", "--no-deps", "-w", wheels, source], check=True)
     (wheel,) = wheels.glob("skysim_estimator-*.whl")
     subprocess.run([sys.executable, "-m", "venv", bare], check=True)

@@ -8,8 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import laws
 import pytest
+
+from tests.helpers import laws
 
 # The property tests of each package; importing them records which functions they cover.
 FILES = sorted(Path(__file__).parent.rglob("test_laws_*.py"))

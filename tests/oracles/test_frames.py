@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import oracles
+from tests.helpers import oracles
 
 MISSING = {
     "tetra3rs": "needs tetra3rs",

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splatting import add_kernel
 
 from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.core.types import Floats
@@ -20,6 +19,7 @@ from skysim.scene.sections.camera import (
     MoffatPsfConfig,
     Psf,
 )
+from tests.helpers.splatting import add_kernel
 
 galsim = pytest.importorskip("galsim")
 

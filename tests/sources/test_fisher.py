@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
+
+from tests.helpers.interpreted import interpreted
 
 FISHER = interpreted("skysim.sources.dome.layouts.fisher")
 CAMERA_M = np.array([0.03, -0.02, 0.3])

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
+
+from tests.helpers.interpreted import interpreted
 
 OPTIMIZE, AMBIGUITY = (
     interpreted(f"skysim.sources.dome.layouts.{name}") for name in ("optimize", "ambiguity")

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from labpage import (
+
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     QUICK_MS,
@@ -25,7 +26,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.worker import session
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 TABS = 20
 WORKERS = 2
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.visualization import ZScaleInterval
-from labpage import CHROMIUM, NARROW, Server, come, exported, opened, panel, source
+
+from tests.helpers.labpage import CHROMIUM, NARROW, Server, come, exported, opened, panel, source
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import (
+
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
@@ -34,7 +35,7 @@ from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 
 

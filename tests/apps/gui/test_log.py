@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from labpage import CHROMIUM, angles, changed, exported, onto_the_page, panel, source, status
+
+from tests.helpers.labpage import (
+    CHROMIUM,
+    angles,
+    changed,
+    exported,
+    onto_the_page,
+    panel,
+    source,
+    status,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -20,7 +30,7 @@ from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 
 
 @pytest.mark.slow

@@ -17,7 +17,11 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.visualization import ZScaleInterval
 from astropy.wcs import WCS
-from labpage import (
+from scipy.interpolate import RegularGridInterpolator
+
+from skysim.core.files import ROOT
+from skysim.scene import loader
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     SLOW_MS,
@@ -45,10 +49,6 @@ from labpage import (
     source,
     status,
 )
-from scipy.interpolate import RegularGridInterpolator
-
-from skysim.core.files import ROOT
-from skysim.scene import loader
 
 FOCUSED = """() => {
   const at = document.activeElement, whole = at.closest(".q-field, .q-slider") || at;
@@ -57,7 +57,7 @@ FOCUSED = """() => {
           Math.max(Math.floor(box.top) - 4, 0), Math.min(Math.ceil(box.right) + 4, innerWidth),
           Math.ceil(box.bottom) + 4];
 }"""  # what has the focus, and where it is
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"),

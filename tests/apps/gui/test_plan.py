@@ -12,8 +12,6 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
-
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.plan_panel import (
     ambiguity_text,
@@ -34,8 +32,9 @@ from skysim.scene import loader
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
 from skysim.tracking import dome_map_file
+from tests.helpers.labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 

@@ -6,9 +6,10 @@ import re
 from typing import Any
 
 import pytest
-from labpage import CHROMIUM, choose_stage, come, onto_the_page, panel, set_to
 
-pytest_plugins = ["labpage"]
+from tests.helpers.labpage import CHROMIUM, choose_stage, come, onto_the_page, panel, set_to
+
+pytest_plugins = ["tests.helpers.labpage"]
 RUNS = 400
 KEYS = {
     "camera.height_px": "659",

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import CHROMIUM, angles, changed, chosen, come, source, status
 from scipy.spatial.transform import Rotation
+
+from tests.helpers.labpage import CHROMIUM, angles, changed, chosen, come, source, status
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -18,7 +19,7 @@ from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.timing import exposure_window
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 INERTIA = np.array([6.0, 6.5, 9.0])
 SPHERE_KG_M2 = 120.0  # of shefex2's vehicle, which is free
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import (
+
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     WIDE,
@@ -32,7 +33,7 @@ from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import OVERRIDES, InputError, Where
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 
 

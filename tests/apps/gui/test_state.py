@@ -9,7 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import (
+
+from skysim.apps.gui.page import history
+from skysim.apps.gui.views.state import PageView
+from skysim.core.errors import InputError
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
@@ -26,11 +30,7 @@ from labpage import (
     status,
 )
 
-from skysim.apps.gui.page import history
-from skysim.apps.gui.views.state import PageView
-from skysim.core.errors import InputError
-
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 SCENES = ("shefex2", "/a b/ä&=.yaml")
 VIEWS = (

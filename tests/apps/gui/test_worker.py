@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import (
+
+from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     TOKEN,
@@ -27,7 +28,7 @@ from labpage import (
     status,
 )
 
-pytest_plugins = ["labpage"]
+pytest_plugins = ["tests.helpers.labpage"]
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"),

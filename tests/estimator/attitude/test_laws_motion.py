@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given
-from laws import SEEDS, answered, assert_covariance, law, units
-from moving_lights import CAMERA, EXPOSURE_S, STREAK_SIGMA_PX, Moving, moving
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +17,8 @@ from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, RateEstimate
 from estimator.detection import classify
 from estimator.detection.detect import local
+from tests.helpers.laws import SEEDS, answered, assert_covariance, law, units
+from tests.helpers.moving_lights import CAMERA, EXPOSURE_S, STREAK_SIGMA_PX, Moving, moving
 
 ARCSEC_RAD = np.radians(1 / 3600)
 ANYTHING = RateEstimate(np.zeros(3), 100.0 * np.eye(3))

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from hypothesis import given
-from laws import SEEDS, assert_covariance, law, turn, units
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +14,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.trackers import dome_tracker
+from tests.helpers.laws import SEEDS, assert_covariance, law, turn, units
 
 FOCAL_SIGMA = 2e-3
 CAMERA = Camera(1000, 800, 2000.0, (510.0, 380.0), focal_sigma=FOCAL_SIGMA)

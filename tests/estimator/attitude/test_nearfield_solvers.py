@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,15 +11,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
-
-# By its path: the benchmarks beside it need the whole simulator.
-_PATH = Path(__file__).parents[3] / "benchmarks" / "nearfield_table.py"
-_SPEC = importlib.util.spec_from_file_location("nearfield_table", _PATH)
-assert _SPEC is not None
-assert _SPEC.loader is not None
-bench = importlib.util.module_from_spec(_SPEC)
-sys.modules["nearfield_table"] = bench  # dataclasses look their module up
-_SPEC.loader.exec_module(bench)
+from tests.helpers import nearfield as bench
 
 DOMES = ("sphere", "sphere 0.125 in off", "measured ellipsoid", "flat at 48 in")
 EXACT = ("rotation_only", "tappe", "pnp")

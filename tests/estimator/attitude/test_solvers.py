@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import SOLVERS, Solver, covariance, quest
 from estimator.core.types import ra_dec_roll_rad
 from estimator.core.vectors import quaternion_xyzw
+from tests.helpers.interpreted import interpreted
 
 ARCSEC_RAD = np.pi / 180 / 3600
 FOV_RAD = np.radians(14.87)

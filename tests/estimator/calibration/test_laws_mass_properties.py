@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from bearing_motion import SMALL, prior, record
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import SEEDS, assert_covariance, law, turn
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import mass_dynamics, mass_properties
@@ -22,6 +20,8 @@ from estimator.calibration.mass_dynamics import (
     inertia_matrix,
     inertia_six,
 )
+from tests.helpers.bearing_motion import SMALL, prior, record
+from tests.helpers.laws import SEEDS, assert_covariance, law, turn
 
 RECORD = record(SMALL, np.random.default_rng(11), 26.0)
 

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
@@ -26,6 +25,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, StarMatch
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 LIGHTS = 14

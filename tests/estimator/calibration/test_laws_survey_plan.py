@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import SEEDS, answered, law
 from scipy.spatial.transform import Rotation
-from surveyed_dome import attitudes, model, pixels
 
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey, survey_faults, survey_plan
@@ -20,6 +18,8 @@ from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.core.camera import Camera
+from tests.helpers.laws import SEEDS, answered, law
+from tests.helpers.surveyed_dome import attitudes, model, pixels
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
@@ -20,6 +19,7 @@ from estimator.calibration.mass_dynamics import (
 )
 from estimator.calibration.mass_properties import estimate_mass, estimate_with_noise, filter_mass
 from estimator.core.checks import Floats, ImageError
+from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 
 NINE = slice(0, 9)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 
 from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
@@ -24,6 +23,7 @@ from estimator.calibration.dome_survey import (
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
+from tests.helpers.surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 
 LEDS = 120
 FRAMES = 30

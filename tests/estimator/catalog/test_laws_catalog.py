@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 from numpy.typing import NDArray
 
 from estimator.catalog import catalog, pair_index, published_catalogs, quad_index, sky_index
@@ -18,6 +17,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 CAMERA = Camera.from_fov(640, 480, np.radians(40))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import SEEDS, law, units
 
 from estimator.catalog import refraction
 from estimator.catalog.refraction import SiteAir
 from estimator.core.checks import ImageError
+from tests.helpers.laws import SEEDS, law, units
 
 ARCSEC = erfa.DAS2R
 DATES = some.datetimes(datetime.datetime(1950, 1, 1), datetime.datetime(2060, 1, 1))

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 
 from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog
 from estimator.core.checks import Floats
+from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.catalog.pair_index")
 bucket_of = PLAIN.bucket_of

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf, j1
 
@@ -12,6 +11,7 @@ from estimator.core.least_squares import CONVERGED_PX
 from estimator.core.types import Centroids, FramePriors
 from estimator.detection import detect
 from estimator.detection.background import FILTERED_NOISE
+from tests.helpers.interpreted import interpreted
 
 SIGMA_PX = 0.7
 # stars so far apart that the sky between them is not lifted by their light

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given
-from laws import SEEDS, law
 
 from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.checks import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs
+from tests.helpers.laws import SEEDS, law
 
 
 def blobs(box: list[int]) -> Blobs:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy import ndimage, optimize, stats
 from scipy.special import erf
 
@@ -14,6 +13,7 @@ from estimator.core.types import FramePriors
 from estimator.detection import background as frame_background
 from estimator.detection import detect
 from estimator.detection.components import runs_above
+from tests.helpers.interpreted import interpreted
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 SIGMA_PX = 0.7

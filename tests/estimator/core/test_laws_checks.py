@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import array_shapes, arrays
-from laws import ANY, NUMBERS, SEEDS, answered, drawn, law, turn, units
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +24,7 @@ from estimator.core.types import Centroids
 from estimator.detection import detect
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Settings
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, drawn, law, turn, units
 
 WORDS = some.text(max_size=8)
 THINGS: Any = (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from interpreted import interpreted
+
+from tests.helpers.interpreted import interpreted
 
 FIT = interpreted("estimator.core.least_squares")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 
 from estimator.core import vectors as compiled
+from tests.helpers.interpreted import interpreted
 
 MODULES = {"compiled": compiled, "interpreted": interpreted("estimator.core.vectors")}
 every_mode = pytest.mark.parametrize("vectors", MODULES.values(), ids=MODULES)

@@ -6,7 +6,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from benchmarks import frames
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
@@ -14,6 +13,7 @@ from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEs
 from estimator.detection import classify, detect
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid, process_frame
+from tests.helpers import drawn_frames as frames
 
 SHAPE = (493, 659)
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf
 
@@ -12,6 +11,7 @@ from estimator.detection import detect
 from estimator.detection.background import interpolate
 from estimator.detection.components import FIRST_RUNS, label_runs, runs_above
 from estimator.detection.shefex_detection import maximum_scan, sequential_scan
+from tests.helpers.interpreted import interpreted
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 

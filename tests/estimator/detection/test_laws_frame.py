@@ -9,7 +9,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import array_shapes, arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 from numpy.typing import NDArray
 from scipy.ndimage import convolve
 from scipy.spatial.transform import Rotation
@@ -28,6 +27,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 WIDTH = 90

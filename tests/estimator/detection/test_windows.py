@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from interpreted import interpreted
 from scipy import ndimage
+
+from tests.helpers.interpreted import interpreted
 
 WINDOWS = interpreted("estimator.detection.windows")
 EIGHT = np.ones((3, 3), int)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tumble import tumble_angle_rad, tumble_body_from_ref
 
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
+from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600
 CROSS = 10 * ARCSEC_RAD

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import laws
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +15,8 @@ from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
 from estimator.filter.states import inverse_response
 from estimator.trackers import exposure_control
 from estimator.trackers.exposure_control import Control, NextExposure, Observation
+from tests.helpers import laws
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 GYRO = GyroModel(1e-5, 1e-4, 1000.0)

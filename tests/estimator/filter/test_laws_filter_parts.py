@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -19,6 +18,7 @@ from estimator.core.types import FilterState
 from estimator.filter import consistency, correct, states
 from estimator.filter.mekf import AttitudeFilter
 from estimator.filter.states import STATES, GyroModel, JumpModel, TrackerModel
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 GYRO = GyroModel(1e-5, 1e-4, 1000.0, scale=1e-3, misalignment_rad=1e-3)

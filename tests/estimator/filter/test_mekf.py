@@ -8,7 +8,6 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
-from tumble import tumble_angle_rad, tumble_body_from_ref
 
 from estimator.core.types import FilterState
 from estimator.filter.mekf import (
@@ -22,6 +21,7 @@ from estimator.filter.mekf import (
     Update,
 )
 from estimator.filter.states import transition
+from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600
 DEG_H_RAD_S = np.pi / 180 / 3600

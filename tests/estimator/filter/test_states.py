@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tumble import tumble_angle_rad, tumble_body_from_ref
 
 from estimator.core.types import FilterState
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
+from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600
 ARW_RAD_SQRT_S = np.radians(0.07) / 60

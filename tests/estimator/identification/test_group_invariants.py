@@ -1,12 +1,12 @@
-"""Invariants of groups of lights, of `benchmarks.dome_invariants`: which transforms leave them alone."""
+"""Invariants of groups of lights, of `tests.helpers.group_invariants`: which transforms leave them alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks import dome_invariants
 from estimator.core.checks import Floats
+from tests.helpers import group_invariants
 
 AFFINE = np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, -0.2], [0.0, 0.0, 1.0]])
 HOMOGRAPHY = AFFINE + np.outer([0.0, 0.0, 1.0], [0.3, -0.2, 0.0])
@@ -20,7 +20,7 @@ def image(x: Floats, matrix: Floats) -> Floats:
 @pytest.mark.parametrize(("name", "matrix"), [("projective", HOMOGRAPHY), ("affine", AFFINE)])
 def test_a_family_s_transforms_leave_its_invariants_alone(name: str, matrix: Floats) -> None:
     """And the lights that fix a transform predict the image of every other one."""
-    family = dome_invariants.TRANSFORMS[name]
+    family = group_invariants.TRANSFORMS[name]
     x = np.concatenate(
         [
             np.random.default_rng(3).uniform(-0.4, 0.4, (9, family.lights, 2)),
@@ -29,18 +29,20 @@ def test_a_family_s_transforms_leave_its_invariants_alone(name: str, matrix: Flo
         axis=2,
     )
     y = image(x, matrix)
-    before, after = (dome_invariants.invariants(one, name) for one in (x, y))
+    before, after = (group_invariants.invariants(one, name) for one in (x, y))
     np.testing.assert_allclose(after, before, rtol=1e-9)
     for source, target in zip(x, y, strict=True):
-        found = dome_invariants.predicted(
+        found = group_invariants.predicted(
             name, source[: family.fixed_by], target[: family.fixed_by], source
         )
         np.testing.assert_allclose(found, target[:, :2], atol=1e-9)
-    mirrored = dome_invariants.invariants(np.roll(x, 1, axis=1), name)
+    mirrored = group_invariants.invariants(np.roll(x, 1, axis=1), name)
     assert np.abs(mirrored - before).min() > 1e-6  # the order of the lights counts
 
 
 def test_perspective_changes_the_ratios_of_areas() -> None:
     x = np.array([[0.1, 0.2, 1], [-0.3, 0.1, 1], [0.2, -0.3, 1], [0.3, 0.35, 1]])
-    before, after = (dome_invariants.invariants(one, "affine") for one in (x, image(x, HOMOGRAPHY)))
+    before, after = (
+        group_invariants.invariants(one, "affine") for one in (x, image(x, HOMOGRAPHY))
+    )
     assert np.abs(after / before - 1).max() > 0.01

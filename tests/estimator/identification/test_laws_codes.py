@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import SEEDS, answered, law, turn, units
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -17,6 +16,7 @@ from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, StarMatch
 from estimator.identification import led_codes, led_naming
 from estimator.identification.led_codes import GROSS, LedCode, LightTracks
+from tests.helpers.laws import SEEDS, answered, law, turn, units
 
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())

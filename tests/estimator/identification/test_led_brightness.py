@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
@@ -18,6 +17,7 @@ from estimator.identification import led_search
 from estimator.identification.led_evidence import STRAY, STRAY_DENSITY
 from estimator.identification.led_index import build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
+from tests.helpers.interpreted import interpreted
 
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
 LEVER = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 from scipy.special import betaln
 
@@ -14,6 +13,7 @@ from estimator.core.checks import Floats
 from estimator.identification import led_evidence, led_search
 from estimator.identification.led_evidence import LedDetections
 from estimator.identification.led_index import DomeIndex, build_dome_index
+from tests.helpers.interpreted import interpreted
 
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
 LEVER = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())

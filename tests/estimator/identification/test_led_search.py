@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,7 @@ from estimator.identification import led_search
 from estimator.identification.led_index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
+from tests.helpers.interpreted import interpreted
 
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +21,7 @@ from estimator.identification.published.saa import UNMATCHED_COST, Gates, Primar
 from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.solver_options import Options
+from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
 PYRAMID, SHEFEX, FIALHO, SAA, DIRECT = (

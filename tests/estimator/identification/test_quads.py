@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
-from star_fields import (
+
+from estimator.catalog import quad_index, sky_index
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids
+from estimator.identification import star_quads, star_search
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from tests.helpers.star_fields import (
     CHECKS,
     FIELD,
     SEARCHED,
@@ -18,13 +25,6 @@ from star_fields import (
     observe,
     random_sky,
 )
-
-from estimator.catalog import quad_index, sky_index
-from estimator.core.camera import Camera
-from estimator.core.types import Centroids
-from estimator.identification import star_quads, star_search
-from estimator.trackers.pipeline import Settings
-from estimator.trackers.star_tracker import StarTracker
 
 HEIGHT_RAD = np.radians(8.0)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 from scipy.special import betaln
 from scipy.stats import norm
 
 from estimator.catalog import sky_index
 from estimator.identification import star_evidence
+from tests.helpers.interpreted import interpreted
 
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
 AREA = float((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))

@@ -4,10 +4,19 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from interpreted import interpreted
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from star_fields import (
+
+from estimator.catalog import sky_index
+from estimator.core.checks import ImageError
+from estimator.core.types import NO_SPREAD
+from estimator.core.vectors import quaternion_xyzw
+from estimator.identification import star_detections as detections_module
+from estimator.identification import star_evidence, star_search
+from estimator.identification.star_detections import FlatCentroids, Sensor, changed, gates_of
+from estimator.identification.star_evidence import Solution
+from tests.helpers.interpreted import interpreted
+from tests.helpers.star_fields import (
     CHECKS,
     FIELD,
     MAG,
@@ -21,15 +30,6 @@ from star_fields import (
     observe,
     random_sky,
 )
-
-from estimator.catalog import sky_index
-from estimator.core.checks import ImageError
-from estimator.core.types import NO_SPREAD
-from estimator.core.vectors import quaternion_xyzw
-from estimator.identification import star_detections as detections_module
-from estimator.identification import star_evidence, star_search
-from estimator.identification.star_detections import FlatCentroids, Sensor, changed, gates_of
-from estimator.identification.star_evidence import Solution
 
 
 def solve(detections: star_evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:

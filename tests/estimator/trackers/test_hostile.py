@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import hostile
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
@@ -25,6 +24,7 @@ from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
 from skysim.core.files import CATALOGS
 from skysim.results import metrics
+from tests.helpers import hostile
 
 BRIEF = settings(max_examples=25, deadline=None)
 CAMERA = Camera.from_fov(40, 30, 0.5)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import SEEDS, answered, law, turn, units
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
@@ -16,6 +15,7 @@ from estimator.core.types import Centroids, RateEstimate
 from estimator.identification.led_codes import LedCode
 from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
+from tests.helpers.laws import SEEDS, answered, law, turn, units
 
 pytestmark = pytest.mark.slow
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))

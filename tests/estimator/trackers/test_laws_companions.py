@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import law
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog
@@ -18,6 +17,7 @@ from estimator.trackers.misfit import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.files import CATALOGS
+from tests.helpers.laws import law
 
 CAMERA = Camera.from_fov(4056, 3040, np.radians(22))  # 20 arcseconds a pixel
 NOISE_PX = 0.05

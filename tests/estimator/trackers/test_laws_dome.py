@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +25,7 @@ from estimator.core.types import Centroids
 from estimator.identification import led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
+from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))

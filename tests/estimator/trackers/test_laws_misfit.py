@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import law
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +21,7 @@ from estimator.identification.star_detections import changed
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
+from tests.helpers.laws import law
 
 CAMERA = Camera.from_fov(1024, 780, np.radians(17))
 NOISE_PX = 0.2

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given
-from laws import SEEDS, law
-from moving_lights import CAMERA, EXPOSURE_S, Moving
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +21,8 @@ from estimator.trackers import rolling_shutter
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
+from tests.helpers.laws import SEEDS, law
+from tests.helpers.moving_lights import CAMERA, EXPOSURE_S, Moving
 
 pytestmark = pytest.mark.slow
 ARCSEC_RAD = np.radians(1 / 3600)

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
-from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, drawn, law, turn, units
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import cKDTree
@@ -36,6 +35,17 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.refinement import FieldMatcher
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
+from tests.helpers.laws import (
+    ANY,
+    NUMBERS,
+    SEEDS,
+    answered,
+    assert_covariance,
+    drawn,
+    law,
+    turn,
+    units,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera.from_fov(640, 480, np.radians(40))

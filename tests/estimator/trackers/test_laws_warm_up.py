@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from laws import law
 
 from estimator.core.camera import Camera
 from estimator.core.checks import ImageError
 from estimator.detection.detect import to_native
 from estimator.trackers import warm_up
+from tests.helpers.laws import law
 
 
 @law(warm_up.loop_type)

@@ -11,7 +11,6 @@ import yaml
 from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
-from two_samples import histogram_p
 
 from estimator.calibration.star_field import disagreement_px
 from skysim.core import files
@@ -25,6 +24,7 @@ from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import build_lab
 from skysim.tracking.onboard_model import calibration
+from tests.helpers.two_samples import histogram_p
 
 SIDE_PX = 700
 GAIN_DN_E = 0.4

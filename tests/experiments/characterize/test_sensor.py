@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from two_samples import histogram_p
 
 from skysim.camera import detector
 from skysim.camera.detector import Detector
@@ -24,6 +23,7 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
+from tests.helpers.two_samples import histogram_p
 
 CHIP = {
     "quantum_efficiency": 0.6,

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
-from small_dataset import HEIGHT, SMALL, WIDTH
 
 from estimator.core.camera import Camera
 from skysim.camera import detector
@@ -20,6 +19,7 @@ from skysim.experiments.study.execution.setups import TrialSetup, prepared_setup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
 from skysim.tracking.onboard_model import assumed_camera
+from tests.helpers.small_dataset import HEIGHT, SMALL, WIDTH
 
 PARTICLE = {
     "camera.detector.particles": [{"per_cm2_s": 2000, "depth": "20 um", "electrons_um": 80}]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy
-from small_dataset import VARY, small
 
 from skysim.core.errors import InputError
 from skysim.experiments import dataset_run
+from tests.helpers.small_dataset import VARY, small
 
 
 def variations(folder: Path, text: str = VARY) -> Path:

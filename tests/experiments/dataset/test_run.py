@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_dataset import HEIGHT, VARY, WIDTH, contents, small
 
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.study.execution import engines, workers
+from tests.helpers.small_dataset import HEIGHT, VARY, WIDTH, contents, small
 
 pyarrow = pytest.importorskip("pyarrow.parquet")
 
@@ -235,13 +235,12 @@ def storage_host() -> str:
 DRIVER = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-from small_dataset import small
+from tests.helpers.small_dataset import small
 from skysim.experiments import dataset_run
 from skysim.experiments.study.execution import engines
 if __name__ == "__main__":
-    told = small(Path(sys.argv[2]), 40)
-    dataset_run.run(told, sys.argv[3], engines.Pool(2), lambda progress: print(progress.done, flush=True))
+    told = small(Path(sys.argv[1]), 40)
+    dataset_run.run(told, sys.argv[2], engines.Pool(2), lambda progress: print(progress.done, flush=True))
 """
 
 
@@ -254,7 +253,7 @@ def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(
     driver = tmp_path / "driver.py"
     folder = tmp_path / "killed"
     driver.write_text(DRIVER)
-    words = [sys.executable, driver, Path(__file__).parent, vary, folder]
+    words = [sys.executable, driver, vary, folder]
     for most in (4, 16):
         environment = (
             os.environ | dict.fromkeys(workers.ONE_THREAD, "1") | {"PYTHONPATH": str(ROOT)}

@@ -17,7 +17,6 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from surveyed_dome import NOISE_PX, attitudes, model, pixels
 
 from estimator.calibration import survey_faults
 from estimator.core.types import Centroids
@@ -30,6 +29,7 @@ from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
+from tests.helpers.surveyed_dome import NOISE_PX, attitudes, model, pixels
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
 SMALL = """

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import yaml
-from study_stores import done
 
 from skysim.experiments.study import answer, study_file
 from skysim.experiments.study.execution import store
@@ -19,6 +18,7 @@ from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
+from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {
     "schema": 1,

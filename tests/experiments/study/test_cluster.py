@@ -15,14 +15,14 @@ from typing import Any
 import psutil  # type: ignore[import-untyped]
 import pytest
 import yaml
-from study_stores import contents, done
-from test_engines import ENVIRONMENT, Cluster, cluster_of, on_dask, study
 
 from skysim.core.errors import InputError
 from skysim.core.files import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import runner, workers
 from skysim.experiments.study.execution.setups import code_version
+from tests.helpers.clusters import ENVIRONMENT, STUDY, Cluster, cluster_of, on_dask, study
+from tests.helpers.study_stores import contents, done
 
 PAGE = (ROOT / "docs/howto/cluster.md").read_text(encoding="utf-8")
 SMALL = ("replicates: 150", "replicates: 20")
@@ -36,8 +36,6 @@ def block(begin: str) -> str:
 
 @pytest.fixture(scope="module")
 def plan_(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
-    from test_engines import STUDY
-
     return study(tmp_path_factory.mktemp("study"), STUDY.replace(*SMALL))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,33 +13,21 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from study_stores import contents, done
 
 import skysim.experiments.study.execution
 from skysim.core.errors import InputError
-from skysim.experiments.study import plan, study_file
-from skysim.experiments.study.execution import engines, runner, setups, store, trials, workers
+from skysim.core.files import ROOT
+from skysim.experiments.study import plan
+from skysim.experiments.study.execution import engines, runner, setups, store, trials
 from skysim.experiments.study.execution.engines import Engine
+from tests.helpers.clusters import ENVIRONMENT, STUDY, Cluster, cluster_of, dask, on_dask, study
+from tests.helpers.study_stores import contents, done
 
-ROOT = Path(__file__).resolve().parents[3]
-STUDY = """
-schema: 1
-title: strays
-scene: shefex2
-seed: 1
-set: {light.limit_mag: 5.0}
-trial: {kind: centroids, lights: 15}
-factors: {strays: {key: trial.false_lights, values: [0, 5]}}
-replicates: 150
-paired: false
-responses: [identified]
-budget: {failures: 1000}
-"""
 # What `python -c` runs in a process of its own: a study on a pool, begun or gone on with, that tells how far it is.
 DRIVER = """
 import sys
@@ -53,18 +40,6 @@ with store.writing(Path(sys.argv[2])) as kept:
     runner.prepare_store(told, kept, kept.counts()["done"] > 0)
     runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
-ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
-ENVIRONMENT = (
-    os.environ
-    | ONE_THREAD
-    | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
-)
-
-
-def study(folder: Path, text: str = STUDY) -> plan.Plan:
-    path = folder / "strays.yaml"
-    path.write_text(text)
-    return study_file.load(path)
 
 
 @pytest.fixture(scope="module")
@@ -325,63 +300,9 @@ def test_memory_stays_flat_over_many_trials(
 # A Dask cluster.
 
 
-class Cluster(NamedTuple):
-    """A scheduler and its workers on loopback."""
-
-    address: str
-    workers: list[subprocess.Popen[bytes]]
-
-
-def cluster_of(
-    folder: Path, *worker: str, count: int = 1, environment: dict[str, str] | None = None
-) -> Iterator[Cluster]:
-    """A real scheduler and `count` real worker processes; all end with the test."""
-    pytest.importorskip("distributed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
-    everyone = ["--host", "127.0.0.1", "--no-dashboard"]
-    dask = [sys.executable, "-m"]
-    commands = [[*dask, "distributed.cli.dask_scheduler", "--port", str(port), *everyone]]
-    plan_ = [*dask, "distributed.cli.dask_worker", address, *everyone, "--nthreads", "1", *worker]
-    commands += [[*plan_, "--local-directory", str(folder)]] * count
-    with (folder / "log").open("wb") as log:
-        processes = [
-            subprocess.Popen(one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log)
-            for one in commands
-        ]
-        try:
-            yield Cluster(address, processes[1:])
-        finally:
-            for process in reversed(processes):
-                for one in (
-                    psutil.Process(process.pid).children(recursive=True)
-                    if process.poll() is None
-                    else ()
-                ):
-                    one.kill()
-                process.kill()
-                process.wait(10)
-
-
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     yield from cluster_of(tmp_path_factory.mktemp("dask"), "--no-nanny", count=2)
-
-
-def dask(address: str) -> Any:
-    """The engine; its module takes the extra `dask`."""
-    from skysim.experiments.study.execution.dask_engine import Dask
-
-    return Dask(address)
-
-
-def on_dask(cluster: Cluster, workers: int) -> Any:
-    """The engine, once so many workers are there."""
-    engine = dask(cluster.address)
-    engine.client.wait_for_workers(workers, 20)
-    return engine
 
 
 def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
@@ -509,7 +430,7 @@ def test_a_trial_that_kills_dask_workers_fails_and_no_other(
     plan_: plan.Plan, tmp_path: Path, stubs: Any
 ) -> None:
     bad = deaths(plan_)
-    found = os.pathsep.join([str(ROOT), str(Path(__file__).parent), str(tmp_path)])
+    found = os.pathsep.join([str(ROOT), str(tmp_path)])
     dask = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "PYTHONPATH": found}
     for cluster in cluster_of(tmp_path, "--nworkers", "2", environment=dask):
         engine = on_dask(cluster, 2)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from study_stores import done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import plan, study_file, table
 from skysim.experiments.study.execution import runner, setups, store
+from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {
     "schema": 1,

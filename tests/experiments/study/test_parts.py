@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import plan, study_file, table, worst
@@ -26,6 +25,7 @@ from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.report import study_export
 from skysim.results.files import row_parts
+from tests.helpers.study_stores import STRAYS, done
 
 pytest.importorskip("pyarrow")
 POINTS = 3

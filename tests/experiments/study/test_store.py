@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from study_stores import STRAYS, contents, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import plan, study_file
@@ -26,6 +25,7 @@ from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
+from tests.helpers.study_stores import STRAYS, contents, done
 
 
 @pytest.fixture(scope="module")

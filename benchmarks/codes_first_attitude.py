@@ -1,18 +1,19 @@
 """Time to the first attitude under blinking LEDs: by the vehicle's rate, the length of the code and the number of LEDs.
 
-`python -m benchmarks.first_attitude [SEQUENCES [FIGURE]]` prints a table and draws docs/images/first_attitude.svg from
-the sequences of `benchmarks.codes`.
+From the sequences of `codes_attitudes`. The figure of docs/explanation/coded_light.md is drawn in out/benchmarks.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from benchmarks.codes import Bench
+from benchmarks.codes_attitudes import Bench
+from benchmarks.timing import figure as figure_row
+from skysim.core.files import ROOT, make_folder
 
 SEQUENCES = 60
 CODES = {
@@ -27,7 +28,7 @@ COUNTS = (200, 400, 800)
 # where the other one is varied
 COUNT = 400
 RATE_DEG_S = 5.0
-IMAGE = Path(__file__).parents[1] / "docs/images/first_attitude.svg"
+IMAGE = ROOT / "out/benchmarks/first_attitude.svg"
 
 
 @dataclass(frozen=True)
@@ -104,16 +105,17 @@ def draw(every: list[Result], path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def main(sequences: int = SEQUENCES, path: Path = IMAGE) -> None:
-    every = results(sequences)
-    print("| code | LEDs | deg/s | median | 95 % | found |\n|---|---|---|---|---|---|")
+def measure(count: int = SEQUENCES) -> list[dict[str, Any]]:
+    """Median and 95 % of the time to the first attitude of all cases, `count` sequences each; draws IMAGE."""
+    every = results(count)
+    make_folder(IMAGE.parent)
+    draw(every, IMAGE)
+    rows = []
     for one in every:
-        most = "-" if np.isinf(one.most_s) else f"{1e3 * one.most_s:.0f} ms"
-        print(
-            f"| {one.code} | {one.leds} | {one.rate_deg_s:g} | {1e3 * one.median_s:.0f} ms | {most} | {one.found:.1%} |"
-        )
-    draw(every, path)
-
-
-if __name__ == "__main__":
-    main(*(kind(word) for kind, word in zip((int, Path), sys.argv[1:], strict=False)))
+        name = f"{one.code}, {one.leds} LEDs, {one.rate_deg_s:g} deg/s"
+        rows += [
+            figure_row(f"{name}: first attitude, median", 1e3 * one.median_s, "ms"),
+            figure_row(f"{name}: first attitude, 95 %", 1e3 * one.most_s, "ms"),
+            figure_row(f"{name}: found within the code", 100 * one.found, "%"),
+        ]
+    return rows

@@ -1,13 +1,12 @@
-"""Attitude error of six near-field methods under five surfaces.
+"""Trials of six near-field methods under five surfaces.
 
-`python -m benchmarks.nearfield_table` prints the table of the docs. The lights are at intersections of random rays
+The lights are at intersections of random rays
 with the true surface. The methods receive the true positions of the lights, and a centered sphere as the assumed
 surface of the dome.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,30 +125,3 @@ def cross_and_roll(errors: NDArray[np.float64]) -> tuple[float, float]:
     """RMS cross-boresight error, sqrt(mean(x^2 + y^2)), and RMS roll error."""
     square = np.mean(errors**2, axis=0)
     return float(np.sqrt(square[0] + square[1])), float(np.sqrt(square[2]))
-
-
-def table(trials: int, seed: int) -> None:
-    """Print RMS cross (roll) in degrees: methods and tilts in rows, surfaces in columns, without noise and with."""
-    for noise_px in (0.0, NOISE_PX):
-        print(f"\n{noise_px} px of noise, {trials} trials a cell: rms cross (roll), degrees\n")
-        print("| method, tilt | " + " | ".join(GEOMETRIES) + " |")
-        print("|---" * (len(GEOMETRIES) + 1) + "|")
-        for method in SOLVERS:
-            for n in range(4):
-                tilts = sorted({geometry.tilts_deg[n] for geometry in GEOMETRIES.values()})
-                cells = [
-                    cross_and_roll(
-                        errors_deg(method, geometry, geometry.tilts_deg[n], trials, seed, noise_px)
-                    )
-                    for geometry in GEOMETRIES.values()
-                ]
-                name = f"{method}, {' / NPS '.join(f'{tilt:g}' for tilt in reversed(tilts))}"
-                print(
-                    f"| {name} | "
-                    + " | ".join(f"{cross:.2g} ({roll:.2g})" for cross, roll in cells)
-                    + " |"
-                )
-
-
-if __name__ == "__main__":
-    table(*(int(argument) for argument in sys.argv[1:3] or ("500", "1")))

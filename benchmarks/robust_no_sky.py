@@ -1,14 +1,13 @@
 """False-alarm rate: how often the tracker answers frames that do not show the sky, or hardly.
 
-`python -m benchmarks.false_frames [FRAMES] [SEED] [KIND ...]`, with the cameras of `lost_in_space`, prints the number
-of answers and of wrong ones for three kinds of frames, or for those named:
+Answers and wrong ones for three kinds of frames, with the cameras of `lost_in_space`:
 
-    no star   : 3 to 30 lights at uniform random positions, with magnitudes of the catalog; FRAMES of them
-    mirrored  : a workload's field with its columns reversed, which no rotation of the sky gives; FRAMES / 10
-    few stars : 3 to 5 stars of a field among 30 false lights; FRAMES / 10. An answer is right if it is within 10' of
-        the truth, or of what the true identities of the stars give: three stars side by side hardly tell the roll
+    no star   : 3 to 30 lights at uniform random positions, with magnitudes of the catalog
+    mirrored  : a workload's field with its columns reversed, which no rotation of the sky gives; a tenth as many
+    few stars : 3 to 5 stars of a field among 30 false lights; a tenth as many. An answer is right if it is within 10'
+        of the truth, or of what the true identities of the stars give: three stars side by side hardly tell the roll
 
-The counts so far are printed after every thousand frames, so that a run in the background can be read at any time.
+The counts so far are printed to stderr after every thousand frames, so that a run in the background can be read.
 """
 
 from __future__ import annotations
@@ -19,11 +18,13 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.lost_in_space import WORKLOADS, Field, Workload, field, oracle, sky
+from benchmarks.timing import figure, verdict
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
@@ -33,9 +34,9 @@ from skysim.results.metrics import WRONG_RAD
 LIGHTS = (3, 30)
 FALSE_LIGHTS = 30
 STARS = (3, 5)
-# frames between two lines of the counts so far
+FRAMES = 100_000
 PROCESSES = 2
-BATCH = 1000
+BATCH = 1000  # frames between two lines of the counts so far
 Frame = tuple[Centroids, tuple[Rotation, ...]]  # with the right answers
 
 
@@ -118,39 +119,40 @@ def count_answers(kind: str, first: int, count: int, seed: int) -> dict[str, lis
         row = out[f"{work.name} ({work.focal_uncertainty:g})"]
         row[:] = [a + b for a, b in zip(row, found, strict=True)]
         if found[2]:
-            print(f"{kind}: wrong answer in frame {n} of seed {seed}, {work.name}", flush=True)
+            told = f"{kind}: wrong answer in frame {n} of seed {seed}, {work.name}"
+            print(told, file=sys.stderr, flush=True)
     return out
 
 
-def run(count: int, seed: int, kinds: list[str]) -> None:
-    """Count some kinds in PROCESSES processes, and print the counts so far after every BATCH frames."""
+def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
+    """Answers and wrong answers of each kind of frames by workload, counted in PROCESSES processes."""
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
-        for kind in kinds:
-            share = KINDS[kind][1]
-            frames = round(share * count)
-            rows = {}
-            begin = time.perf_counter()
-            firsts = range(0, frames, BATCH)
-            sizes = [min(BATCH, frames - first) for first in firsts]
-            batches = pool.map(
-                count_answers, [kind] * len(sizes), firsts, sizes, [seed] * len(sizes)
-            )
-            for batch in batches:
-                rows = {name: np.add(rows.get(name, 0), row) for name, row in batch.items()}
-                done, answers, wrong = np.sum(list(rows.values()), axis=0)
-                speed = done / (time.perf_counter() - begin)
-                print(
-                    f"{kind:10s} seed {seed}: {done:7d} of {frames} frames, {answers} answered, {wrong} wrong,"
-                    f" {done - answers} refused; {speed:.0f} frames/s",
-                    flush=True,
-                )
-            for name, (done, answers, wrong) in rows.items():
-                print(
-                    f"{kind:10s} {name:43s} {done:7d} frames, {answers} answered, {wrong} wrong",
-                    flush=True,
-                )
+        return [row for kind in KINDS for row in measure_kind(kind, count, seed, pool)]
 
 
-if __name__ == "__main__":
-    numbers = sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :]
-    run(int(numbers[0]), int(numbers[1]), sys.argv[3:] or list(KINDS))
+def measure_kind(
+    kind: str, count: int, seed: int, pool: ProcessPoolExecutor
+) -> list[dict[str, Any]]:
+    """The rows of one kind. No frame without a sky may be answered; an answer to few stars may be right."""
+    frames = max(round(KINDS[kind][1] * count), 1)
+    firsts = range(0, frames, BATCH)
+    sizes = [min(BATCH, frames - first) for first in firsts]
+    total: dict[str, Any] = {}
+    begin = time.perf_counter()
+    batches = pool.map(count_answers, [kind] * len(sizes), firsts, sizes, [seed] * len(sizes))
+    for batch in batches:
+        total = {name: np.add(total.get(name, 0), row) for name, row in batch.items()}
+        done, answers, wrong = np.sum(list(total.values()), axis=0)
+        speed = done / (time.perf_counter() - begin)
+        progress = (
+            f"{done} of {frames} frames, {answers} answered, {wrong} wrong; {speed:.0f} frames/s"
+        )
+        print(f"{kind}: {progress}", file=sys.stderr, flush=True)
+    rows = []
+    for name, (done, answers, wrong) in total.items():
+        what = f"{done} frames"
+        rows += [
+            figure(f"{kind}, {name}: answered", answers, "frames", what),
+            verdict(f"{kind}, {name}: wrong", int(wrong), "frames", what, 0),
+        ]
+    return rows

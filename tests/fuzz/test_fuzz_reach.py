@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from fuzz.__main__ import NAMES, seeds
-from fuzz.targets import TARGETS
 from skysim.core.files import ROOT
+from tests.fuzz.__main__ import NAMES, seeds
+from tests.fuzz.targets import TARGETS
 
 SEEDS = 12  # of each target: its readers are reached by any
 READER = re.compile(

@@ -1,7 +1,7 @@
 """Studies of millions of rows: time, CPU and memory of `skysim study report` and `skysim study export`.
 
-`python -m benchmarks.big_store [ROWS [POINTS]]`, by default 10 million rows of 10 points. They are drawn, not
-simulated: a tracker with errors of arcseconds that refuses 1 % of the attitudes and is wrong in one of a million.
+The rows, 10 million of 10 points, are drawn, not simulated: a tracker with errors of arcseconds that refuses 1 % of the
+attitudes and is wrong in one of a million.
 """
 
 from __future__ import annotations
@@ -129,7 +129,12 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def measure(rows: int = ROWS, points: int = POINTS) -> Iterator[dict[str, Any]]:
+def measure(count: int = ROWS) -> list[dict[str, Any]]:
+    """Size of a row, time and memory of the commands, for a store of `count` rows."""
+    return list(results(count, POINTS))
+
+
+def results(rows: int, points: int) -> Iterator[dict[str, Any]]:
     """All results, as they come."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -172,12 +177,3 @@ def timed(
         most_s,
     )
     yield verdict(f"study {command}: memory", 1024 * used.ru_maxrss / 1e6, "MB", what, most / 1e6)
-
-
-if __name__ == "__main__":
-    for one in measure(*map(int, sys.argv[1:])):
-        load = os.getloadavg()[0]
-        text = (
-            f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
-        )
-        print(f"{one['name']}: {text}", flush=True)

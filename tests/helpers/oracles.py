@@ -1,10 +1,10 @@
 """Sky frames rendered by skysim, solved by independent solvers ("oracles").
 
-`python -m benchmarks.oracles [FRAMES] [SEED]`. Frames at random attitudes go to tetra3rs and to astrometry.net as FITS
+Frames at random attitudes go to tetra3rs and to astrometry.net as FITS
 files, with only the field of view (tetra3rs: the camera calibration) given. Each detects the stars with its own code
 and identifies them with its own catalog. Its world coordinates (WCS), and separately its identified stars, are
 compared with the WCS in the frame's header, and the difference with the error predicted from the oracle's own
-residuals. `benchmarks.galsim_sky` tests the opposite direction.
+residuals. `tests.helpers.galsim_sky` has the opposite direction.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import subprocess
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +29,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.core.constants import ARCSEC_RAD, SPEED_OF_LIGHT_KM_S
+from skysim.core.constants import SPEED_OF_LIGHT_KM_S
 from skysim.core.types import Frame, Truth
 from skysim.results.files import recording as frame_files
 from skysim.results.metrics import WRONG_RAD
@@ -413,34 +412,3 @@ def squares(solved: Sequence[Agreement]) -> NDArray:
         (one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad) for one in solved
     ]
     return np.asarray(np.mean(np.square(ratio), axis=0))
-
-
-def line(label: str, frames: int, solved: Sequence[Agreement]) -> str:
-    """A row of the table; medians and worst errors are in arcseconds."""
-    cross = np.array([one.cross_rad for one in solved]) / ARCSEC_RAD
-    roll = np.abs([one.roll_rad for one in solved]) / ARCSEC_RAD
-    over = squares(solved)
-    return (
-        f"{label:42s} {frames:6d} {len(solved):6d} {sum(one.within for one in solved):9d}"
-        f" {np.median(cross):8.2f} {cross.max():8.2f} {np.median(roll):8.1f} {roll.max():8.1f}"
-        f" {over[0]:7.2f} {over[1]:7.2f} {sum(one.wrong for one in solved):6d}"
-    )
-
-
-HEAD = (
-    f"{'':42s} {'frames':>6s} {'solved':>6s} {'within 3x':>9s} {'cross':>8s} {'worst':>8s} {'roll':>8s}"
-    f" {'worst':>8s} {'cross²':>7s} {'roll²':>7s} {'wrong':>6s}"
-)
-
-if __name__ == "__main__":
-    count, first = (int(one) for one in (sys.argv[1:3] + ["200", "1"][len(sys.argv[1:3]) :]))
-    print(HEAD)
-    for scene_name in SCENES:
-        for who, build_oracle in ORACLES.items():
-            solve_with_oracle = build_oracle(scene_name)
-            if solve_with_oracle is None:
-                print(f"{who}: not installed")
-                continue
-            both = zip(*confront(scene_name, who, solve_with_oracle, count, first), strict=True)
-            for what, pairs in zip(("its coordinates", "its stars"), both, strict=True):
-                print(line(f"{who}, {scene_name}, {what}", count, pairs), flush=True)

@@ -1,6 +1,6 @@
 """Tests of one mutant at a time, in processes forked from one that has imported and collected all tests.
 
-A server of benchmarks/mutants.py: a pytest plugin. In `record` it runs all tests once and notes which functions each of
+A pytest plugin of `tests.mutants`. In `record` it runs all tests once and notes which functions each of
 them enters; in `serve` it forks a process for each mutant, in which the functions have the changed code.
 """
 

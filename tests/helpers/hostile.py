@@ -1,6 +1,6 @@
-"""Robustness of `skysim solve` against adversarial and malformed images.
+"""Adversarial and malformed images for `skysim solve`, and what it may answer.
 
-`python -m benchmarks.hostile [COUNT] [SEED]`. Each input is a file: noise, stripes, text, repeating lights, mirrored
+Each input is a file: noise, stripes, text, repeating lights, mirrored
 skies, false headers, or bytes that are not an image. None may be solved, except images that contain (parts of) a true
 sky, which may be solved with the attitude of any of these. No input may raise an exception, take more than 2 s of
 processor time per megapixel (at least one megapixel is counted), or use more memory than ten decoded frames plus 64
@@ -9,7 +9,6 @@ MiB. For most inputs the camera or the field of view is given; one in 400 is sea
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -22,8 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.frames import LIEBE_E, CameraSetup, paint, render
-from benchmarks.hostilefiles import encoded, promise
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.trackers.star_tracker import CORNERS
@@ -33,6 +30,8 @@ from skysim.core.files import CATALOGS, SCENES
 from skysim.core.images import IMAGE_SUFFIXES
 from skysim.results.metrics import WRONG_RAD
 from skysim.sources import stars as star_sources
+from tests.helpers.drawn_frames import LIEBE_E, CameraSetup, paint, render
+from tests.helpers.hostile_files import encoded, promise
 
 LIMIT_S_PER_MPX = 2.0
 MEMORY_FRAMES = 10
@@ -456,22 +455,3 @@ def defects(case: HostileInput, answer: dict, seconds: float, memory_bytes: floa
         yield f"SLOW {seconds:.1f} s, prior {answer['prior']}"
     if memory_bytes > MEMORY_FRAMES * held:
         yield f"MEMORY {memory_bytes / 2**20:.0f} MiB beyond the first {MEMORY_FLOOR >> 20}"
-
-
-if __name__ == "__main__":
-    count, seed = (int(one) for one in (sys.argv[1:3] + ["10000", "1"][len(sys.argv[1:3]) :]))
-    begin = time.perf_counter()
-    results = judged(count, seed, quiet=False)
-    print(
-        f"{'':14s} {'pictures':>8s} {'a true sky':>10s} {'defects':>8s} {'worst s':>8s} {'frames':>7s}"
-    )
-    for name, one in results.items():
-        print(
-            f"{name:14s} {one.looked:8d} {one.right:10d} {len(one.defects):8d}"
-            f" {one.worst_s:8.2f} {one.most_frames:7.1f}"
-        )
-        print(
-            *(f"    {line}" for line in one.defects[:20]), sep="\n", end="\n" if one.defects else ""
-        )
-    looked = sum(one.looked for one in results.values())
-    print(f"{looked} pictures, {(time.perf_counter() - begin) / looked:.3f} s each")

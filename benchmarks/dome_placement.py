@@ -1,21 +1,20 @@
 """LED layouts compared at independent attitudes: patch boards, Fibonacci spiral, Poisson disk and optimized layout.
 
-`python -m benchmarks.placement [LEDS [FRAMES [SEED]]]` prints the table of docs/findings/dome.md: AFIT's SimSat under
-its measured dome with the scene's camera and lever arm, LEDS equal LEDs over the cap that any field within 30 degrees
-of tilt can reach, and FRAMES frames for the tracker. `compare` returns its rows.
+The last table of docs/findings/dome.md: AFIT's SimSat under its measured dome with the scene's camera and lever arm,
+LEDS equal LEDs over the cap that any field within 30 degrees of tilt can reach.
 """
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.dome_identify import TILT_DEG, Case, trial
+from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.identification.led_index import build_dome_index
@@ -34,7 +33,8 @@ from skysim.tracking.onboard_model import calibration
 Ints = NDArray[np.int64]
 
 TEST_ATTITUDES = 100_000  # number of test attitudes
-DEFAULTS = (400, 1000, 1)  # default arguments: LEDs, frames for the tracker, seed
+LEDS = 400
+FRAMES = 1000  # for the tracker
 NOISE_PX = 0.1  # centroid noise for the predicted sigmas
 TAIL = 0.01  # fraction of the attitudes, the worst, that is averaged
 MAX_OVERLAP = 0.5  # overlap above which two neighborhoods count as alike
@@ -211,36 +211,29 @@ def row(setup: Setup, kind: str, count: int, seed: int, frames: int) -> Row:
     )
 
 
-def compare(count: int, frames: int, seed: int) -> Iterator[Row]:
-    """Yield the results for every kind of layout with `count` LEDs."""
+def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
+    """The results of every kind of layout with LEDS LEDs, with `count` frames for the tracker."""
     setup = build_setup()
-    yield from (row(setup, kind, count, seed, frames) for kind in KINDS)
+    return [one for kind in KINDS for one in rows_of(row(setup, kind, LEDS, seed, count), count)]
 
 
-def format_row(one: Row) -> str:
-    """A row of the table in the docs."""
-    arcsec = [
-        "—" if np.isinf(value) else f"{value:.3g}" for value in one.roll_arcsec + one.cross_arcsec
+def rows_of(one: Row, frames: int) -> list[dict[str, Any]]:
+    """The rows of one layout. Sigmas are infinite if an attitude sees fewer than two LEDs."""
+    what = f"{one.count} LEDs"
+    tracked = f"{frames} frames"
+    name = one.layout
+    parts = ("median", f"worst {TAIL:.0%}", "worst")
+    return [
+        figure(f"{name}: LEDs seen, mean", one.seen[0], "", what),
+        figure(f"{name}: LEDs seen, least", one.seen[1], "", what),
+        *(
+            figure(f"{name}: {axis}, {part}", sigma, "arcsec", what)
+            for axis, sigmas in (("roll", one.roll_arcsec), ("cross", one.cross_arcsec))
+            for part, sigma in zip(parts, sigmas, strict=True)
+        ),
+        figure(f"{name}: fields alike", 100 * one.alike, "%", what),
+        figure(f"{name}: ambiguous", 100 * one.ambiguous, "%", tracked),
+        figure(f"{name}: identified", 100 * one.found, "%", tracked),
+        verdict(f"{name}: wrong", one.wrong, "frames", tracked, 0),
+        figure(f"{name}: made in", one.layout_s, "s of CPU", what),
     ]
-    cells = [
-        f"{one.count:,} {one.layout}",
-        f"{one.seen[0]:.1f} ({one.seen[1]})",
-        ", ".join(arcsec[:3]),
-        ", ".join(arcsec[3:]),
-        f"{100 * one.alike:.1f} %",
-        f"{100 * one.ambiguous:.1f} %",
-        f"{100 * one.found:.1f} %",
-        f"{one.wrong}",
-        f"{one.layout_s:.1f} s",
-    ]
-    return f"| {' | '.join(cells)} |"
-
-
-if __name__ == "__main__":
-    print(
-        "| LEDs | seen (min) | roll: median, worst 1 %, worst | cross | alike | ambiguous | found | wrong | made |"
-    )
-    print("|---" * 9 + "|")
-    arguments = [int(word) for word in sys.argv[1:]]
-    for one in compare(*arguments, *DEFAULTS[len(arguments) :]):
-        print(format_row(one), flush=True)

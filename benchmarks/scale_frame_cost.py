@@ -1,6 +1,6 @@
 """What a labelled frame costs in CPU and bytes: a linear model, fitted, and tested on frames that it has not seen.
 
-`python -m benchmarks.cost_model`. seconds = a + b pixels + c sources, and the same for bytes: a is the work of Python
+seconds = a + b pixels + c sources, and the same for bytes: a is the work of Python
 for any frame, b that of noise, detection and files, c that of projection, drawing and labels. The fit is relative, by
 least squares, so that small frames count as much as large ones. docs/explanation/scale.md uses it.
 """
@@ -10,11 +10,12 @@ from __future__ import annotations
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.scale import CMOS
+from benchmarks.scale_rates import CMOS
+from benchmarks.timing import figure
 from skysim.core.types import Floats
 from skysim.experiments import dataset_run
 from skysim.experiments.dataset_shards import Storage
@@ -47,7 +48,7 @@ class Cost(NamedTuple):
         return np.array([1.0, self.width_px * self.height_px / 1e6, self.sources])
 
 
-def measure(width_px: int, height_px: int, limit_mag: float) -> Cost:
+def cost_of(width_px: int, height_px: int, limit_mag: float) -> Cost:
     """CPU seconds, bytes and sources a frame, written to a local folder by one process."""
     keys = {
         "camera.width_px": f"{width_px}",
@@ -78,23 +79,31 @@ def fit(costs: list[Cost], name: str) -> Floats:
     return np.asarray(np.linalg.lstsq(terms / values[:, None], np.ones(len(costs)), rcond=None)[0])
 
 
-def main() -> None:
-    """Print measurements, the model, and its errors on what it has not seen."""
-    seen = [measure(*one) for one in SEEN]
+def measure() -> list[dict[str, Any]]:
+    """The model's coefficients, what each size costs, and the model's errors, also on what it has not seen."""
+    seen = [cost_of(*one) for one in SEEN]
     models = {name: fit(seen, name) for name in ("seconds", "bytes_")}
-    for name, (a, b, c) in models.items():
-        print(f"{name.strip('_')} a frame = {a:.4g} + {b:.4g} Mpx + {c:.4g} sources")
-    for what, costs in (("seen", seen), ("unseen", [measure(*one) for one in UNSEEN])):
-        for one in costs:
-            errors = [
-                model @ one.terms() / getattr(one, name) - 1 for name, model in models.items()
-            ]
-            size = f"{one.width_px}x{one.height_px}, V {one.limit_mag}"
-            cost = f"{1e3 * one.seconds:.2f} ms, {one.bytes_ / 1e6:.3f} MB"
-            print(
-                f"{what:7s}{size:20s}{one.sources:6.0f} sources  {cost}; errors {errors[0]:+.1%}, {errors[1]:+.1%}"
+    rows = []
+    for name, coefficients in models.items():
+        for term, value in zip(("any frame", "a Mpx", "a source"), coefficients, strict=True):
+            rows.append(
+                figure(f"{name.strip('_')} of {term}", value, "s" if name == "seconds" else "B")
             )
-
-
-if __name__ == "__main__":
-    main()
+    for what, costs in (("seen", seen), ("unseen", [cost_of(*one) for one in UNSEEN])):
+        for one in costs:
+            size = f"{what}, {one.width_px} x {one.height_px}, V {one.limit_mag}"
+            sources = f"{one.sources:.0f} sources"
+            rows += [
+                figure(f"{size}: CPU", 1e3 * one.seconds, "ms", sources),
+                figure(f"{size}: size", one.bytes_ / 1e6, "MB", sources),
+                *(
+                    figure(
+                        f"{size}: error of the model's {name.strip('_')}",
+                        100 * (model @ one.terms() / getattr(one, name) - 1),
+                        "%",
+                        sources,
+                    )
+                    for name, model in models.items()
+                ),
+            ]
+    return rows

@@ -1,7 +1,7 @@
 """Throughput from one frame to many: labelled frames in shards, centroid trials in the store, closed loops, clusters.
 
-`python -m benchmarks scale`, on a quiet machine with two cores. Rates are those of the clock; the costs of a frame's
-parts and of a trial are seconds of CPU, which other load lengthens less. docs/explanation/scale.md uses them.
+For a quiet machine with two cores. Rates are those of the clock; the costs of a frame's parts and of a trial are
+seconds of CPU, which other load lengthens less. docs/explanation/scale.md uses them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,14 @@ import mujoco
 import numpy as np
 import yaml
 
-from benchmarks import coordination
-from benchmarks.studies import CENTROIDS, run_study
-from benchmarks.timing import verdict, versus
+from benchmarks import scale_coordination as coordination
+from benchmarks.timing import figure, verdict, versus
 from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
 from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import engines, trials
+from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
 from skysim.simulation.flight import Flight
@@ -47,6 +47,22 @@ CMOS = SIZE | {
 FRAMES = 640
 PER_SHARD = 16
 PARTS = 64  # frames of which the parts are timed
+STUDY = """
+schema: 1
+title: how fast studies are
+scene: shefex2
+seed: 1
+trial: {trial}
+factors: {{{factor}}}
+replicates: {replicates}
+responses: [identified]
+"""
+CENTROIDS = {
+    "trial": "{kind: centroids, noise_px: 0.1, lights: 15}",
+    "factor": "strays: {key: trial.false_lights, values: [0, 5]}",
+    "replicates": 5000,
+}
+WARM_UP = 0.2  # fraction of the trials after which every worker has its scene and full chunks
 DASK_S = 1.0
 DASK_CHUNKS = 12
 
@@ -61,13 +77,7 @@ def measure() -> list[dict[str, Any]]:
         *closed_loop(),
         *worker_cost(),
         dask_overhead(),
-        *coordination.measure(),
     ]
-
-
-def figure(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
-    """A result without a bar."""
-    return verdict(name, value, unit, what, 0.0) | {"bar": None, "met": None}
 
 
 # Labelled frames.
@@ -199,6 +209,61 @@ def by_tarfile(kept: list[tuple[int, LabelledFrame]]) -> None:
 
 
 # Trials, motion, clusters.
+
+
+class TimedPool:
+    """A pool that records each batch. batches : (arrival time, number of trials, seconds spent in trials) by batch."""
+
+    def __init__(self, pool: engines.Pool) -> None:
+        self.pool = pool
+        self.name = pool.name
+        self.workers = pool.workers
+        self.batches: list[tuple[float, int, float]] = []
+
+    def run(self, job: engines.Job, chunks: engines.Chunks) -> Iterator[list[trials.Row]]:
+        """See `engines.Engine`."""
+        for rows in self.pool.run(job, chunks):
+            self.batches.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
+            yield rows
+
+
+@dataclass(frozen=True)
+class StudyTime:
+    """Time of a study.
+
+    total_s     : from loading the file to closing the store, including start and end of the processes
+    rate        : trials per second after the first WARM_UP of them
+    overhead_ms : worker time per trial that was not spent in the trial itself
+    """
+
+    total_s: float
+    rate: float
+    overhead_ms: float
+
+
+def run_study(settings: dict[str, Any], workers: int) -> StudyTime:
+    """Run a study with a pool in a temporary folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "study.yaml"
+        path.write_text(STUDY.format(**settings))
+        pool = TimedPool(engines.Pool(workers))
+        begin = time.perf_counter()
+        study = study_loader.load(path)
+        with store.writing(path.with_suffix(".sqlite")) as database:
+            runner.prepare_store(study, database, False)
+            progress = runner.run(study, database, pool)
+        total_s = time.perf_counter() - begin
+    if (progress.done, progress.failed) != (study.trials, 0):
+        raise RuntimeError(
+            f"{progress.done} of {study.trials} trials are in, {progress.failed} of them failed"
+        )
+    when_s, count, worked_s = np.array(pool.batches).T
+    late = np.cumsum(count) > WARM_UP * study.trials
+    first = int(np.argmax(late))  # the timed window starts at its end
+    window_s = when_s[-1] - when_s[first]
+    done = count[first + 1 :].sum()
+    beside_s = workers * window_s - worked_s[first + 1 :].sum()
+    return StudyTime(total_s, done / window_s, 1e3 * beside_s / done)
 
 
 def centroids() -> list[dict[str, Any]]:

@@ -97,11 +97,11 @@ def lab_of(case: Case, depth: float) -> Lab:
     )
 
 
-def measure(frames: int = FRAMES) -> list[dict[str, Any]]:
-    """One row a case: the bit error rate, theory's, their ratio and whether they agree to MAX_OFF."""
+def measure(count: int = FRAMES) -> list[dict[str, Any]]:
+    """One row a case: the bit error rate of `count` frames, theory's, their ratio and whether they agree to MAX_OFF."""
     rows = []
     for case in CASES:
-        measured, theory = bit_error_rate(case, frames)
+        measured, theory = bit_error_rate(case, count)
         ratio = measured / theory
         rows.append(
             {
@@ -228,8 +228,3 @@ def theory(lab: Lab, full_e: Floats, noise_e2: float, changes: float) -> float:
         return fails(np.zeros(1))
     mixed = changes * exposure_s / code.bit_time_s
     return mixed * fails((np.arange(100) + 0.5) / 200) + (1 - mixed) * fails(np.zeros(1))
-
-
-if __name__ == "__main__":
-    for row in measure():
-        print(row)

@@ -1,14 +1,12 @@
-"""LEDs that blink their names: attitudes found and wrong, bit errors against theory, frames to the first attitude.
+"""LEDs that blink their names: attitudes found, and wrong ones.
 
 Centroids of scene coded_spiral, 400 LEDs on a spiral, at random attitudes within 30 degrees of tilt, at rest or turning
 at a constant rate about a random axis. A light's position and brightness have the errors of `Noise`. Some sequences are
 rendered too, and other codes, levels and clocks are tried.
-`python -m benchmarks.codes [ATTITUDES [RENDERED [VARIANTS]]]` prints the rows.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import bit_errors
 from benchmarks.dome_identify import attitude
 from benchmarks.timing import verdict
 from estimator.attitude.dome_map import project
@@ -201,15 +198,12 @@ VARIANTS = {
 MOST_FRAMES = 40  # of a variant's sequence: a De Bruijn word is much longer
 
 
-def measure(
-    attitudes: int = ATTITUDES, rendered: int = RENDERED, variants: int = ATTITUDES // 20
-) -> list[dict[str, Any]]:
-    """All rows; bit errors against theory in benchmarks/bit_errors.py."""
-    rows = (
-        identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
-    )
+def measure(count: int = ATTITUDES) -> list[dict[str, Any]]:
+    """`count` attitudes from centroids, RENDERED of a full run from frames, and a twentieth for each variant."""
+    rendered = max(round(count * RENDERED / ATTITUDES), 2)
+    rows = identified("centroids", count) + identified("rendered", rendered)
     for name, settings in VARIANTS.items():
-        rows += identified("centroids", variants, name, settings)
+        rows += identified("centroids", max(count // 20, 2), name, settings)
     return rows
 
 
@@ -238,7 +232,3 @@ def identified(
             verdict(f"{name}: wrong", wrong, "attitudes", f"{attitudes} attitudes", 0),
         ]
     return rows
-
-
-if __name__ == "__main__":
-    print(*measure(*(int(word) for word in sys.argv[1:])), sep="\n")

@@ -1,9 +1,9 @@
-"""`python -m fuzz SECONDS [TARGET ...] [--plain]`: fuzz the targets, each for an equal share of the time.
+"""`python -m tests.fuzz SECONDS [TARGET ...] [--plain]`: fuzz the targets, each for an equal share of the time.
 
 Exit code 1 if there is a finding. Fuzzing is guided by coverage (atheris, libFuzzer) if atheris is installed;
-otherwise, or with --plain, the corpus is only mutated at random. Seeds are fuzz/corpus/, files that skysim ships, and
-(guided) the inputs that earlier runs have added in out/fuzz/. Findings are kept in out/fuzz/; after the bug is fixed,
-the file goes into fuzz/corpus/, which the tests read too.
+otherwise, or with --plain, the corpus is only mutated at random. Seeds are tests/fuzz/corpus/, files that skysim
+ships, and (guided) the inputs that earlier runs have added in out/fuzz/. Findings are kept in out/fuzz/; after the bug
+is fixed, the file goes into tests/fuzz/corpus/, which the tests read too.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 from random import Random
 from types import FunctionType, ModuleType
 
-FOLDER = Path(__file__).parent
-CORPUS = FOLDER / "corpus"
-OUT = FOLDER.parent / "out" / "fuzz"
+ROOT = Path(__file__).resolve().parents[2]
+CORPUS = Path(__file__).parent / "corpus"
+OUT = ROOT / "out" / "fuzz"
 TIME_LIMIT_S = 10
 MEMORY_LIMIT_MB = 3000
 # Targets, and the shipped files that are seeds of each.
@@ -72,7 +72,7 @@ TOKENS = (
 
 def shipped_files(name: str) -> list[Path]:
     """Shipped files that are seeds of a target."""
-    return [path for glob in TARGETS[name] for path in sorted(FOLDER.parent.glob(glob))]
+    return [path for glob in TARGETS[name] for path in sorted(ROOT.glob(glob))]
 
 
 def seeds(name: str) -> list[bytes]:
@@ -89,7 +89,7 @@ def write_dictionary(name: str) -> Path:
     )
     texts = [
         *seeds(name),
-        *((FOLDER.parent / f"data/schema/{schema}.json").read_bytes() for schema in schemas),
+        *((ROOT / f"data/schema/{schema}.json").read_bytes() for schema in schemas),
     ]
     words = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
     path = OUT / f"{name}.dict"
@@ -132,7 +132,7 @@ def run_timed(target: Callable[[bytes], None], data: bytes) -> None:
 
 def fuzz_by_mutation(name: str, seconds: float, seed: int = 1) -> int:
     """Fuzz a target by random mutation only; return the number of findings."""
-    from fuzz.targets import TARGETS
+    from tests.fuzz.targets import TARGETS
 
     rng = Random(seed)
     corpus = seeds(name)
@@ -162,7 +162,7 @@ def fuzz_by_coverage(names: list[str], seconds_each: float) -> int:
     import atheris
 
     with atheris.instrument_imports(include=INSTRUMENTED_PACKAGES):
-        from fuzz.targets import TARGETS
+        from tests.fuzz.targets import TARGETS
 
         for name in names:
             for path in (CORPUS / name).iterdir():  # imports on first use must be instrumented too

@@ -1,13 +1,13 @@
 """Mutation score: the share of small changes of the code that the tests notice.
 
-`python -m benchmarks.mutants [COUNT] [SEED] [--again] [--control]`. COUNT places are drawn uniformly from all that
+`python -m tests.mutants [COUNT] [SEED] [--again] [--control]`. COUNT places are drawn uniformly from all that
 cosmic-ray's operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of
 each. Left out are type annotations, decorators, errors' messages (whole raise statements and f-strings) and
 __init__.py.
 
 The tests run once without a mutant, and what each enters is noted. A mutant is tested, in a copy, by the tests that
 enter the changed function, nearest file first, up to BUDGET_S; if these take less than OTHERS_S, others of near files
-fill it. benchmarks/mutant_tests.py runs them, in a process forked after all imports. A change outside of functions is
+fill it. tests/mutants/server.py runs them, in a process forked after all imports. A change outside of functions is
 tested in a process that imports all packages anew. A mutant is killed if a test fails, crashes, or takes 60 s and ten
 times its time.
 
@@ -44,7 +44,7 @@ import pytest
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 
-from benchmarks.mutant_tests import (
+from tests.mutants.server import (
     BROKEN,
     OPTIONS,
     Key,
@@ -56,7 +56,7 @@ from benchmarks.mutant_tests import (
     order,
 )
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "out" / "mutants"
 TREE = OUT / "tree"
 CACHE = OUT / "cache"
@@ -377,11 +377,14 @@ def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
 
 
 def use_copy() -> None:
-    """Import the packages from the copy, and the benchmarks, which imported them from elsewhere, once more."""
-    for name in [
-        name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")
-    ]:
-        del sys.modules[name]
+    """Import the packages and the tests from the copy; only this program stays that of the checkout."""
+    for name in list(sys.modules):
+        package, _, rest = name.partition(".")
+        if (
+            package in ("benchmarks", "skysim", "estimator", "tests")
+            and rest.partition(".")[0] != "mutants"
+        ):
+            del sys.modules[name]
     sys.path.insert(0, str(TREE))
     importlib.invalidate_caches()  # Python remembers that the copy's folder did not exist when it started
 
@@ -411,7 +414,7 @@ def main() -> None:
     if os.environ.get("NUMBA_CACHE_DIR") != str(CACHE):  # before any import reads them
         os.execve(
             sys.executable,
-            [sys.executable, "-m", "benchmarks.mutants", *sys.argv[1:]],
+            [sys.executable, "-m", "tests.mutants", *sys.argv[1:]],
             environment(),
         )
     OUT.mkdir(parents=True, exist_ok=True)

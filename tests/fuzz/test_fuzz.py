@@ -20,9 +20,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from PIL import Image
 
-from benchmarks.hostilefiles import promise
-from fuzz.__main__ import NAMES, TOKENS, mutate, seeds
-from fuzz.targets import TARGETS, rejects
 from skysim.camera.psf.otf import read_cells
 from skysim.core import encoded, images, yaml_reader
 from skysim.core.errors import InputError
@@ -30,6 +27,9 @@ from skysim.scene import loader
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.layouts import listed
+from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
+from tests.fuzz.targets import TARGETS, rejects
+from tests.helpers.hostile_files import promise
 
 AS_IT_IS = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

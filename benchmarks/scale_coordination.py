@@ -1,6 +1,6 @@
 """How many chunks a second the study's own process can hand out, collect and store: 64 workers on one machine.
 
-`python -m benchmarks.coordination`. A worker is a thread whose trials do nothing but last a known time, so one machine
+A worker is a thread whose trials do nothing but last a known time, so one machine
 can have as many as a cluster. One chunk is one trial. The shorter the trials, the more chunks complete in a second,
 until the process that coordinates them is the limit: chunk queue, engine, and the store's transaction.
 """
@@ -221,10 +221,3 @@ def measure() -> list[dict[str, Any]]:
         )
         rows.append(verdict(f"{name}: CPU of coordination", cpu_ms, "ms", "a chunk", 0.5))
     return rows
-
-
-if __name__ == "__main__":
-    for one in measure():
-        print(
-            f"{one['name']}: {one['value']:.3g} {one['unit']} (bar {one['bar']:g}); {one['peer']}"
-        )

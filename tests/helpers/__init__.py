@@ -1,0 +1,1 @@
+"""What tests share: fixtures, small worlds, drawn frames, and cases that benchmarks measure too."""

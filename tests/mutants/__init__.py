@@ -1,0 +1,1 @@
+"""The mutation score of the tests. See `tests.mutants.__main__`."""
