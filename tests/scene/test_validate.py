@@ -13,7 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim.apps.cli import main
+from skysim.apps.cli import json_schema, main
 from skysim.apps.cli.commands.validate import check_file
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
