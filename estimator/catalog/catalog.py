@@ -139,10 +139,8 @@ class StarCatalog:
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
         """Select stars by mask or index."""
-        return replace(
-            self,
-            **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"},
-        )
+        columns = [name for name in self.__slots__ if name != "epoch_yr"]
+        return replace(self, **{name: getattr(self, name)[which] for name in columns})
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +200,7 @@ def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
 
 
 def checked(stars: object) -> StarCatalog:
-    """The catalog, if its columns are of one length and finite and its vectors of unit length; else raise ImageError."""
+    """The catalog, if its columns are of one length and finite and its vectors of unit length; else ImageError."""
     checks.of_type("stars", stars, StarCatalog)
     assert isinstance(stars, StarCatalog)
     count = len(stars)
@@ -358,13 +356,9 @@ def columns(
 
 def _epoch_yr(lines: Sequence[str]) -> float:
     """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError if there is none."""
-    comments = (line for line in lines if line.startswith("#"))
-    found = [
-        match
-        for line in comments
-        if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))
-    ]
-    epoch_yr = float(found[0][1]) if found else np.nan
+    matches = (re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line) for line in lines)
+    found = next(filter(None, matches), None)
+    epoch_yr = float(found[1]) if found else np.nan
     if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
         raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))
     return epoch_yr
@@ -480,9 +474,8 @@ def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     Each star takes the least label among itself and its neighbors until none changes. scipy.sparse.csgraph does the
     same, but takes longer to import than this to run.
     """
-    one, other = (
-        cKDTree(vectors).query_pairs(2 * np.sin(closer_than_rad / 2), output_type="ndarray").T
-    )
+    chord = 2 * np.sin(closer_than_rad / 2)
+    one, other = cKDTree(vectors).query_pairs(chord, output_type="ndarray").T
     label = np.arange(len(vectors))
     before = np.empty(0, int)
     while not np.array_equal(label, before):

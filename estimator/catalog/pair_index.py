@@ -111,10 +111,7 @@ def build(
             f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
         )
     # All pairs, sorted by angle.
-    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
+    pair, angle = _pairs_within(vectors, 2 * np.sin(min(max_angle_rad, np.pi) / 2))
     order = np.argsort(angle, kind="stable")
     pair = np.ascontiguousarray(pair[order])
     angle = angle[order]
@@ -150,6 +147,14 @@ def build(
         magnitudes,
         sky_index.build_grid(vectors),
     )
+
+
+def _pairs_within(vectors: Floats, chord: float) -> tuple[NDArray[np.int32], Floats]:
+    """(P, 2) rows of all pairs of (N, 3) unit vectors up to a chord, and their (P,) angles, rad."""
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    return pair, 2 * np.arcsin(half_chord)
 
 
 def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
@@ -206,6 +211,16 @@ def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[in
 def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
     """The position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
     return first_from(index.separation_rad, index.first[star], index.first[star + 1], low_rad)
+
+
+@jit
+def neighbor_range(index: PairIndex, star: int, low_rad: float, high_rad: float) -> tuple[int, int]:
+    """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
+    begin = first_neighbor(index, star, low_rad)
+    end = begin
+    while end < index.first[star + 1] and index.separation_rad[end] <= high_rad:
+        end += 1
+    return begin, end
 
 
 @jit
@@ -287,9 +302,7 @@ def build_pair_catalog(
         raise ImageError(f"bucket width {width_rad} rad; allowed: more than 0")
     low, high = range_rad or (0.0, np.pi)
     # Search slightly beyond the range, then select by the exact angles.
-    chord = 2 * np.sin(min(high, np.pi) / 2) + 1e-12
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
+    pair, angle = _pairs_within(vectors, 2 * np.sin(min(high, np.pi) / 2) + 1e-12)
     in_magnitude_range = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
     selected = (angle >= low) & (angle <= high) & in_magnitude_range[pair].all(axis=1)
     pair = pair[selected]

@@ -200,13 +200,9 @@ def thin(stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])
     n_bright = int(np.searchsorted(stars.v_mag[order], bright_mag, side="right"))
-    return stars.take(
-        order[
-            _thin(
-                vectors, sky_index.build_grid(vectors), n_bright, 2 * np.sin(min_separation_rad / 2)
-            )
-        ]
-    )
+    chord = 2 * np.sin(min_separation_rad / 2)
+    selected = _thin(vectors, sky_index.build_grid(vectors), n_bright, chord)
+    return stars.take(order[selected])
 
 
 @jit
@@ -241,9 +237,10 @@ def uniform(stars: StarCatalog, count: int, bright_mag: float = -np.inf) -> Star
     high = np.pi
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (
-            (middle, high) if len(thin(stars, middle, bright_mag)) >= count else (low, middle)
-        )
+        if len(thin(stars, middle, bright_mag)) >= count:
+            low = middle
+        else:
+            high = middle
     return thin(stars, low, bright_mag)
 
 

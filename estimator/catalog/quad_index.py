@@ -14,7 +14,7 @@ negative, and C is the one with the smaller first number.
    brightest detections of a frame are among them everywhere in the sky (`_locally_bright`).
 2. List the chosen neighbors of each chosen star (`_neighbors`).
 3. Form all quads of neighbors, and their codes (`_quads`).
-4. Sort them into the cells of a grid of four dimensions (`_sort_into_cells`).
+4. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of
+from estimator.catalog.sky_index import SkyIndex, cell_of, counting_sort
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -72,7 +72,8 @@ def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
         code = np.empty((total, 4))
         total = _quads(sky.vectors, neighbor, first, SHORTEST * height_rad, found, code)
     # 4. Cells.
-    return QuadIndex(*_sort_into_cells(found[:total], code[:total]))
+    cells, order = counting_sort(_grid_cells(code[:total]), SIDE**4)
+    return QuadIndex(found[order], code[order], cells)
 
 
 @jit
@@ -224,26 +225,10 @@ def code_cell(value: float, axis: int) -> int:
 
 
 @jit
-def _sort_into_cells(
-    star: NDArray, code: Floats
-) -> tuple[NDArray[np.int32], Floats, NDArray[np.int32]]:
-    """Step 4: sort quads by the cell of their code (counting sort); returns the fields of QuadIndex."""
-    cell = np.empty(len(code), np.int64)
-    first = np.zeros(SIDE**4 + 1, np.int32)
+def _grid_cells(code: Floats) -> NDArray[np.int64]:
+    """(Q,) number of the cell of each code (Q, 4) in the grid of SIDE^4 cells."""
+    cell = np.zeros(len(code), np.int64)
     for n in range(len(code)):
-        k = 0
         for axis in range(4):
-            k = k * SIDE + code_cell(code[n, axis], axis)
-        cell[n] = k
-        first[k + 1] += 1
-    for k in range(SIDE**4):
-        first[k + 1] += first[k]
-    sorted_star = np.empty_like(star)
-    sorted_code = np.empty_like(code)
-    free = first.copy()
-    for n in range(len(code)):
-        slot = free[cell[n]]
-        sorted_star[slot] = star[n]
-        sorted_code[slot] = code[n]
-        free[cell[n]] += 1
-    return sorted_star, sorted_code, first
+            cell[n] = cell[n] * SIDE + code_cell(code[n, axis], axis)
+    return cell

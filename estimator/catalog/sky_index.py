@@ -5,7 +5,7 @@ of a few adjacent bins:
 
 1. Find all pairs by a sweep along z: with the stars sorted by z, only stars with |dz| up to the greatest chord can form
    a pair (`_sweep`).
-2. Sort them into bins by a counting sort (`_sort_into_bins`).
+2. Sort them into bins (`counting_sort`).
 
 Directions are binned twice, for two kinds of search:
 
@@ -16,7 +16,7 @@ to FACE_HALF_WIDTH, so that a search around any direction needs only the cells o
 therefore stored on more than one face.
 
 `Cells`: in the cells of the cube [-1, 1]^3 about the unit sphere, for searches within any angle (`within`,
-`nearest_in_grid`). A counting sort lists the stars cell after cell. A search within a chord visits the cells that meet
+`nearest_in_grid`). The stars are listed cell after cell. A search within a chord visits the cells that meet
 the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each (x, y) column
 is one loop.
 """
@@ -61,27 +61,47 @@ def build_grid(vectors: Floats) -> Cells:
     The sphere meets about 4 pi / (2 / side)^2 = pi side^2 cells.
     """
     side = min(max(int(sqrt(len(vectors) / pi)), 2), MAX_SIDE)
-    return Cells(side, *_sorted(vectors, side))
+    return Cells(side, *counting_sort(_cube_cells(vectors, side), side**3))
 
 
 @jit
-def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
-    """Sort the stars by cell (counting sort); returns the fields `first` and `row` of Cells."""
-    first = np.zeros(side**3 + 1, np.int32)
-    row = np.empty(len(vectors), np.int32)
+def _cube_cells(vectors: Floats, side: int) -> NDArray[np.int64]:
+    """(N,) number of the cell of each unit vector (N, 3); cells adjacent in z have successive numbers."""
     cell = np.empty(len(vectors), np.int64)
-    # Count the stars of each cell, add the counts up, and fill the cells.
     for n in range(len(vectors)):
         x, y, z = vectors[n]
         cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)
-        first[cell[n] + 1] += 1
-    for c in range(side**3):
+    return cell
+
+
+@jit
+def counting_sort(cell: NDArray, cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Sort N things by their cell, in a time proportional to N; the order within a cell is kept.
+
+    Parameters
+    ----------
+    cell
+        (N,) number of each thing's cell, 0 to cells - 1
+
+    Returns
+    -------
+    first
+        (cells + 1,) the things of cell c are order[first[c] : first[c + 1]]
+    order
+        (N,) rows of the things, cell after cell
+    """
+    first = np.zeros(cells + 1, np.int32)
+    order = np.empty(len(cell), np.int32)
+    # Count the things of each cell, add the counts up, and fill the cells.
+    for c in cell:
+        first[c + 1] += 1
+    for c in range(cells):
         first[c + 1] += first[c]
-    next_free = first[:-1].copy()
-    for n in range(len(vectors)):
-        row[next_free[cell[n]]] = n
-        next_free[cell[n]] += 1
-    return first, row
+    free = first.copy()
+    for n in range(len(cell)):
+        order[free[cell[n]]] = n
+        free[cell[n]] += 1
+    return first, order
 
 
 @jit
@@ -251,9 +271,10 @@ def build(
     angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])
     angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
     # 2. Sort them into bins; the width leaves the greatest angle in the last bin, whatever the rounding.
-    pair, first, bin_rad = _sort_into_bins(
-        by_z, found[:total], angle_rad, max_angle_rad * (1 + 1e-9)
-    )
+    bins = max(total // PAIRS_PER_BIN, 1)
+    bin_rad = max_angle_rad * (1 + 1e-9) / bins
+    first, order = counting_sort((angle_rad / bin_rad).astype(np.int32), bins)
+    pair = by_z.astype(np.int32)[found[order]]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
@@ -323,43 +344,6 @@ def _sweep(
     return total
 
 
-@jit
-def _sort_into_bins(
-    row: NDArray, found: NDArray, angle_rad: Floats, end_rad: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
-    """Step 2: sort pairs by angle into bins (counting sort).
-
-    Parameters
-    ----------
-    row
-        (N,) row of each star in the catalog
-    found
-        (P, 2) pairs, by their place in `row`
-    end_rad
-        Upper end of the last bin
-
-    Returns
-    -------
-    pair, first, bin_rad
-        Fields of SkyIndex
-    """
-    bins = max(len(found) // PAIRS_PER_BIN, 1)
-    bin_rad = end_rad / bins
-    first = np.zeros(bins + 1, np.int32)
-    for n in range(len(found)):
-        first[int(angle_rad[n] / bin_rad) + 1] += 1
-    for k in range(bins):
-        first[k + 1] += first[k]
-    pair = np.empty((len(found), 2), np.int32)
-    next_free = first.copy()
-    for n in range(len(found)):
-        k = int(angle_rad[n] / bin_rad)
-        pair[next_free[k], 0] = row[found[n, 0]]
-        pair[next_free[k], 1] = row[found[n, 1]]
-        next_free[k] += 1
-    return pair, first, bin_rad
-
-
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Sort the stars by cell of the faces; a star near the edge of a face is also on the neighboring face.
 
@@ -380,10 +364,8 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
             column, row = cells.astype(np.int64).T
             cell.append(((2 * axis + (sign < 0)) * side + row) * side + column)
             star.append(on_face)
-    number = np.concatenate(cell)
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(6 * side * side + 1))
-    return first.astype(np.int32), np.concatenate(star)[order].astype(np.int32)
+    first, order = counting_sort(np.concatenate(cell), 6 * side * side)
+    return first, np.concatenate(star)[order].astype(np.int32)
 
 
 @jit

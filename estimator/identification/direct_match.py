@@ -20,6 +20,7 @@ from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
 from estimator.catalog.sky_index import nearest_in_grid
+from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -160,15 +161,15 @@ def match_nearest(
     # Stars per steradian in the cap of the neighbors.
     cap_sr = 2 * pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[center + 1] - index.first[center] + 1) / cap_sr
+    R_ref_from_cam = R_cam_from_ref.T.copy()
     count = 0
     covered_sr = 0.0
     for n in range(len(rays)):
-        u, v, w = rays[n]
-        # The direction in the catalog's frame: R^T times the ray.
-        x = R_cam_from_ref[0, 0] * u + R_cam_from_ref[1, 0] * v + R_cam_from_ref[2, 0] * w
-        y = R_cam_from_ref[0, 1] * u + R_cam_from_ref[1, 1] * v + R_cam_from_ref[2, 1] * w
-        z = R_cam_from_ref[0, 2] * u + R_cam_from_ref[1, 2] * v + R_cam_from_ref[2, 2] * w
-        radius = tolerance + (stretch * np.arccos(min(max(w, -1.0), 1.0)) if stretch > 0 else 0.0)
+        ray = vectors.row(rays, n)
+        x, y, z = vectors.rotate(R_ref_from_cam, ray)
+        radius = tolerance + (
+            stretch * np.arccos(min(max(ray[2], -1.0), 1.0)) if stretch > 0 else 0.0
+        )
         covered_sr += density * pi * radius**2
         best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
         is_used = False

@@ -162,17 +162,22 @@ def _pair_names(
     Ints
         (M, 2) rows of LEDs, at most MAX_HYPOTHESES
     """
-    rows = [np.flatnonzero(excess[light] <= REACH) for light in (first, second)]
-    seen = [
-        _seen_directions(lights.ray[light], sphere, row)
-        for light, row in zip((first, second), rows, strict=True)
-    ]
-    known = [sphere.direction[row] for row in rows]
+    first_rows = np.flatnonzero(excess[first] <= REACH)
+    second_rows = np.flatnonzero(excess[second] <= REACH)
+    seen_first = _seen_directions(lights.ray[first], sphere, first_rows)
+    seen_second = _seen_directions(lights.ray[second], sphere, second_rows)
+    directions = (
+        seen_first,
+        seen_second,
+        sphere.direction[first_rows],
+        sphere.direction[second_rows],
+    )
     gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
     # Count the pairs, then store them.
-    pairs = np.empty((_alike(*seen, *known, gate, np.empty((0, 2), np.int64)), 2), np.int64)
-    _alike(*seen, *known, gate, pairs)
-    names = np.column_stack([rows[0][pairs[:, 0]], rows[1][pairs[:, 1]]])
+    count = _alike(*directions, gate, np.empty((0, 2), np.int64))
+    pairs = np.empty((count, 2), np.int64)
+    _alike(*directions, gate, pairs)
+    names = np.column_stack([first_rows[pairs[:, 0]], second_rows[pairs[:, 1]]])
     # One LED cannot be both lights.
     names = names[names[:, 0] != names[:, 1]]
     cost = excess[first, names[:, 0]] + excess[second, names[:, 1]]
@@ -218,12 +223,14 @@ def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
 
 def _attitudes(lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints) -> Floats:
     """Step 3: (M, 3, 3) R_cam_from_lab of each pair of names."""
-    seen = [
-        _seen_directions(lights.ray[light], sphere, names[:, k])
-        for k, light in enumerate((first, second))
-    ]
-    known = [sphere.direction[names[:, k]] for k in range(2)]
-    return np.einsum("mia,mib->mab", _frames(*seen), _frames(*known))
+    seen_first = _seen_directions(lights.ray[first], sphere, names[:, 0])
+    seen_second = _seen_directions(lights.ray[second], sphere, names[:, 1])
+    known_first = sphere.direction[names[:, 0]]
+    known_second = sphere.direction[names[:, 1]]
+    # R = sum over the axes of (axis in camera axes) (axis in the lab frame)^T.
+    seen = _frames(seen_first, seen_second)
+    known = _frames(known_first, known_second)
+    return np.einsum("mia,mib->mab", seen, known)
 
 
 def _frames(u: Floats, v: Floats) -> Floats:

@@ -191,10 +191,8 @@ def _search(
     rival_dex
         Evidence of the best hypothesis with another attitude, log10
     """
-    R_cam_from_lab = np.zeros((3, 3))
-    for axis in range(3):
-        R_cam_from_lab[axis, axis] = 1.0
-    best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_lab, -np.inf)
+    none = np.empty(0, np.int64)
+    best = LedHypothesis(none, none, np.eye(3), -np.inf)
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     # 2. The order of the pairs.

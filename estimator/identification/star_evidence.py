@@ -116,15 +116,8 @@ class Solution(NamedTuple):
 @jit
 def no_hypothesis() -> Hypothesis:
     """The empty hypothesis, with evidence -inf."""
-    R_cam_from_ref = np.zeros((3, 3))
-    info = np.zeros((4, 4))
-    for n in range(4):
-        info[n, n] = 1.0
-        if n < 3:
-            R_cam_from_ref[n, n] = 1.0
-    return Hypothesis(
-        np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_ref, 1.0, info, -np.inf
-    )
+    none = np.empty(0, np.int64)
+    return Hypothesis(none, none, np.eye(3), 1.0, np.eye(4), -np.inf)
 
 
 @jit
@@ -191,7 +184,8 @@ def evaluate(
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
         # A fit that has converged on the same matches need not be repeated.
-        if fall < CONVERGED_CHI2 and _equal(observed, before[0]) and _equal(star, before[1]):
+        same = np.array_equal(observed, before[0]) and np.array_equal(star, before[1])
+        if same and fall < CONVERGED_CHI2:
             break
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if iteration < 2:
@@ -209,15 +203,6 @@ def evaluate(
         return no_hypothesis()
     dex += counts_dex(matched, _count_missing(detections, sky, R, focal_ratio, star))
     return Hypothesis(observed, star, R, focal_ratio, info, dex)
-
-
-@jit
-def _equal(first: NDArray, second: NDArray) -> bool:
-    """Whether two lists of rows are equal."""
-    same = len(first) == len(second)
-    for n in range(min(len(first), len(second))):
-        same = same and first[n] == second[n]
-    return same
 
 
 @jit
@@ -306,12 +291,9 @@ def count_near(
         if matched[n]:
             continue
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        count += (
-            nearest(
-                sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05)
-            )[0]
-            >= 0
-        )
+        gate = min(gates[n], 0.05)
+        s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
+        count += s >= 0
     return count
 
 
@@ -330,10 +312,10 @@ def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis
     _, fall = _fit(
         detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info
     )
+    # `info` becomes its Cholesky factor.
     cholesky_solve(info, np.zeros(4))
-    return fall / 2 / log(10.0) + log10(
-        sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty)
-    )
+    width_dex = log10(sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty))
+    return fall / 2 / log(10.0) + width_dex
 
 
 @jit
@@ -489,7 +471,7 @@ def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int
     # Chord of the angle from the boresight to the farthest corner.
     corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
     chord = sqrt(2 - 2 / sqrt(1 + corner2))
-    (bx, by, bz) = vectors.row(R, 2)
+    bx, by, bz = vectors.row(R, 2)
     # The cells that a box of this half-width about the boresight meets; those adjacent in z are adjacent in the list.
     side = sky.cells.side
     first = sky.cells.first
@@ -621,9 +603,9 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         chi2 += squared_mahalanobis(
             detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
         )
-        x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, hypothesis.star[k])
-        tx = detections.tangent[hypothesis.observed[k], 0]
-        ty = detections.tangent[hypothesis.observed[k], 1]
+        x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, star)
+        tx = detections.tangent[observed, 0]
+        ty = detections.tangent[observed, 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)

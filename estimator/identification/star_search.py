@@ -102,90 +102,25 @@ def lost_in_space(
         Empty if the search finds nothing beyond chance, or if all detections together do not confirm what it finds
     """
     # 1. Choose the detections to search with.
-    few = min(FEW, max_detections, len(detections.sigma))
-    many = min(max_detections, len(detections.sigma))
-    if many == few:
-        accept_dex = ACCEPT_DEX
-        candidate = search(
-            changed(detections, few, 1.0, detections.focal_uncertainty), stars, max_checks
-        )
-    else:
-        accept_dex = ACCEPT_DEX + log10(2.0)
-        # A short search with few detections, one with many, then the first one again with the whole effort.
-        for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-            searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-            candidate = search(searched, stars, int(effort * max_checks))
-            if candidate.dex >= accept_dex:
-                break
+    total = len(detections.sigma)
+    few = min(FEW, max_detections, total)
+    many = min(max_detections, total)
+    # Two searches must each reach twice the evidence.
+    accept_dex = ACCEPT_DEX if few == many else ACCEPT_DEX + log10(2.0)
+    candidate = no_hypothesis()
+    # A short search with few detections, one with many, then the first one again with the whole effort.
+    for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
+        if few == many and effort < 1:
+            continue
+        # 2. to 8. The search.
+        searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+        candidate = search(searched, stars, int(effort * max_checks))
+        if candidate.dex >= accept_dex:
+            break
     # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
     calibrated = detections.focal_uncertainty == 0
-    free = (
-        changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL) if calibrated else detections
-    )
-    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == len(detections.sigma))
-
-
-@jit
-def fit_to_all(
-    detections: Detections,
-    stars: SkyIndex,
-    candidate: Hypothesis,
-    accept_dex: float,
-    calibrated: bool,
-    whole: bool,
-) -> Solution:
-    """Step 9: fit a candidate attitude of some detections to all detections and all stars.
-
-    With a wrong focal length a part of the stars may still match, at a wrong attitude. The candidate of a calibrated
-    camera is therefore fitted with the calibrated and with a free focal length. The free one is taken if it has
-    WRONG_FOCAL_DEX more evidence.
-
-    Parameters
-    ----------
-    detections
-        All detections, with the focal uncertainty of the free fit
-    candidate
-        Best hypothesis of the search
-    accept_dex
-        Least evidence of the candidate, log10
-    calibrated
-        Whether the focal length is calibrated
-    whole
-        Whether the candidate already is the calibrated fit to all detections
-
-    Returns
-    -------
-    Solution
-        Empty if the candidate has less than `accept_dex`, if the full field keeps no more than half of its matches, or
-        if all detections together are not beyond chance
-    """
-    chosen = detections
-    full = no_hypothesis()
-    gates = gates_of(detections, 1.5)
-    R = candidate.R_cam_from_ref
-    ratio = candidate.focal_ratio
-    found = candidate.dex >= accept_dex
-    free = True
-    # 9a. The fit with the calibrated focal length.
-    if found and calibrated:
-        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
-        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
-        # If all detections match there is none that another focal length could match.
-        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
-    # 9b. The fit with a free focal length.
-    if found and free:
-        fitted = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
-        if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
-            chosen = detections
-            full = fitted
-    # 9c. Refuse what all detections together do not confirm.
-    if not found or 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
-        return build_solution(chosen, stars, no_hypothesis())
-    dex = max(full.dex, candidate.dex)
-    best = Hypothesis(
-        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
-    )
-    return build_solution(chosen, stars, best)
+    free = changed(detections, total, 1.0, WRONG_FOCAL) if calibrated else detections
+    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == total)
 
 
 @jit
@@ -250,9 +185,9 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
         if checks[0] > limit or total - 2 <= MAX_MISSES:
             break
     # 8. A weaker attitude must be significant, and clearly better than any other.
-    return (
-        best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
-    )
+    if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
+        return best
+    return no_hypothesis()
 
 
 @jit
@@ -287,11 +222,9 @@ def _pair_lengths(detections: Detections) -> Floats:
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
-            out[a, b] = (
-                length
-                if length >= min_length
-                else 1e3 * min_length * min_length / max(length, 1e-9)
-            )
+            if length < min_length:
+                length = 1e3 * min_length * min_length / max(length, 1e-9)
+            out[a, b] = length
     return out
 
 
@@ -416,9 +349,11 @@ def _test_pair(
             continue
         vectors.pair_frame(star_i, star_j, in_ref)
         for flip in range(2):
-            if flip:  # the star pair in reverse order: a half turn about its first axis
+            if flip:
+                # The star pair in reverse order: a half turn about its bisector, the first axis.
                 for k in range(3):
-                    in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
+                    in_ref[k, 1] = -in_ref[k, 1]
+                    in_ref[k, 2] = -in_ref[k, 2]
             if not (backward if flip else forward):
                 continue
             # 4c. The attitude turns the axes of the detections into those of the stars.
@@ -475,11 +410,8 @@ def trial(
     gates = pair_gates(detections, a, b)
     order = other_detections(len(detections.sigma), a, b, start)
     pair_dex = attitude_dex(detections, a, b)
-    return (
-        gates,
-        order,
-        required_matches(detections.sigma, field_area(detections), pair_dex, min_dex),
-    )
+    required = required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
+    return gates, order, required
 
 
 @jit
@@ -650,10 +582,74 @@ def quick_check(
         if count + remaining - step < required or (step >= max_misses and count == 2):
             return step, False
         # The star nearest to the detection's direction in the catalog's frame.
-        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, order[step], focal_ratio))
-        count += (
-            nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[order[step]])[0] >= 0
-        )
+        n = order[step]
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        star, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
+        count += star >= 0
         if count >= required:
             return step + 1, True
     return remaining, False
+
+
+@jit
+def fit_to_all(
+    detections: Detections,
+    stars: SkyIndex,
+    candidate: Hypothesis,
+    accept_dex: float,
+    calibrated: bool,
+    whole: bool,
+) -> Solution:
+    """Step 9: fit a candidate attitude of some detections to all detections and all stars.
+
+    With a wrong focal length a part of the stars may still match, at a wrong attitude. The candidate of a calibrated
+    camera is therefore fitted with the calibrated and with a free focal length. The free one is taken if it has
+    WRONG_FOCAL_DEX more evidence.
+
+    Parameters
+    ----------
+    detections
+        All detections, with the focal uncertainty of the free fit
+    candidate
+        Best hypothesis of the search
+    accept_dex
+        Least evidence of the candidate, log10
+    calibrated
+        Whether the focal length is calibrated
+    whole
+        Whether the candidate already is the calibrated fit to all detections
+
+    Returns
+    -------
+    Solution
+        Empty if the candidate has less than `accept_dex`, if the full field keeps no more than half of its matches, or
+        if all detections together are not beyond chance
+    """
+    if not candidate.dex >= accept_dex:
+        return build_solution(detections, stars, no_hypothesis())
+    chosen = detections
+    full = no_hypothesis()
+    # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.
+    gates = gates_of(detections, 1.5)
+    R = candidate.R_cam_from_ref
+    free = True
+    if calibrated:
+        # 9a. The fit with the calibrated focal length.
+        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
+        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
+        # If all detections match there is none that another focal length could match.
+        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
+    if free:
+        # 9b. The fit with a free focal length.
+        fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)
+        if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
+            chosen = detections
+            full = fitted
+    # 9c. Refuse what all detections together do not confirm.
+    if 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
+        return build_solution(chosen, stars, no_hypothesis())
+    dex = max(full.dex, candidate.dex)
+    best = Hypothesis(
+        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
+    )
+    return build_solution(chosen, stars, best)

@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
+from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -397,20 +397,17 @@ def _test_neighbors(
             continue
         # Candidates b at the angle of side 0 from a.
         count = 0
-        place = first_neighbor(index, a, sides[0] - tolerance[0])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[0] + tolerance[0]:
-            if _candidate(index, index.neighbor[place], magnitudes[corners[1]], options):
-                second[count] = index.neighbor[place]
+        low, high = neighbor_range(index, a, sides[0] - tolerance[0], sides[0] + tolerance[0])
+        tried[1] += high - low
+        for b in index.neighbor[low:high]:
+            if _candidate(index, b, magnitudes[corners[1]], options):
+                second[count] = b
                 count += 1
-            place += 1
-            tried[1] += 1
         # Candidates c at the angle of side 1 from a.
         if count == 0:
             continue
-        place = first_neighbor(index, a, sides[1] - tolerance[1])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[1] + tolerance[1]:
-            c = index.neighbor[place]
-            place += 1
+        low, high = neighbor_range(index, a, sides[1] - tolerance[1], sides[1] + tolerance[1])
+        for c in index.neighbor[low:high]:
             tried[1] += count
             if not _candidate(index, c, magnitudes[corners[2]], options):
                 continue

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
+from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -173,11 +173,9 @@ def _count_angles(
             continue
         side = angle(rays[master], rays[n])
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
-        place = first_neighbor(index, candidate, side - tolerance)
+        begin, end = neighbor_range(index, candidate, side - tolerance, side + tolerance)
         tried[1] += 1
-        count += (
-            place < index.first[candidate + 1] and index.separation_rad[place] <= side + tolerance
-        )
+        count += end > begin
     return count
 
 
@@ -212,13 +210,9 @@ def _best_match(
     # Stars at the angle of the second star from the candidate.
     for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
-        place = first_neighbor(index, candidate, sides[n] - tolerance)
-        while (
-            place < index.first[candidate + 1]
-            and index.separation_rad[place] <= sides[n] + tolerance
-        ):
-            stars = np.array([candidate, index.neighbor[place]], np.int64)
-            place += 1
+        begin, end = neighbor_range(index, candidate, sides[n] - tolerance, sides[n] + tolerance)
+        for second in index.neighbor[begin:end]:
+            stars = np.array([candidate, second], np.int64)
             tried[0] += 1
             tried[1] += len(rays)
             pair = np.array([master, n])

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
+from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -163,11 +163,10 @@ def _triangle(
         for flip in range(2):
             a = index.pair[p, flip]
             b = index.pair[p, 1 - flip]
-            place = first_neighbor(index, a, ik - t_ik)
-            while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
+            first, last = neighbor_range(index, a, ik - t_ik, ik + t_ik)
+            for place in range(first, last):
                 c = index.neighbor[place]
                 side_ac = index.separation_rad[place]
-                place += 1
                 tried[2] += 1
                 if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
                     continue
@@ -225,12 +224,8 @@ def _pyramid(
         # Catalog stars d at the angle of r from the first corner.
         reach = angle(rays[corners[0]], rays[r])
         tolerance = sqrt(2.0) * options.tolerance + stretch * reach
-        place = first_neighbor(index, stars[0], reach - tolerance)
-        while (
-            place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + tolerance
-        ):
-            d = index.neighbor[place]
-            place += 1
+        begin, end = neighbor_range(index, stars[0], reach - tolerance, reach + tolerance)
+        for d in index.neighbor[begin:end]:
             # The angles to the two other corners.
             fits = True
             for corner in range(1, 3):

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from estimator.attitude.solvers import quest
 from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
 from estimator.catalog.sky_index import Cells, within
+from estimator.core import vectors
 from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -39,6 +40,10 @@ from estimator.identification.solver_options import Options
 # Cost of an observed star without a partner, in squared standard deviations; a bad partner costs no more. 16 is four
 # standard deviations: it corresponds to a probability of one in three thousand that a star has no partner.
 UNMATCHED_COST = 16.0
+# Further pairs whose assumptions the best one must beat. If half of the pairs are of true stars, the true assumption is
+# missed by all ten with probability 1e-3.
+RIVAL_PAIRS = 10
+MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
 
 
 class Gates(NamedTuple):
@@ -132,9 +137,7 @@ def triad(a: Floats, b: Floats) -> Floats:
     rows = np.empty((3, 3))
     rows[0] = a + b
     rows[1] = a - b
-    rows[2, 0] = b[1] * a[2] - b[2] * a[1]
-    rows[2, 1] = b[2] * a[0] - b[0] * a[2]
-    rows[2, 2] = b[0] * a[1] - b[1] * a[0]
+    rows[2] = np.cross(b, a)
     for n in range(3):
         rows[n] /= np.sqrt(rows[n, 0] ** 2 + rows[n, 1] ** 2 + rows[n, 2] ** 2)
     return rows
@@ -290,20 +293,11 @@ def _partners(
     """
     # 5. R_ref_from_cam maps the axes of the observed pair to those of the catalog pair.
     triad_ref = triad(stars.vectors[first], stars.vectors[second])
-    R = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = (
-                triad_ref[0, i] * primary.triad[0, j]
-                + triad_ref[1, i] * primary.triad[1, j]
-                + triad_ref[2, i] * primary.triad[2, j]
-            )
+    R_ref_from_cam = np.empty((3, 3))
+    vectors.multiply_transposed(triad_ref.T, primary.triad.T, R_ref_from_cam)
     # 6. Catalog stars near the predicted place.
     for k in range(len(primary.others)):
-        u, v, w = stars.vectors_cam[primary.others[k]]
-        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
-        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
-        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        x, y, z = vectors.rotate(R_ref_from_cam, vectors.row(stars.vectors_cam, primary.others[k]))
         chord = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
         partner[k] = -1
         partner_cost[k] = UNMATCHED_COST
@@ -373,12 +367,6 @@ def add_contradictions(
                 break
 
 
-# Further pairs whose assumptions the best one must beat. If half of the pairs are of true stars, the true assumption is
-# missed by all ten with probability 1e-3.
-RIVAL_PAIRS = 10
-MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
-
-
 def saa(
     vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
@@ -413,11 +401,9 @@ def saa(
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    sep_rad = (
-        np.sqrt(2) / 3 * tolerance_rad
-        if settings.epsilon_sep_rad is None
-        else settings.epsilon_sep_rad
-    )
+    sep_rad = settings.epsilon_sep_rad
+    if sep_rad is None:
+        sep_rad = np.sqrt(2) / 3 * tolerance_rad
     if not min(sep_rad, tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
             f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"

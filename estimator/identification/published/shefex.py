@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
+from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -202,10 +202,8 @@ def _triangle(
         for flip in range(2):
             a = index.pair[p, flip]
             b = index.pair[p, 1 - flip]
-            place = first_neighbor(index, a, low_ik)
-            while place < index.first[a + 1] and index.separation_rad[place] <= high_ik:
-                c = index.neighbor[place]
-                place += 1
+            first, last = neighbor_range(index, a, low_ik, high_ik)
+            for c in index.neighbor[first:last]:
                 tried[1] += 1
                 if not low_jk <= angle(index.vectors[b], index.vectors[c]) <= high_jk:
                     continue
@@ -322,12 +320,11 @@ def _partner(
     """
     best = -1
     least = np.inf
-    place = first_neighbor(index, stars[0], gate[0])
+    begin, end = neighbor_range(index, stars[0], gate[0], gate[3])
     tried[1] += 3
-    while place < index.first[stars[0] + 1] and index.separation_rad[place] <= gate[3]:
+    for place in range(begin, end):
         d = index.neighbor[place]
         difference = abs(np.cos(index.separation_rad[place]) - gate[6])
-        place += 1
         tried[1] += 1
         # The angles to the second and third star of the base.
         fits = d != stars[1] and d != stars[2]
