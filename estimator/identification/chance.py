@@ -40,8 +40,10 @@ def log10_tail(trials: int, hits: int, p: float) -> float:
         return 0.0
     total = 0.0
     for k in range(hits, trials + 1):
+        # ln C(trials, k)
         ways = lgamma(trials + 1.0) - lgamma(k + 1.0) - lgamma(trials - k + 1.0)
         total += np.exp(ways + k * log(p) + (trials - k) * log(1 - p))
+    # The floor keeps a hopeless match finite.
     return np.log10(max(total, 1e-300))
 
 
@@ -52,6 +54,7 @@ def counts_dex(matched: int, missing: int) -> float:
     The detection probability is unknown, with a uniform prior: the integral of p^m (1 - p)^k over p is the Beta
     function m! k! / (m + k + 1)!.
     """
+    # ln B = ln m! + ln k! - ln (m + k + 1)!, with n! = gamma(n + 1).
     return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(
         10.0
     )
@@ -100,6 +103,7 @@ def required_matches(
     """
     total = len(sigma)
     match_dex = light_dex - log10(2 * pi * least(sigma) ** 2 * total / field_area)
+    # The least count whose evidence suffices.
     for count in range(MIN_EVIDENCE_MATCHES, total):
         if count * match_dex + attitude_dex - log10(count + 1.0) >= min_dex:
             return count

@@ -167,11 +167,13 @@ def match_nearest(
     for n in range(len(rays)):
         ray = vectors.row(rays, n)
         x, y, z = vectors.rotate(R_ref_from_cam, ray)
+        # The uncertain focal length or distortion adds an error that grows with the angle from the boresight.
         radius = tolerance + (
             stretch * np.arccos(min(max(ray[2], -1.0), 1.0)) if stretch > 0 else 0.0
         )
         covered_sr += density * pi * radius**2
         best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
+        # A catalog star that is used already cannot match again.
         is_used = False
         for m in range(count):
             is_used = is_used or star[m] == best
@@ -203,12 +205,14 @@ def log10_chance(groups: NDArray, count: int, p: float) -> float:
     second = 0
     further = 0
     for n in range(len(groups)):
+        # Number of earlier matches of the same group.
         earlier = 0
         for m in range(n):
             earlier += groups[m] == groups[n]
         independent += earlier == 0
         second += earlier == 1
         further += earlier > 1
+    # Three independent matches define the attitude: the others are trials.
     tail = log10_tail(max(count - 3 - second - further, 0), independent - 3, p)
     # log10 2 = 0.3.
     return tail - second - 0.3 * further

@@ -58,6 +58,7 @@ class LedCode:
 
     def __post_init__(self) -> None:
         levels = checks.floats("code: levels", self.levels, (None, None))
+        # An LED with the same level in all bits has no code.
         if (
             levels.size == 0
             or not ((levels >= 0) & (levels <= 1)).all()
@@ -106,9 +107,11 @@ class LedCode:
         error
             (P, N) standard deviation of the level by that of the phase
         """
+        # Synchronized: the frame shows one bit, without an error of the phase.
         if self.bit_time_s is None:
             shown = self.levels[None, :, frame % self.bits]
             return shown, np.zeros_like(shown)
+        # Free-running: begin and length of the exposure, in bits, at each phase.
         begin = begin_s / self.bit_time_s % self.bits + self.phases
         length = max((end_s - begin_s) / self.bit_time_s, 1e-6)
         half = 0.5 / PHASES_PER_BIT
@@ -169,9 +172,11 @@ def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, ou
         # The error by the phase is proportional to the brightness, for which the brightest frame is taken.
         for w in range(len(templates)):
             for j in range(len(weight)):
+                # Without a measurement the weight is 0.
                 weight[j] = 0.0
                 if abs(light[t, j]) < np.inf:
                     weight[j] = 1 / (sigma[t, j] ** 2 + (top * spread[w, j]) ** 2)
+            # The brightness from two starts; the better fit counts.
             least = np.inf
             for start in (_brightness(light[t], weight, templates[w], 0.0, False), top):
                 fitted = _brightness(light[t], weight, templates[w], start, True)
@@ -197,6 +202,7 @@ def _brightness(
     product = 0.0
     square = 0.0
     for j in range(len(light)):
+        # Leave out what is not measured, and gross errors.
         if weight[j] == 0 or (
             selects and (light[j] - start * template[j]) ** 2 * weight[j] > 2 * GROSS
         ):
@@ -230,6 +236,7 @@ def likely(light: Floats, templates: Floats) -> Ints:
         (W, J) templates of the words
     """
     seen = np.isfinite(light)
+    # In units of the standard deviation.
     y = light[seen] / light[seen].max() / ROUGH
     shown = templates[:, seen]
     square = np.maximum(np.einsum("wj,wj->w", shown, shown), 1e-300)
@@ -391,6 +398,7 @@ class LightTracks:
         """
         found = self.row >= 0
         if found.sum() >= 2 and elapsed_s > 0:
+            # Wahba's problem: the rotation of the points from the last frame to this one.
             turn, _ = Rotation.align_vectors(seen_m[self.row[found]], self.point_m[found])
             self.rate_rad_s = turn.as_rotvec() / elapsed_s
 
@@ -404,8 +412,10 @@ class LightTracks:
         """
         found = self.row >= 0
         dark = ~found & inside & self.goes_dark
+        # Dark tracks have a measurement of 0; those without one have NaN.
         self.light[:, self.column] = np.where(dark, 0.0, np.nan)
         self.sigma[:, self.column] = np.nan
+        # The light found, with its error.
         self.light[found, self.column] = centroids.flux[self.row[found]]
         self.sigma[found, self.column] = sigma[self.row[found]]
         # A dark frame is as uncertain as the others, whose errors are those of the light itself.
@@ -426,6 +436,7 @@ class LightTracks:
         self.light, self.sigma = np.vstack([self.light, nothing]), np.vstack([self.sigma, nothing])
         self.row = np.concatenate([self.row, new])
         self.missed = np.concatenate([self.missed, np.zeros(len(new), np.int64)])
+        # Their only measurement is that of this frame.
         first = len(self.row) - len(new)
         self.light[first:, self.column] = centroids.flux[new]
         self.sigma[first:, self.column] = sigma[new]
@@ -450,9 +461,11 @@ def _mutual_nearest(predicted_px: Floats, seen_px: Floats, gate_px: float) -> In
     if not len(predicted_px) or not len(seen_px):
         return row
     distance = np.linalg.norm(predicted_px[:, None] - seen_px, axis=2)
+    # A prediction behind the camera has no pixel.
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest = distance.argmin(axis=1)
     track = np.arange(len(row))
+    # Nearest in both directions, and within the gate.
     good = (distance.argmin(axis=0)[nearest] == track) & (distance[track, nearest] <= gate_px)
     row[good] = nearest[good]
     return row

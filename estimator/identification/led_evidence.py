@@ -110,6 +110,7 @@ def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> 
     """
     if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
         return 0.0
+    # Difference of the logarithms in standard deviations.
     z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
     as_led = exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
     return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
@@ -165,6 +166,7 @@ def evaluate(
     dex = -np.inf
     for _ in range(2):
         if len(observed) < MIN_EVIDENCE_MATCHES:
+            # Too few matches determine no attitude.
             return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
         # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
         info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
@@ -245,6 +247,7 @@ def _match(
             continue
         x = qx / qz
         y = qy / qz
+        # The gate of an LED: the errors of the attitude at its place and of a detection.
         variance = base_variance + direction_variance * (
             (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
         )
@@ -257,6 +260,7 @@ def _match(
                 best = n
                 distance2 = residual2 / detections.sigma[n] ** 2
         if best < 0:
+            # A missing LED counts only well inside the field.
             missing += left < x < right and top < y < bottom
             continue
         # The slot of an earlier match of the same detection, or a new one at the end.
@@ -325,6 +329,7 @@ def _fit(
             slopes[1] = (1 - axis) * bz * by_component - bx * by_depth
             slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
             slopes[3] = focal_ratio * q[axis] / q[2]
+            # The residual, and its contribution to the gradient and to the information.
             residual = detections.tangent[observed[k], axis] - slopes[3]
             for i in range(count):
                 step[i] += weight * slopes[i] * residual
@@ -343,11 +348,13 @@ def _factorize(info: Floats, factor: Floats) -> float:
 
     The root is 0 for a singular matrix.
     """
+    # Copy the lower triangle, then factorize the copy.
     for i in range(len(info)):
         for j in range(i + 1):
             factor[i, j] = info[i, j]
     if not least_squares.cholesky(factor):
         return 0.0
+    # det info = (product of the factor's diagonal)^2
     root = 1.0
     for i in range(len(info)):
         root *= factor[i, i]

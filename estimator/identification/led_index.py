@@ -176,10 +176,12 @@ def inner_field(corners: Floats) -> tuple[Floats, Floats]:
 
 def build_grid(directions: Floats) -> DirectionGrid:
     """Grid of (L, 3) unit vectors, with one vector in a cell on average."""
+    # Turn the mean direction to +z, so that x and y tell the LEDs apart.
     mean = directions.mean(axis=0)
     R_grid_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], [mean])[0].as_matrix()
     in_grid = directions @ R_grid_from_lab.T
     flat = in_grid[:, :2]
+    # A square that holds all LEDs, with one cell for each LED.
     half_size = np.abs(flat).max() * 1.001
     side = max(int(np.sqrt(len(flat))), 1)
     cell = 2 * half_size / side
@@ -202,6 +204,7 @@ def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:
         (L,) factor of each LED
     """
     first, second = index.pair.T
+    # The order of the pairs changes with the angles, and with it the k-vector.
     angle = index.angle_rad * (scale[first] + scale[second]) / 2
     order = np.argsort(angle, kind="stable")
     kvector, slope, offset = k_vector(angle[order])
@@ -220,5 +223,6 @@ def cap_height(directions: Floats, margin_rad: float) -> float:
     The solid angle of the cap is 2 pi times this.
     """
     mean = directions.mean(axis=0)
+    # Cosine of the angle of the LED farthest from the mean.
     nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))

@@ -129,6 +129,7 @@ def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
     count = len(match.observed)
     if count < lights / 2 or (count == 2 and lights > 2):
         return False
+    # Best misfit at one common phase, and at a phase of its own for each light.
     together = misfit[:, match.observed, match.star].sum(axis=1).min()
     apart = misfit.min(axis=(0, 2))[match.observed].sum()
     return bool(together - apart <= TRUSTED * np.sqrt(count))
@@ -146,6 +147,7 @@ def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
     """
     apart = np.linalg.norm(ray[:, None] - ray, axis=2)
     names = (excess <= REACH).sum(axis=1).astype(float)
+    # The number of pairs of names; infinite for lights that are too close together.
     cost = np.where(apart >= apart.max() / 2, names[:, None] * names, np.inf)
     np.fill_diagonal(cost, np.inf)
     first, second = np.unravel_index(int(cost.argmin()), cost.shape)
@@ -199,12 +201,14 @@ def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, 
     found = 0
     for a in range(len(u)):
         for b in range(len(v)):
+            # Cosine of the angle that is seen, and of the angle that is known.
             cosine = u[a, 0] * v[b, 0] + u[a, 1] * v[b, 1] + u[a, 2] * v[b, 2]
             known = (
                 known_u[a, 0] * known_v[b, 0]
                 + known_u[a, 1] * known_v[b, 1]
                 + known_u[a, 2] * known_v[b, 2]
             )
+            # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
                     pairs[found, 0] = a
@@ -275,9 +279,11 @@ def _evaluate(
     offset = offset - sphere.pupil_m[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         tangent = np.where(offset[:, 2:] > 0, offset[:, :2] / offset[:, 2:], np.inf)
+    # Geometry of the pair, for the error of its attitude.
     seen = lights.ray[:, :2] / lights.ray[:, 2:]
     middle = seen[list(pair)].mean(axis=0)
     length2 = np.sum((seen[pair[0]] - seen[pair[1]]) ** 2)
+    # Misfit of the pair's two codes.
     total = excess[pair[0], names[:, 0]] + excess[pair[1], names[:, 1]]
     star = np.full((len(names), len(seen)), -1)
     star[:, pair] = names
@@ -292,6 +298,7 @@ def _evaluate(
         cost[:, :-1] = np.where(squared < GATE_SIGMA**2, squared / 2 + excess[light], np.inf)
         np.put_along_axis(cost, star[:, named], np.inf, axis=1)  # an LED is one light at most
         cost[:, -1] = STRANGER
+        # The best name of this light, or none.
         star[:, light] = cost.argmin(axis=1)
         total = total + cost.min(axis=1)
         star[star[:, light] == len(sphere.position_m), light] = -1

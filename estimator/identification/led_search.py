@@ -237,9 +237,11 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
+            # Coincident detections have no direction between them.
             if not length > MIN_SEPARATION:
                 continue
             begin, end, _ = _pair_range(detections, dome, a, b)
+            # The cost: number of LED pairs, or one beyond all of these for a short pair.
             pair[count, 0] = a
             pair[count, 1] = b
             cost[count] = end - begin if length >= min_length else 1e9 - length
@@ -270,10 +272,12 @@ def _pair_range(
     )
     direction_a = vectors.row(detections.direction, a)
     direction_b = vectors.row(detections.direction, b)
+    # The angle about the bearing, for LEDs at the median radius.
     angle = 2 * np.arcsin(min(vectors.chord(direction_a, direction_b) / 2, 1.0))
     # The index holds angles that are scaled to the median radius, with an error.
     slack = gate + dome.scaling_error_rad
     uncertainty = detections.focal_uncertainty
+    # An uncertain focal length widens the range in proportion.
     begin, end = pair_range(
         dome.pairs, angle / (1 + uncertainty) - slack, angle / (1 - uncertainty) + slack
     )
@@ -306,10 +310,11 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
     for other in range(len(pairs)):
         penalty = 0
         for end in range(2):
+            # Each end costs 3 if it is not matched, and 1 if it is shared.
             is_matched = False
             for n in best.observed:
                 is_matched = is_matched or n == pairs[other, end]
-            penalty += 3 * (not is_matched)  # an unmatched detection is worse than two shared ones
+            penalty += 3 * (not is_matched)
             penalty += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
         if penalty < cost:
             best_rank = other
@@ -437,6 +442,7 @@ def _fit_focal_ratio(
     """
     focal_ratio = 1.0
     if detections.focal_uncertainty > 0:
+        # f <- f chord(f) / chord of the LEDs
         for _ in range(3):
             direction_a = _direction_from_bearing(
                 _ray(detections, a, focal_ratio), dome, radius_a_m
@@ -467,6 +473,7 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
         Unit vector p / R
     """
     px, py, pz = dome.pupil_m
+    # u . r, then the distance s along the ray.
     along = ray[0] * px + ray[1] * py + ray[2] * pz
     distance = -along + sqrt(
         max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
@@ -484,6 +491,7 @@ def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
     """Greatest evidence that the brightness of any light can give, for `required_matches`."""
     if len(detections.light_density) == 0:
         return 0.0
+    # The peak of the LED's density over the least density of a light.
     return -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
 
 
@@ -497,11 +505,13 @@ def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) ->
     separation and s the least sigma of all detections. V is the prior volume. An uncertain focal length, known to
     sqrt(2) s / D from the pair, contributes sqrt(2 pi) sqrt(2) s / D over the width of its range.
     """
+    # Attitude.
     sigma = least(detections.sigma)
     length = separation(detections.tangent, a, b)
     attitude_dex = (
         1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
     )
+    # Focal length: its posterior width over the width of its range.
     if detections.focal_uncertainty > 0:
         attitude_dex += log10(
             sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty)
@@ -528,6 +538,7 @@ def _pair_gates(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> F
     out = np.empty(len(detections.ray))
     for n in range(len(out)):
         distance2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
+        # As seen by the camera, then about the bearing.
         gate = GATE_SIGMA * detections.sigma[n] * sqrt(1.5 + direction_variance * distance2)
         out[n] = gate * _bearing_angle_ratio(dome) + dome.scaling_error_rad
     return out
@@ -572,6 +583,7 @@ def _quick_check(
     total = len(detections.ray)
     radius_offset_m = radius_m - dome.median_radius_m
     for n in range(total):
+        # Reached or out of reach.
         if count >= required or count + total - n < required:
             break
         if n in (a, b):
@@ -601,6 +613,7 @@ def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
     inverse = 1 / grid.cell
     half = grid.side / 2
     reach = gate / grid.cell
+    # Place in units of cells.
     x = direction[0] * inverse + half
     y = direction[1] * inverse + half
     # The cells that a square of this half-width about the direction meets; those of a line are contiguous.

@@ -72,12 +72,14 @@ def candidates(
         The camera with the focal length of the step, and cam_from_ref
     """
     identify = IDENTIFIERS[identifier]
+    # Steps on either side of the assumed focal length, the nearest first.
     steps = int(np.ceil(focal_uncertainty / STEP - 0.5))
     stretch = STRETCH if focal_uncertainty else CALIBRATED
     zooms = sorted((n * STEP for n in range(-steps, steps + 1)), key=abs)
     for triangles, most_checks in EFFORTS:
         for zoom in zooms:
             zoomed = camera.zoomed(1 + zoom)
+            # The tolerance is four standard deviations, but at least a pixel, for errors of the calibration.
             match = identify(
                 zoomed.rays(centroids.xy_px),
                 index,

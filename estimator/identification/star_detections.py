@@ -151,10 +151,12 @@ def changed(
     sigma = np.empty(count)
     weight = np.empty((count, 3))
     factor = sqrt(variance)
+    # The inverse covariance falls as the variance grows.
     for n in range(count):
         sigma[n] = detections.sigma[n] * factor
         for k in range(3):
             weight[n, k] = detections.weight[n, k] / variance
+    # A part of the detections has no limiting magnitude.
     return Detections(
         detections.tangent[:count],
         sigma,

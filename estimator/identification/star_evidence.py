@@ -247,6 +247,7 @@ def _match(
         s, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
         if s < 0:
             continue
+        # The gate is a circle; an elongated error ellipse asks for the Mahalanobis distance.
         distance2 = squared_mahalanobis(detections, sky, R, focal_ratio, n, s)
         if distance2 > max_sigma**2:
             continue
@@ -290,6 +291,7 @@ def count_near(
     for n in range(len(gates)):
         if matched[n]:
             continue
+        # The star nearest to the detection's direction in the catalog's frame.
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
         gate = min(gates[n], 0.05)
         s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
@@ -405,6 +407,7 @@ def _fit(
     for i in range(4):
         for j in range(i):
             info[j, i] = info[i, j]
+    # Apply the step; its squared length is the predicted fall of chi-square.
     vectors.rotate_in_place(step[:3], R)
     fall = 0.0
     for i in range(count):
@@ -421,6 +424,7 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
     x = b.copy()
     for i in range(len(b)):
         for j in range(i + 1):
+            # a_ij - sum over k < j of L_ik L_jk, then the pivot or the quotient.
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
@@ -570,6 +574,7 @@ def _magnitude_ratio(
     if not np.isfinite(difference):
         return 1.0
     relative_density = magnitude_density(sky, detections.mag[detection]) / fraction_brighter
+    # The Gaussian density of the difference.
     likelihood = (
         np.exp(-0.5 * (difference / detections.mag_sigma) ** 2)
         / detections.mag_sigma
@@ -607,6 +612,7 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         tx = detections.tangent[observed, 0]
         ty = detections.tangent[observed, 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
+    # Two residuals for each match, of which `count` are used up by the fit.
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)
     xyzw = vectors.quaternion_xyzw(hypothesis.R_cam_from_ref)

@@ -89,6 +89,7 @@ def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks:
                     candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
+                    # Give up when the effort is used up.
                     if checks[0] > max_checks:
                         return no_hypothesis()
     return no_hypothesis()
@@ -165,6 +166,7 @@ def _longest_first(tangent: Floats, quad: Ints) -> None:
     second = 1
     for m in range(4):
         for k in range(m):
+            # The pair (k, m) farthest apart so far.
             length = vectors.chord(ray(tangent, quad[k], 1.0), ray(tangent, quad[m], 1.0))
             if length > longest:
                 longest = length

@@ -197,6 +197,7 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
     The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
     """
     trace = 0.0
+    # trace(R1^T R2) = sum of the products of the elements.
     for i in range(3):
         for j in range(3):
             trace += first.R_cam_from_ref[i, j] * second.R_cam_from_ref[i, j]
@@ -222,6 +223,7 @@ def _pair_lengths(detections: Detections) -> Floats:
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
+            # A short pair comes after all others.
             if length < min_length:
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
             out[a, b] = length
@@ -269,6 +271,7 @@ def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int
     best_b = 1
     for a in range(len(weight)):
         for b in range(a + 1, len(weight)):
+            # The costs change with every attempt: sorting the pairs once would not do.
             cost = length[a, b] * weight[a] * weight[b]
             if cost < best and not tried[a, b]:
                 best = cost
@@ -454,6 +457,7 @@ def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64
     out = np.empty(total, np.int64)
     count = 0
     for step in range(total):
+        # Wrap around at the end.
         n = (start + step) % total
         if n not in (a, b):
             out[count] = n
@@ -480,6 +484,7 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float
         Ratio of the true to the assumed focal length
     """
     focal_ratio = chord / target
+    # f <- f chord(f) / target
     for _ in range(2):
         focal_ratio *= (
             vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
@@ -509,6 +514,7 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     out = np.empty(len(detections.sigma))
     for n in range(len(out)):
         distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        # The detection's variance, that of the midpoint, and that of the direction at this distance.
         out[n] = GATE_SIGMA * sqrt(
             detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
         )
@@ -528,6 +534,7 @@ def attitude_dex(detections: Detections, a: int, b: int) -> float:
     sigma = least(detections.sigma)
     direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
     dex = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * direction_sigma) - prior_volume_dex(detections)
+    # An uncertain focal length is as well known as the roll.
     if detections.focal_uncertainty > 0:
         dex += log10(sqrt(2 * pi) * direction_sigma)
     return dex

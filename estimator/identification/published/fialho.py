@@ -210,6 +210,7 @@ def fialho_4(
     if match is None:
         return None
     magnitudes = Options(**options).magnitudes(len(vectors_cam))
+    # Errors of the magnitudes of the identified stars.
     offset_mag = magnitudes[match.observed] - index.magnitude[match.star]
     return MagnitudeMatch(
         match.observed,
@@ -283,6 +284,7 @@ def search(
                 if count >= options.triangles or tried[1] >= options.checks:
                     return no_match()
                 next_corners = np.array([i, i + dj, i + dj + dk])
+                # Not the first triangle again, and none that is too small.
                 if (next_corners == corners).all() or _shortest_side(
                     rays, next_corners
                 ) < min_side_rad:
@@ -308,6 +310,7 @@ def _brightest(rays: Floats, base: int, min_side_rad: float) -> NDArray:
         for j in range(i + 1, base):
             if angle(rays[i], rays[j]) < min_side_rad:
                 continue
+            # The first triangle in the order of brightness whose sides are long enough.
             for k in range(j + 1, base):
                 corners = np.array([i, j, k])
                 if _shortest_side(rays, corners) >= min_side_rad:
@@ -335,6 +338,7 @@ def triplets(
     """
     i, j, k = corners
     sides = np.array([angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])])
+    # The index holds no longer pairs.
     if sides.max() > index.max_angle_rad:
         return no_match()
     tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides
@@ -354,6 +358,7 @@ def _direct_match(
 ) -> DirectMatch:
     """Step 4: the direct match of one triplet; empty if too few stars match or it is not significant."""
     match = match_field(rays, index, corners, stars, options.tolerance_rad, options.stretch, tried)
+    # The paper's threshold on the number of matches, and the added one on their significance.
     if (
         len(match.observed) <= options.min_fraction * len(rays)
         or match.log10_chance > ACCEPT_LOG10_CHANCE

@@ -173,6 +173,7 @@ def _count_angles(
             continue
         side = angle(rays[master], rays[n])
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
+        # Catalog stars at this angle from the candidate; one is enough.
         begin, end = neighbor_range(index, candidate, side - tolerance, side + tolerance)
         tried[1] += 1
         count += end > begin
@@ -215,10 +216,12 @@ def _best_match(
             stars = np.array([candidate, second], np.int64)
             tried[0] += 1
             tried[1] += len(rays)
+            # The attitude of the master and the second star, matched to the whole field.
             pair = np.array([master, n])
             match = match_field(
                 rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0]
             )
+            # The worse of two matches that contradict each other is a rival.
             if len(match.observed) and _contradict(best, match):
                 rival[0] = min(rival[0], max(best.log10_chance, match.log10_chance))
             if match.log10_chance < best.log10_chance:

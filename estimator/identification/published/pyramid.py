@@ -147,6 +147,7 @@ def _triangle(
     ik = angle(rays[i], rays[k])
     jk = angle(rays[j], rays[k])
     t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array([ij, ik, jk])
+    # Short sides carry little information, and the index holds no longer pairs.
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return no_match()
     # If the three sides agree on one focal length, only the lens distortion remains of the stretch.
@@ -219,6 +220,7 @@ def _pyramid(
     """
     for r in range(options.base):
         tried[2] += 1
+        # The fourth star is none of the corners.
         if r == corners[0] or r == corners[1] or r == corners[2]:
             continue
         # Catalog stars d at the angle of r from the first corner.
@@ -243,6 +245,7 @@ def _scale_tangents(rays: Floats, factor: float) -> Floats:
     """The (N, 3) unit vectors with their tangents multiplied by a factor, as if the focal length were shorter by it."""
     out = np.empty_like(rays)
     for n in range(len(rays)):
+        # Scale the tangents, then normalize.
         z = rays[n, 2]
         x = rays[n, 0] / z * factor
         y = rays[n, 1] / z * factor
@@ -267,6 +270,7 @@ def _match_with_penalty(
     match = match_field(rays, index, corners, stars, options.tolerance, stretch, hypotheses)
     if len(match.observed) == 0 or options.missed_dex <= 0:
         return match
+    # Catalog stars that the attitude puts into the field and that are not matched.
     missing = max(
         _count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0
     )
@@ -289,6 +293,7 @@ def _count_in_field(
     begin = index.first[center]
     end = index.first[center + 1]
     for place in range(begin - 1, end):
+        # The star itself, then its neighbors.
         s = center if place < begin else index.neighbor[place]
         x, y, z = R_cam_from_ref @ index.vectors[s]
         inside = (

@@ -138,6 +138,7 @@ def triad(a: Floats, b: Floats) -> Floats:
     rows[0] = a + b
     rows[1] = a - b
     rows[2] = np.cross(b, a)
+    # Normalize.
     for n in range(3):
         rows[n] /= np.sqrt(rows[n, 0] ** 2 + rows[n, 1] ** 2 + rows[n, 2] ** 2)
     return rows
@@ -241,6 +242,7 @@ def match_assumptions(
     partner = np.empty(len(primary.others), np.int64)
     partner_cost = np.empty(len(primary.others))
     for p in range(len(pairs)):
+        # Skip pairs outside of the gate, which whole buckets include.
         misfit = abs(angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad)
         if misfit > gate:
             continue
@@ -255,6 +257,7 @@ def match_assumptions(
             star[count] = -1
             star[count, a] = first
             star[count, b] = second
+            # The cost of the pair: its angle and its two magnitudes.
             total = (misfit / stars.gates.separation_rad) ** 2 + cost_a + cost_b
             # 5. and 6. The attitude and the direct match; then the cost.
             _partners(stars, primary, first, second, nearby, partner, partner_cost)
@@ -333,6 +336,7 @@ def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
         if partner[k] < 0:
             continue
         count += 1
+        # An earlier observed star with the same partner: the one of greater cost loses it.
         for m in range(k):
             if partner[m] == partner[k]:
                 loser = k if partner_cost[m] <= partner_cost[k] else m
@@ -360,6 +364,7 @@ def add_contradictions(
     """
     for n in range(len(cost)):
         for m in range(len(best)):
+            # One star identified differently is enough.
             if star[n, m] >= 0 and best[m] >= 0 and star[n, m] != best[m]:
                 contradictions[0] += 1
                 contradictions[1] += matches[n]
@@ -408,6 +413,7 @@ def saa(
         raise ImageError(
             f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"
         )
+    # The tolerance of a direction is three standard deviations.
     gates = Gates(float(sep_rad), tolerance_rad / 3, settings.epsilon_mag, settings.stretch)
     stars = SearchInput(
         np.ascontiguousarray(vectors_cam),
@@ -482,6 +488,7 @@ class AssumptionPool:
         On a lattice, false assumptions match often. The match rate of those that contradict the best one is
         therefore measured, and the greater of it and of p counts.
         """
+        # The pair defines the attitude: the other stars are trials.
         trials = len(self.star) - 2
         hits = int((self.star >= 0).sum()) - 2
         if hits + 2 < MIN_MATCHES:
@@ -499,6 +506,7 @@ class AssumptionPool:
         count, _, rival_cost = self._contradictions
         if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
             return None
+        # The attitude of all matches.
         observed = np.flatnonzero(self.star >= 0)
         star = self.star[observed].astype(np.int64)
         cam_from_ref = quest(
@@ -577,6 +585,7 @@ def _chance_statistics(
     # Those that can be partners: within reach of the pair, and not of the pair itself.
     rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
     rows = rows[(rows != pair[0]) & (rows != pair[1])]
+    # Of these, the number of similar brightness, for each observed star.
     difference_mag = np.abs(stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows])
     # NaN > x is False: an unknown magnitude passes.
     similar = len(rows) - (difference_mag > 3 * stars.gates.magnitude).sum(axis=1)

@@ -129,6 +129,7 @@ def shefex(
         raise ImageError(f"shefex: tolerance {tolerance_rad} rad; allowed: more than 0")
     if len(vectors_cam) < MIN_MATCHES:
         return None
+    # cosError is one number for all angles: the stretch counts at the greatest angle.
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
@@ -182,6 +183,7 @@ def _triangle(
     ij = angle(rays[i], rays[j])
     ik = angle(rays[i], rays[k])
     jk = angle(rays[j], rays[k])
+    # Short sides carry little information, and the index holds no longer pairs.
     if (
         min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad
         or max(ij, ik, jk) > index.max_angle_rad
@@ -191,6 +193,7 @@ def _triangle(
     low, high = angle_interval(ij, options.cos_error)
     low_ik, high_ik = angle_interval(ik, options.cos_error)
     low_jk, high_jk = angle_interval(jk, options.cos_error)
+    # The gates of the other stars are the same for all catalog triangles.
     gates = _angle_gates(rays, corners, options)
     # 2. Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = pair_range(index, low, high)
@@ -233,10 +236,12 @@ def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floa
     gates = np.zeros((len(rays), 10))
     side = np.empty(3)
     for n in range(len(rays)):
+        # Each angle's interval and cosine.
         for m in range(3):
             side[m] = angle(rays[corners[m]], rays[n])
             gates[n, m], gates[n, 3 + m] = angle_interval(side[m], options.cos_error)
             gates[n, 6 + m] = np.cos(side[m])
+        # A star too close to the base keeps the area 0.
         if side.min() >= MIN_SIDE_TOLERANCES * options.tolerance_rad:
             gates[n, 9] = _gate_area(rays, corners, n, side, gates[n, 3:6] - gates[n, :3])
     return gates
@@ -324,6 +329,7 @@ def _partner(
     tried[1] += 3
     for place in range(begin, end):
         d = index.neighbor[place]
+        # The angle to the first star of the base.
         difference = abs(np.cos(index.separation_rad[place]) - gate[6])
         tried[1] += 1
         # The angles to the second and third star of the base.
@@ -354,6 +360,7 @@ def _same_side(
         a = m
         b = (m + 1) % 3
         volume = triple(rays[corners[a]], rays[corners[b]], rays[n])
+        # The line farthest from the star decides: noise cannot move the star across it.
         if abs(volume) > best:
             best = abs(volume)
             product = volume * triple(
@@ -384,6 +391,7 @@ def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floa
         a = m
         b = (m + 1) % 3
         volume = abs(triple(rays[corners[a]], rays[corners[b]], rays[n]))
+        # Sine of the angle at which the rings cross.
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)
     return least
