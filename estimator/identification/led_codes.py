@@ -59,11 +59,8 @@ class LedCode:
     def __post_init__(self) -> None:
         levels = checks.floats("code: levels", self.levels, (None, None))
         # An LED with the same level in all bits has no code.
-        if (
-            levels.size == 0
-            or not ((levels >= 0) & (levels <= 1)).all()
-            or not (np.ptp(levels, axis=1) > 0).all()
-        ):
+        in_range = ((levels >= 0) & (levels <= 1)).all()
+        if levels.size == 0 or not in_range or not (np.ptp(levels, axis=1) > 0).all():
             raise ImageError(
                 "code: levels; allowed: 0 to 1, of each LED two different ones or more"
             )
@@ -275,6 +272,7 @@ def expected_misfit(measured: Floats | Ints) -> Floats:
 BORDER_PX = 30.0  # an LED nearer to the border of the sensor may be undetected
 
 
+@dataclass(eq=False)
 class LightTracks:
     """Tracks of the lights of a field, with the brightness of each in the last frames (see the module's steps).
 
@@ -308,23 +306,15 @@ class LightTracks:
         Column of the last frame
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        pupil_m: Floats,
-        radius_m: float,
-        frames: int,
-        gate_px: float,
-        patience: int,
-        goes_dark: bool,
-    ) -> None:
-        self.camera = camera
-        self.pupil_m = pupil_m
-        self.radius_m = radius_m
-        self.frames = frames
-        self.gate_px = gate_px
-        self.patience = patience
-        self.goes_dark = goes_dark
+    camera: Camera
+    pupil_m: Floats
+    radius_m: float
+    frames: int
+    gate_px: float
+    patience: int
+    goes_dark: bool
+
+    def __post_init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -368,22 +358,15 @@ class LightTracks:
         # 3. Measure the motion.
         self._measure_motion(seen_m, elapsed_s)
         found = self.row >= 0
-        self.point_m = np.where(
-            found[:, None], seen_m[self.row] if len(seen_m) else predicted_m, predicted_m
-        )
-        # 4. Record the brightness.
-        self._record(
-            centroids, sigma, self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX)
-        )
+        self.point_m = predicted_m
+        self.point_m[found] = seen_m[self.row[found]]
+        # 4. Record the brightness. A point behind the camera has no pixel: it is outside of the sensor.
+        xy_px = np.nan_to_num(xy_px, nan=-1e9)
+        self._record(centroids, sigma, self.camera.contains(xy_px, BORDER_PX))
         # 5. End tracks and begin new ones.
         self.missed = np.where(found, 0, self.missed + 1)
-        self._keep(
-            found
-            | (
-                (self.missed <= self.patience)
-                & self.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
-            )
-        )
+        waits = (self.missed <= self.patience) & self.camera.contains(xy_px)
+        self._keep(found | waits)
         self._begin(centroids, sigma, seen_m)
 
     def _measure_motion(self, seen_m: Floats, elapsed_s: float) -> None:
@@ -433,7 +416,8 @@ class LightTracks:
         new = np.setdiff1d(np.arange(len(centroids)), self.row)
         nothing = np.full((len(new), self.frames), np.nan)
         self.point_m = np.vstack([self.point_m, seen_m[new]])
-        self.light, self.sigma = np.vstack([self.light, nothing]), np.vstack([self.sigma, nothing])
+        self.light = np.vstack([self.light, nothing])
+        self.sigma = np.vstack([self.sigma, nothing])
         self.row = np.concatenate([self.row, new])
         self.missed = np.concatenate([self.missed, np.zeros(len(new), np.int64)])
         # Their only measurement is that of this frame.

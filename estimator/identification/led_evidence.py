@@ -163,15 +163,15 @@ def evaluate(
     observed, star, missing = _match(
         detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
     )
-    dex = -np.inf
     for _ in range(2):
+        dex = -np.inf
+        # Too few matches determine no attitude.
         if len(observed) < MIN_EVIDENCE_MATCHES:
-            # Too few matches determine no attitude.
-            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+            break
         # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
         info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
-            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+            break
         # 3. Match again.
         observed, star, missing = _match(
             detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0
@@ -180,9 +180,9 @@ def evaluate(
         dex = _evidence(
             detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
         )
-    return LedHypothesis(
-        observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf
-    )
+    if len(observed) < MIN_EVIDENCE_MATCHES:
+        dex = -np.inf
+    return LedHypothesis(observed, star, R_cam_from_lab, dex)
 
 
 @jit

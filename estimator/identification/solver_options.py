@@ -59,6 +59,12 @@ class Options:
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
 
+    @staticmethod
+    def require_tolerance(name: str, tolerance_rad: float) -> None:
+        """Raise ImageError unless the tolerance of method `name` is positive."""
+        if not tolerance_rad > 0:
+            raise ImageError(f"{name}: tolerance {tolerance_rad} rad; allowed: more than 0")
+
     def require_known_focal(self, name: str) -> None:
         """Raise ImageError if the focal length is uncertain, as method `name` needs calibrated angles."""
         if self.focal_unknown:

@@ -196,7 +196,7 @@ def evaluate(
                 break
     # 5. The evidence. A literal True in place of `with_residuals` would be compiled as another type.
     matched = len(observed)
-    with_residuals = len(observed) > 0
+    with_residuals = matched > 0
     dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, with_residuals)
     # Missing stars only reduce the evidence: count them if it suffices without any.
     if dex + counts_dex(matched, 0) < min_dex:
@@ -321,10 +321,10 @@ def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis
 
 
 @jit
-def project(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
-    """Project a star into camera axes: x / z, y / z, and z."""
+def project(vectors_ref: Floats, R: Floats, star: int) -> tuple[float, float]:
+    """Tangents x / z and y / z of a star in camera axes."""
     x, y, z = vectors.rotate(R, vectors.row(vectors_ref, star))
-    return x / z, y / z, z
+    return x / z, y / z
 
 
 @jit
@@ -332,7 +332,7 @@ def squared_mahalanobis(
     detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, detection: int, star: int
 ) -> float:
     """Squared Mahalanobis distance of a detection from a star's predicted image: r^T W r, W the inverse covariance."""
-    x, y, _ = project(sky.vectors, R, star)
+    x, y = project(sky.vectors, R, star)
     dx = detections.tangent[detection, 0] - focal_ratio * x
     dy = detections.tangent[detection, 1] - focal_ratio * y
     xx, yy, xy = vectors.row(detections.weight, detection)
@@ -382,7 +382,7 @@ def _fit(
     vectors_ref = sky.vectors
     for k in range(len(observed)):
         # Derivatives of the predicted tangents.
-        x, y, _ = project(vectors_ref, R, star[k])
+        x, y = project(vectors_ref, R, star[k])
         d_x[0] = -f * x * y
         d_x[1] = f * (1 + x * x)
         d_x[2] = -f * y
@@ -454,7 +454,7 @@ def _count_missing(
     if np.isfinite(detections.limit_mag):
         faintest = first_from(sky.mag, 0, len(sky.mag), detections.limit_mag) - 1
     for s in star:
-        x, y, _ = project(sky.vectors, R, s)
+        x, y = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
         faintest = max(faintest, s)
     return _count_inside(sky, R, field, faintest) - matched
@@ -608,7 +608,7 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         chi2 += squared_mahalanobis(
             detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
         )
-        x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, star)
+        x, y = project(stars.vectors, hypothesis.R_cam_from_ref, star)
         tx = detections.tangent[observed, 0]
         ty = detections.tangent[observed, 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2

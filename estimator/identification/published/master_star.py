@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -89,8 +89,7 @@ def master_star(
     """
     settings = Options(**options)
     settings.require_known_focal("master_star")
-    if not tolerance_rad > 0:
-        raise ImageError(f"master_star: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("master_star", tolerance_rad)
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -89,8 +89,7 @@ def pyramid(
         Unless the tolerance is positive.
     """
     settings = Options(**options)
-    if not tolerance_rad > 0:
-        raise ImageError(f"pyramid: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("pyramid", tolerance_rad)
     if len(vectors_cam) < MIN_MATCHES:
         return None
     parameters = PyramidOptions(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -125,8 +125,7 @@ def shefex(
     """
     settings = Options(**options)
     settings.require_known_focal("shefex")
-    if not tolerance_rad > 0:
-        raise ImageError(f"shefex: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("shefex", tolerance_rad)
     if len(vectors_cam) < MIN_MATCHES:
         return None
     # cosError is one number for all angles: the stretch counts at the greatest angle.
