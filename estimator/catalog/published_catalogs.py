@@ -249,8 +249,7 @@ def chosen(stars: StarCatalog) -> StarCatalog:
     return uniform(asymmetric(stars), COUNT, BRIGHT_MAG)
 
 
-Selection = Callable[[StarCatalog], StarCatalog]
-CATALOGS: dict[str, Selection] = {
+CATALOGS: dict[str, Callable[[StarCatalog], StarCatalog]] = {
     "asymmetric": asymmetric,
     "uniform": lambda stars: uniform(stars.take(stars.v_mag <= 5.75), COUNT),
     "chosen": chosen,

@@ -39,8 +39,8 @@ from estimator.catalog.sky_index import (
     MAG_STEP,
     SkyIndex,
     cell_of,
-    edge_cell,
     nearest,
+    within,
 )
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
@@ -474,24 +474,18 @@ def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int
     left, right, top, bottom = field
     # Chord of the angle from the boresight to the farthest corner.
     corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
-    chord = sqrt(2 - 2 / sqrt(1 + corner2))
+    # A hair longer, so that rounding excludes no star in a corner.
+    chord = sqrt(2 - 2 / sqrt(1 + corner2)) * (1 + 1e-9)
     bx, by, bz = vectors.row(R, 2)
-    # The cells that a box of this half-width about the boresight meets; those adjacent in z are adjacent in the list.
-    side = sky.cells.side
-    first = sky.cells.first
-    row = sky.cells.row
-    vectors_ref = sky.vectors
+    # Stars within the circle around the field, then those in the field.
+    near = np.empty(len(sky.vectors), np.int64)
+    count = within(sky.cells, sky.vectors, bx, by, bz, chord, near)
     inside = 0
-    low = edge_cell(bz - chord, side)
-    high = edge_cell(bz + chord, side) + 1
-    for i in range(edge_cell(bx - chord, side), edge_cell(bx + chord, side) + 1):
-        for j in range(edge_cell(by - chord, side), edge_cell(by + chord, side) + 1):
-            column = (i * side + j) * side
-            for entry in range(first[column + low], first[column + high]):
-                if row[entry] > faintest:
-                    continue
-                x, y, z = vectors.rotate(R, vectors.row(vectors_ref, row[entry]))
-                inside += left * z < x < right * z and top * z < y < bottom * z
+    for s in near[:count]:
+        if s > faintest:
+            continue
+        x, y, z = vectors.rotate(R, vectors.row(sky.vectors, s))
+        inside += left * z < x < right * z and top * z < y < bottom * z
     return inside
 
 
