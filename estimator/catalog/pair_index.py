@@ -9,7 +9,7 @@ without a search:
    (`pair_range`).
 
 The separations are nearly enough linear in their rank that the range holds only a few pairs too many. The neighbor
-lists tell which stars are at a given separation from one star: for each star they hold the other stars of its pairs,
+lists give the stars at a given separation from one star: for each star they hold the other stars of its pairs,
 sorted by separation, and are searched by bisection (`first_neighbor`).
 
 `PairCatalog` groups the pairs into buckets of equal width in angle (Needelman, Li & Wu 2005, as described by Padro

@@ -14,7 +14,7 @@ prior volume of attitudes that see the dome, times the width of the range of an 
 Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil. If the
 focal length is uncertain, it is refined with the attitude: `focal_ratio` is the true one over the assumed one.
 
-The steps of `evaluate`; the same numbers stand in the code:
+The steps of `evaluate`; the same numbers return as comments in the code:
 
 1. Match the LEDs around to the detections, within the error of the pair's attitude (`_match`).
 2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).

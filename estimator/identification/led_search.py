@@ -6,7 +6,7 @@ hypothetical LED's own radius about the bearing. This gives the direction from t
 without knowledge of the attitude. A pair of detections and a pair of LEDs must then agree in one angle about the
 bearing, and they determine an attitude, which the other detections must confirm.
 
-The steps; the same numbers stand in the code:
+The steps; the same numbers return as comments in the code:
 
 1. Convert rays to directions from the bearing, with their total errors (`build_detections`).
 2. Sort the pairs of detections by the number of LED pairs of the same angle (`_ordered_pairs`).

@@ -15,7 +15,7 @@ the fit (n = 3, or 4 with an uncertain focal length). V is the prior volume of a
 term with V is Laplace's approximation of the integral over them. By Markov's inequality, random detections reach x dex
 at any attitude in at most one of 10^x frames.
 
-The steps of `evaluate`; the same numbers stand in the code:
+The steps of `evaluate`; the same numbers return as comments in the code:
 
 1. Match each detection to its nearest star (`_match`).
 2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).

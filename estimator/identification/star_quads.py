@@ -4,7 +4,7 @@ The code of four detections (`catalog.quad_index`) hardly depends on the focal l
 same code are therefore candidates, however uncertain the focal length is. The two detections farthest apart and their
 stars determine the attitude and the focal length, which the other detections confirm as in `star_search`.
 
-The steps; the same numbers stand in the code:
+The steps; the same numbers return as comments in the code:
 
 1. Take four detections, by brightness: the four brightest, then all fours with the fifth, and so on (`_search`).
 2. Call the two farthest apart A and B, and compute the code (`_test_quad`).

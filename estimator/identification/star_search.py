@@ -6,7 +6,7 @@ other detections have catalog stars at their predicted directions. A quick check
 also determines it, from the ratio of the measured to the catalog separation, and the other detections must confirm
 both.
 
-The steps; the same numbers stand in the code:
+The steps; the same numbers return as comments in the code:
 
 1. Choose the detections and the effort: the FEW brightest first, then up to `max_detections` (`lost_in_space`).
 2. Take the pair of detections that the fewest catalog pairs are expected to match (`search`).
@@ -15,7 +15,7 @@ The steps; the same numbers stand in the code:
    reject it by its magnitudes and its separation, and compute the focal ratio and the attitude.
 5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`quick_check`).
 6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
-7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, search on for rivals only, with limited effort (`search`).
+7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
 9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
 
