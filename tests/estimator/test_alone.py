@@ -96,13 +96,13 @@ def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     catalog += "CATALOG = ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv'"
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
-    def told() -> str:
+    def printed() -> str:
         done = subprocess.run(
             [python, "-c", f"{catalog}{WORK}"], cwd=here, env=clean, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
 
-    assert told().startswith("a date needs pyerfa")
+    assert printed().startswith("a date needs pyerfa")
     subprocess.run([python, *quiet, "install", f"{wheel}[sky]"], check=True)
-    assert told() == "with a date"
+    assert printed() == "with a date"

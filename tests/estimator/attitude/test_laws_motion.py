@@ -313,15 +313,15 @@ def test_another_rate_tells_the_sign(rng: np.random.Generator) -> None:
     true = rng.normal(0, 1, 3)
     spread = 0.01 * np.eye(3)
     unsigned = RateEstimate(-true, spread, sign_known=False)
-    told = unsigned.resolved(RateEstimate(true + rng.normal(0, 0.1, 3), spread))
+    resolved = unsigned.resolved(RateEstimate(true + rng.normal(0, 0.1, 3), spread))
     if true @ true > 1:
-        assert told.sign_known
-        assert_allclose(told.rate_rad_s, true, rtol=0, atol=0)
+        assert resolved.sign_known
+        assert_allclose(resolved.rate_rad_s, true, rtol=0, atol=0)
     assert unsigned.resolved(unsigned) is unsigned
     assert not unsigned.resolved(RateEstimate(true, 1e4 * np.eye(3))).sign_known
     known = RateEstimate(true, spread)
     assert known.resolved(RateEstimate(-true, spread)) is known
-    assert np.array_equal(told.covariance_rad2_s2, spread)
+    assert np.array_equal(resolved.covariance_rad2_s2, spread)
 
 
 def test_centroids_keep_their_streaks() -> None:

@@ -328,7 +328,7 @@ def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
     camera = replace(SMALL, focal_px=1.01 * SMALL.focal_px)
     clean = survey(frames, start, believed, camera, leds_sigma_m=0.002)
     robust = survey(mixed, start, believed, camera, loss="cauchy", leds_sigma_m=0.002)
-    told = {(int(k), int(row)) for k, row in robust.outliers}
+    outliers = {(int(k), int(row)) for k, row in robust.outliers}
     wrong = {
         (k, int(row))
         for k, (frame, other) in enumerate(zip(frames, mixed, strict=True))
@@ -336,9 +336,9 @@ def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
         if robust.surveyed[other.led[row]] and robust.tied[k]
     }
     assert len(wrong) > 15
-    assert wrong <= told
+    assert wrong <= outliers
     # Some right ones go too: 5 sigma in two dimensions are 4e-6 of Gaussian noise, so none of a thousand.
-    assert all(frames[k].led[row] != mixed[k].led[row] for k, row in told)
+    assert all(frames[k].led[row] != mixed[k].led[row] for k, row in outliers)
     assert robust.misfit == pytest.approx(
         1, abs=4 / np.sqrt(2 * 700)
     )  # some 700 degrees of freedom

@@ -241,7 +241,7 @@ def test_the_home_catalog_has_the_dome_s_angles_within_noise(home: HomeCatalog) 
     truth = {led: place for led, place in zip(leds.id, leds.position_m, strict=True)}
     true = angles(unit(np.array([truth[led] for led in home.id])))
     z = (angles(home.vectors) - true) / (np.sqrt(2) * SIGMA_M / R_M / np.sqrt(50))
-    # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The slip adds under .01 of one here.
+    # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The thesis's error adds under .01 of one.
     assert np.abs(z).max() < stats.norm.isf(RARE / 66 / 2)
     # and they are noisy: 21 independent squares (24 coordinates less a turn) or so have a mean near 1.
     assert 0.3 < np.mean(z**2) < 2.5

@@ -311,15 +311,15 @@ def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Gener
         frames.append(
             DomeFrame(np.arange(LIGHTS), xy, np.full(LIGHTS, 0.1), turn(rng, 0.01) * truth)
         )
-    told = answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=0.01))
-    assert told is not None
-    assert told.status == "converged"
-    assert 0 < told.focal_sigma_px < 100
-    assert told.surveyed_leds.id.tolist() == np.flatnonzero(told.surveyed).tolist()
+    result = answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=0.01))
+    assert result is not None
+    assert result.status == "converged"
+    assert 0 < result.focal_sigma_px < 100
+    assert result.surveyed_leds.id.tolist() == np.flatnonzero(result.surveyed).tolist()
     for matrix in (
-        *told.led_covariance_m2[told.surveyed],
-        told.lever_covariance_m2,
-        told.lens_covariance,
+        *result.led_covariance_m2[result.surveyed],
+        result.lever_covariance_m2,
+        result.lens_covariance,
     ):
         assert_covariance(matrix)
 
@@ -420,12 +420,12 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
 def test_star_fields_give_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
     sheet = replace(CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5)
-    told = star_field.calibrate(frames, sheet)
-    assert told.report.status == "converged"
-    assert_covariance(told.covariance)
+    result = star_field.calibrate(frames, sheet)
+    assert result.report.status == "converged"
+    assert_covariance(result.covariance)
     assert star_field.disagreement_px(CAMERA, CAMERA) < 1e-9
-    assert star_field.disagreement_px(told.camera, CAMERA) < 0.3
-    assert (told.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
+    assert star_field.disagreement_px(result.camera, CAMERA) < 0.3
+    assert (result.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
     assert (LensPrior().sigma(sheet) > 0).all()
 
 
@@ -469,8 +469,8 @@ def test_a_camera_calibrates_itself_by_the_stars_that_are_named(
         for k, one in enumerate(frames)
     ]
     namer = Namer(frames, seen)
-    told = answered(
+    result = answered(
         lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01))
     )
-    assert (told is not None) == seen
-    assert told is None or star_field.disagreement_px(told.camera, CAMERA) < 0.5
+    assert (result is not None) == seen
+    assert result is None or star_field.disagreement_px(result.camera, CAMERA) < 0.5

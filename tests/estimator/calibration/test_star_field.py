@@ -29,7 +29,7 @@ from skysim.core import images
 from skysim.core.files import ROOT
 from skysim.sources import star_archives
 
-# SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.
+# SHEFEX-2's chip behind an uncalibrated 25 mm lens, and what its data sheet says: 1.5 % off, no distortion.
 TRUE = Camera(659, 493, 2520.0, (336.5, 241.0), (-0.11, 0.35, 8e-4, -6e-4, -1.5))
 SHEET = Camera(659, 493, 2520.0 * 1.015, (329.0, 246.0))
 # 60 degrees across, with a barrel of 40 px in the corners.
@@ -103,14 +103,14 @@ def test_it_is_scipy_s_least_squares_and_its_covariance() -> None:
     scale = np.array([1.0, 1, 1, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2])
 
     def residual(p: np.ndarray) -> np.ndarray:
-        told = start + scale * p[:8]
-        camera = Camera(659, 493, told[0], (told[1], told[2]), tuple(told[3:]))
+        lens = start + scale * p[:8]
+        camera = Camera(659, 493, lens[0], (lens[1], lens[2]), tuple(lens[3:]))
         turned = Rotation.from_rotvec(1e-3 * p[8:].reshape(-1, 3)) * found.report.cam_from_ref
         pixels = [
             (camera.pixels(turned[k].apply(one.vectors_ref)) - one.xy_px) / NOISE_PX
             for k, one in enumerate(field.frames)
         ]
-        return np.concatenate([np.ravel(pixels), (told - believed) / sigma])
+        return np.concatenate([np.ravel(pixels), (lens - believed) / sigma])
 
     oracle = least_squares(
         residual, np.zeros(8 + 15), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14
@@ -276,7 +276,7 @@ def test_a_moved_principal_point_is_next_to_a_turn() -> None:
 def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
     rng = np.random.default_rng(97)
     errors = []
-    told = []
+    claimed = []
     for _ in range(200):
         v_mag = rng.uniform(1, 6, 60)
         color = 0.3 * rng.normal(size=60)
@@ -286,9 +286,9 @@ def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
         instrumental[rng.random(400) < 0.05] += 3.0  # blends, wrong names
         zero = magnitude_zero(instrumental, v_mag[star], vectors[star])
         errors.append(zero.offset_mag - 12.3)
-        told.append((zero.sigma_mag, zero.scatter_mag))
+        claimed.append((zero.sigma_mag, zero.scatter_mag))
         assert zero.stars == len(np.unique(star))
-    sigma, scatter = np.mean(told, axis=0)
+    sigma, scatter = np.mean(claimed, axis=0)
     assert scatter == pytest.approx(0.3, rel=0.05)
     # The deviation of 200 draws is known to 5 %; three of them.
     assert np.std(errors) == pytest.approx(sigma, rel=0.15)

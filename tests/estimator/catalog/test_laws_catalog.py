@@ -127,9 +127,9 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     assert (np.bincount(groups)[groups[alone]] == 1).all() or near_rad < 1e-6
     _, mag = catalog.light_centers(stars.vectors, stars.v_mag, groups)
     merged = catalog.merge_doubles(stars, near_rad)
-    for told in (mag, merged.v_mag):
+    for magnitudes in (mag, merged.v_mag):
         np.testing.assert_allclose(
-            np.sum(10 ** (-0.4 * told)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
+            np.sum(10 ** (-0.4 * magnitudes)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
         )
     assert set(merged.id) <= set(stars.id)
     assert (np.diff(merged.v_mag) >= 0).all()
@@ -169,13 +169,16 @@ def test_a_prepared_catalog_counts_every_star(
     raw = published_catalogs.OnBoard(
         stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0
     )
-    told = published_catalogs.proc_cat(raw, near_rad)
-    assert told.components.sum() == len(stars)
-    assert (np.diff(told.magnitude) >= 0).all()
-    edges, count = published_catalogs.histogram(told.magnitude, step_mag)
-    assert count.sum() == len(told)
-    assert edges[0] <= told.magnitude[0] + 1e-6 and told.magnitude[-1] < edges[-1] + step_mag  # noqa: PT018
-    assert len(published_catalogs.log(told, step_mag).splitlines()) == 6 + len(count) + len(told)
+    prepared = published_catalogs.proc_cat(raw, near_rad)
+    assert prepared.components.sum() == len(stars)
+    assert (np.diff(prepared.magnitude) >= 0).all()
+    edges, count = published_catalogs.histogram(prepared.magnitude, step_mag)
+    assert count.sum() == len(prepared)
+    assert edges[0] <= prepared.magnitude[0] + 1e-6
+    assert prepared.magnitude[-1] < edges[-1] + step_mag
+    assert len(published_catalogs.log(prepared, step_mag).splitlines()) == 6 + len(count) + len(
+        prepared
+    )
 
 
 # Indexes
@@ -198,7 +201,10 @@ def test_three_indexes_hold_the_pairs_that_there_are(
     mag = np.sort(rng.uniform(0, 6, count))
     every = apart(vectors, vectors)[np.triu_indices(count, 1)]
     pairs = int(np.count_nonzero(every <= most_rad))
-    for build in (pair_index.build, lambda *told: sky_index.build(told[0], mag, told[1])):
+    for build in (
+        pair_index.build,
+        lambda *arguments: sky_index.build(arguments[0], mag, arguments[1]),
+    ):
         made = answered(lambda: build(vectors, most_rad), ImageError)  # noqa: B023
         assert (len(made.pair) if made else 0) == (pairs if pairs >= 3 else 0)
     if made:  # the sky index: every pair once, in the bin of its angle

@@ -84,7 +84,7 @@ def test_a_double_is_one_star_of_all_the_light_at_its_center() -> None:
     assert one.components.tolist() == [2, 1]
     assert one.magnitude[0] == pytest.approx(5 - 2.5 * np.log10(1.1), abs=1e-12)
     ra = np.arctan2(one.vectors[0, 1], one.vectors[0, 0])
-    assert ra / ARCSEC_RAD == pytest.approx(100, abs=1e-4)  # the chord's slip, 1e-7 of it
+    assert ra / ARCSEC_RAD == pytest.approx(100, abs=1e-4)  # a chord instead of an arc: 1e-7 of it
 
 
 def test_merging_keeps_the_light_and_the_stars_and_parts_the_rest() -> None:

@@ -85,9 +85,9 @@ def errors_of(name: str, flux_e: float, noise_e: float, gain_e_dn: float, seed: 
         image, places = starfield(rng, flux_e, noise_e)
         image /= gain_e_dn
         found = CENTROIDERS[name](image, detect.local(image, 6.0, max_blobs=1000), gain_e_dn)
-        error, told = matched(found, places)
+        error, claimed = matched(found, places)
         off.append(error)
-        sigma.append(told)
+        sigma.append(claimed)
     return np.concatenate(off), np.concatenate(sigma)
 
 

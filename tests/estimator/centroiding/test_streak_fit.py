@@ -111,8 +111,8 @@ def test_white_noise_keeps_so_much_through_the_line_filter(streak_px) -> None:
     assert detect.noise_factor(taps) == pytest.approx(line.std(), rel=0.025)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) -> None:
+@pytest.mark.parametrize("with_gyro", [True, False])
+def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(with_gyro: bool) -> None:
     rng = np.random.default_rng(62)
     # At 1,000 e a streak's pixels are 5 of their own sigmas in the filtered image; the line filter sees 10.
     fluxes = np.concatenate([np.full(12, 1000.0), np.full(24, 3000.0)])
@@ -121,7 +121,7 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
         dx = 12 * np.cos(angle)
         dy = 12 * np.sin(angle)
         image, xy = field(rng, dx, dy, fluxes)
-        blobs = detect.default(image, priors=FramePriors((dx, dy) if told else None))
+        blobs = detect.default(image, priors=FramePriors((dx, dy) if with_gyro else None))
         found += near(blobs.xy_px, xy)
         strangers += len(blobs) - near(blobs.xy_px, xy)
     assert found >= 0.98 * 6 * 36
@@ -339,7 +339,7 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
 
 @pytest.mark.slow
 def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
-    """Five streaks of which the filter for round stars sees two at most; nobody tells which way they go."""
+    """Five streaks of unknown direction; the filter for round stars finds two of them at most."""
     rng = np.random.default_rng(31)
     middles = rng.uniform(40, 360, (5, 2))
     along = np.array([10.0, 6.0])
@@ -355,10 +355,10 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
                 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
             )
     image = 100 + light + rng.normal(0, 10, light.shape)
-    told = detect.default(image, priors=FramePriors(tuple(along)))
+    blobs = detect.default(image, priors=FramePriors(tuple(along)))
     unaided = detect.default(image)
     assert len(detect.local(image)) <= 2
-    assert len(told) == 5
+    assert len(blobs) == 5
     near = np.linalg.norm(unaided.xy_px[:, None] - middles, axis=2).min(axis=0)
     assert (
         np.sum(near < 3) >= 4

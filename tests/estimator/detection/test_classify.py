@@ -448,7 +448,7 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(
 def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -> None:
     rng = np.random.default_rng(48)
     off = []
-    told = []
+    claimed_px = []
     for _ in range(12):
         light, xy = sky_frame(rng, 15, 0.8)
         image = exposed(rng, light)
@@ -459,8 +459,8 @@ def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -
         )
         rows = np.linalg.norm(found.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
         off.append(found.xy_px[rows] - xy)
-        told.append(found.sigma_px[rows])
-    chi2 = np.mean((np.concatenate(off) / np.concatenate(told)[:, None]) ** 2)
+        claimed_px.append(found.sigma_px[rows])
+    chi2 = np.mean((np.concatenate(off) / np.concatenate(claimed_px)[:, None]) ** 2)
     # 360 numbers that are not Gaussian (a bad pixel on the peak is worse than one beside it): within a factor of 2.
     assert 0.5 < chi2 < 2
 

@@ -293,8 +293,8 @@ def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(
     assert max(map(abs, short.streak_px)) < detect.MAX_STREAK_PX
     assert taps
     stars, xy = field_of_stars(3)
-    told = detect.default(stars, priors=FramePriors((0.0, 5000.0)))
-    assert nearest_px(told.xy_px, xy).max() < 1
+    in_stars = detect.default(stars, priors=FramePriors((0.0, 5000.0)))
+    assert nearest_px(in_stars.xy_px, xy).max() < 1
 
 
 def streaked(

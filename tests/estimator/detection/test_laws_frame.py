@@ -80,9 +80,11 @@ def assert_inside(blobs: Blobs, most: int) -> None:
     )
 )
 def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
-    told = answered(lambda: detect.prepare_image(image), ImageError)
-    assert told is None or (told.ndim == 2 and told.dtype.isnative and min(told.shape) >= 16)
-    assert told is None or (np.isfinite(told).all() and (told == image).all())
+    prepared = answered(lambda: detect.prepare_image(image), ImageError)
+    assert prepared is None or (
+        prepared.ndim == 2 and prepared.dtype.isnative and min(prepared.shape) >= 16
+    )
+    assert prepared is None or (np.isfinite(prepared).all() and (prepared == image).all())
 
 
 @law(*DETECTORS.values(), slow=True)
@@ -159,11 +161,11 @@ def test_runs_are_the_pixels_that_a_plain_filter_has_above(
 ) -> None:
     frame, _ = starry(rng, kind)
     runs = components.runs_above(frame, np.full((1, 1), threshold))
-    told = np.zeros(frame.shape, bool)
+    in_runs = np.zeros(frame.shape, bool)
     for y, first, last in runs:
-        told[y, first : last + 1] = True
+        in_runs[y, first : last + 1] = True
     np.testing.assert_array_equal(
-        told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold
+        in_runs, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold
     )
     lower, higher = (
         background.estimate_background(frame + np.array(more, kind)) for more in (0, 50)
@@ -198,9 +200,9 @@ def test_a_line_filter_keeps_less_noise_and_has_no_direction(
 )
 def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray) -> None:
     frame, _ = starry(rng)
-    told = answered(lambda: detect.replace_bad_pixels(frame, bad), ImageError)
-    assert (told is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
-    mended = frame if told is None else told
+    replaced = answered(lambda: detect.replace_bad_pixels(frame, bad), ImageError)
+    assert (replaced is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
+    mended = frame if replaced is None else replaced
     changed = set(map(tuple, np.argwhere(mended != frame)[:, ::-1].tolist()))
     assert changed <= set(map(tuple, bad.tolist()))
     assert frame.min() <= mended.min() <= mended.max() <= frame.max()
@@ -241,13 +243,15 @@ def test_a_verdict_changes_flags_alone(
 ) -> None:
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 50, FramePriors())
-    told = classify.classify(frame, blobs, FramePriors(streak_px, full))
-    np.testing.assert_array_equal(told.flag & int(Flag.SATURATED) != 0, told.peak >= full)
-    assert streak_px in (None, told.streak_px)
-    order = rng.permutation(len(told))
-    taken = told.take(order)
+    classified = classify.classify(frame, blobs, FramePriors(streak_px, full))
+    np.testing.assert_array_equal(
+        classified.flag & int(Flag.SATURATED) != 0, classified.peak >= full
+    )
+    assert streak_px in (None, classified.streak_px)
+    order = rng.permutation(len(classified))
+    taken = classified.take(order)
     for name in ("box_px", "xy_px", "flux", "peak", "area_px", "flag"):
-        np.testing.assert_array_equal(getattr(taken, name), getattr(told, name)[order])
+        np.testing.assert_array_equal(getattr(taken, name), getattr(classified, name)[order])
 
 
 @law(classify.streaks_px)
@@ -389,7 +393,7 @@ def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
 ) -> None:
     fits = answered(lambda: camera.check_frame(hostile, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
-    nothing = Attitude("nobody asked")
+    nothing = Attitude("not solved")
     answered(
         lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px),
         ImageError,
@@ -480,8 +484,8 @@ def test_a_solver_finds_the_turn_in_any_order(
 def test_any_directions_are_solved_or_refused(
     rng: np.random.Generator, cam: NDArray, ref: NDArray, sigma: NDArray, name: str, scale: float
 ) -> None:
-    told = answered(lambda: SOLVERS[name](cam, ref, sigma))
-    assert told is None or np.isfinite(told.as_quat()).all()
+    solution = answered(lambda: SOLVERS[name](cam, ref, sigma))
+    assert solution is None or np.isfinite(solution.as_quat()).all()
     answered(lambda: solvers.covariance(cam, sigma, name))
     seen = units(rng, 5)
     spread = solvers.covariance(seen, np.full(5, 1e-4), name)

@@ -78,12 +78,12 @@ def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
 ) -> None:
     vehicle = Vehicle(1)
     assert statuses(vehicle.updates(HOME, right)) == [(USED, right)]
-    told = vehicle.updates(WRONG, wrong)
+    updates = vehicle.updates(WRONG, wrong)
     refused = [(OUTSIDE_GATE, 2), (DISPUTED, wrong - 2)]
-    assert statuses(told) == refused
-    assert [update.agreeing for update in told] == list(range(1, wrong + 1))
-    assert (np.diff([update.log_odds for update in told]) > 0).all()
-    assert told[-1].log_odds < ENOUGH
+    assert statuses(updates) == refused
+    assert [update.agreeing for update in updates] == list(range(1, wrong + 1))
+    assert (np.diff([update.log_odds for update in updates]) > 0).all()
+    assert updates[-1].log_odds < ENOUGH
     assert statuses(vehicle.updates(HOME, 3)) == [(USED, 3)]
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
@@ -92,9 +92,9 @@ def test_a_tracker_that_stays_wrong_prevails_after_half_a_minute() -> None:
     """Nothing that the filter knows distinguishes it then from a gyro that failed without a flag."""
     vehicle = Vehicle(2)
     vehicle.updates(HOME, 60)
-    told = statuses(vehicle.updates(WRONG, 60))
-    assert [status for status, _ in told] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
-    assert 25 <= told[1][1] <= 40
+    runs = statuses(vehicle.updates(WRONG, 60))
+    assert [status for status, _ in runs] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
+    assert 25 <= runs[1][1] <= 40
 
 
 @pytest.mark.parametrize("off", [0.01, 0.1, 3.0])
@@ -119,18 +119,18 @@ def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> Non
         for k, off in enumerate((100.0, -100.0, 100.0)):
             mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
             seen = Rotation.from_rotvec([0.0, off * ARCSEC_RAD, 0.0])
-            told = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
-        assert told.status == last
+            update = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
+        assert update.status == last
 
 
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong: int) -> None:
     vehicle = Vehicle(4, sigma_rad=2.0)  # knows nothing at the start
     assert statuses(vehicle.updates(WRONG, wrong)) == [(USED, wrong)]
-    told = statuses(vehicle.updates(HOME, 30))
-    assert [status for status, _ in told] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
+    runs = statuses(vehicle.updates(HOME, 30))
+    assert [status for status, _ in runs] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
     # log(100) / -log(wrong_repeat) = 16.0 more than the wrong ones.
-    assert told[0][1] + told[1][1] + told[2][1] - wrong in (16, 17)
+    assert runs[0][1] + runs[1][1] + runs[2][1] - wrong in (16, 17)
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
@@ -164,9 +164,9 @@ def test_after_a_knock_the_filter_is_back_within_three_solutions(
     vehicle.updates(HOME, 40)
     turn, after = knock(times_limit * LIMIT_RAD_S, samples)
     flagged = slice(40, 40 + samples) if known_by == "the flag" else slice(0)
-    told = [vehicle.update(after, turn, flagged), *vehicle.updates(after, 3)]
-    assert told[2].status in (USED, RESET)
-    assert told[3].status == USED
+    updates = [vehicle.update(after, turn, flagged), *vehicle.updates(after, 3)]
+    assert updates[2].status in (USED, RESET)
+    assert updates[3].status == USED
     assert vehicle.error_rad(after) < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 

@@ -1,4 +1,4 @@
-"""Laws of the attitude filter and of exposure control, whatever they are told."""
+"""Laws of the attitude filter and of exposure control, for any input."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def test_the_inverse_response_undoes_the_gyro_s_matrix(seed: int, used: NDArray)
     )
 
 
-def assert_sound(told: FilterState) -> None:
-    assert_covariance(told.covariance)
+def assert_sound(state: FilterState) -> None:
+    assert_covariance(state.covariance)
     np.testing.assert_allclose(
-        told.sigma_attitude_rad**2, np.diag(told.covariance)[:3], rtol=1e-12, atol=0
+        state.sigma_attitude_rad**2, np.diag(state.covariance)[:3], rtol=1e-12, atol=0
     )
     np.testing.assert_allclose(
-        told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0
+        state.sigma_bias_rad_s**2, np.diag(state.covariance)[3:], rtol=1e-12, atol=0
     )
 
 
@@ -113,13 +113,13 @@ def test_a_solution_that_is_used_makes_the_filter_surer(
     mekf.propagate([0.1, 0.2], rng.normal(0, 0.1, (2, 3)), [False, False])
     before = mekf.state
     measured = Rotation.from_rotvec(off_rad * laws.units(rng, 1)[0]) * before.body_from_ref
-    told = mekf.update(0.2, measured, sigma_rad**2 * np.eye(3))
+    update = mekf.update(0.2, measured, sigma_rad**2 * np.eye(3))
     after = mekf.state
     assert_sound(after)
-    np.testing.assert_allclose(np.linalg.norm(told.residual_rad), off_rad, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(update.residual_rad), off_rad, rtol=0, atol=1e-9)
     shrunk = np.trace(after.covariance[3:, 3:]) <= np.trace(before.covariance[3:, 3:]) * (1 + 1e-9)
     unchanged = np.array_equal(after.covariance, before.covariance)
-    assert shrunk if told.status == USED else unchanged
+    assert shrunk if update.status == USED else unchanged
 
 
 @law(AttitudeFilter.update)
@@ -165,9 +165,9 @@ def test_an_exposure_stays_within_the_camera_s(
     full=some.floats(0, 7e4),
 )
 def test_what_is_seen_of_a_frame_is_within_it(image: NDArray, boxes: NDArray, full: float) -> None:
-    told = answered(lambda: exposure_control.observe(image, boxes, full, Control(1e3)))
+    observation = answered(lambda: exposure_control.observe(image, boxes, full, Control(1e3)))
     inside = (boxes[:, :2] >= 0).all() and (boxes[:, 2:] < [30, 20]).all()
-    assert (told is not None) == inside
+    assert (observation is not None) == inside
     everything = exposure_control.observe(image, np.array([[0, 0, 29, 19]]), full, Control(1e3))
     np.testing.assert_allclose(everything.mean_dn, image.mean(), rtol=1e-12, atol=0)
     assert everything.overexposed == (np.count_nonzero(image >= full) > 1)

@@ -86,10 +86,10 @@ def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
 @law(consistency.not_negative)
 @given(value=ANY | NUMBERS)
 def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None:
-    told = answered(lambda: consistency.not_negative("sigma", value))
+    checked = answered(lambda: consistency.not_negative("sigma", value))
     good = np.shape(value) in ((), (3,)) and bool((np.asarray(value) >= 0).all())
-    assert (told is not None) == good
-    np.testing.assert_array_equal(told if good else value, value)
+    assert (checked is not None) == good
+    np.testing.assert_array_equal(checked if good else value, value)
 
 
 @law(consistency.checked_samples)
@@ -120,9 +120,9 @@ def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(
 ) -> None:
     noise = covariance(rng, 3)
     common = covariance(rng, 3)
-    told = consistency.checked_covariances(noise + common, common)
-    np.testing.assert_allclose(told[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
-    np.testing.assert_array_equal(told[1], told[1].T)
+    covariances = consistency.checked_covariances(noise + common, common)
+    np.testing.assert_allclose(covariances[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
+    np.testing.assert_array_equal(covariances[1], covariances[1].T)
     assert consistency.is_covariance(noise)
     assert not consistency.is_covariance(noise - 2 * np.trace(noise) * np.eye(3))
     assert consistency.is_covariance(np.outer(noise[0], noise[0]), singular=True)
@@ -379,15 +379,15 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
 @law(FilterState.sigma, AttitudeFilter.state)
 @given(rng=SEEDS)
 def test_the_sigma_of_each_state_is_its_part_of_the_covariance(rng: np.random.Generator) -> None:
-    told = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
+    state = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
     parts = [
-        told.sigma_attitude_rad,
-        told.sigma_bias_rad_s,
-        *(told.sigma(name) for name in told.others),
+        state.sigma_attitude_rad,
+        state.sigma_bias_rad_s,
+        *(state.sigma(name) for name in state.others),
     ]
     np.testing.assert_allclose(
-        np.concatenate(parts) ** 2, np.diag(told.covariance), rtol=1e-12, atol=0
+        np.concatenate(parts) ** 2, np.diag(state.covariance), rtol=1e-12, atol=0
     )
-    assert list(told.others) == ["scale", "misalignment", "mounting"]
+    assert list(state.others) == ["scale", "misalignment", "mounting"]
     with pytest.raises(KeyError):
-        told.sigma("attitude")
+        state.sigma("attitude")

@@ -1,4 +1,4 @@
-"""LEDs told apart at a finite distance: equal ones, dead ones, reflections, domes of any shape, and twins."""
+"""Identification of LEDs at a finite distance: equal LEDs, dead LEDs, reflections, any dome shape, and twins."""
 
 from __future__ import annotations
 

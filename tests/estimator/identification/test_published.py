@@ -641,9 +641,9 @@ def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
     rays, _, _, index, _ = field(1)
     asked: list[tuple[int, ...]] = []
 
-    def no_triplet(*told: object) -> object:
-        asked.append(tuple(told[3]))
-        told[5][1] += 7
+    def no_triplet(*arguments: object) -> object:
+        asked.append(tuple(arguments[3]))
+        arguments[5][1] += 7
         return FIALHO.no_match()
 
     monkeypatch.setattr(FIALHO, "triplets", no_triplet)

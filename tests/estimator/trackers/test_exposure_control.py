@@ -133,8 +133,8 @@ def lit(lab: Lab, glare_e_s: float) -> Lab:
 
 
 def exposed(lab: Lab, time_s: float) -> Lab:
-    told = lab.scene.exposure.model_copy(update={"time_s": time_s})
-    return lab.with_scene(lab.scene.model_copy(update={"exposure": told}))
+    exposure = lab.scene.exposure.model_copy(update={"time_s": time_s})
+    return lab.with_scene(lab.scene.model_copy(update={"exposure": exposure}))
 
 
 def flown(

@@ -136,9 +136,9 @@ def test_hostile_pictures_are_refused(
 ) -> None:
     """No attitude but a true one, no exception, no second over two a megapixel, no eleventh frame of memory."""
     monkeypatch.setattr(hostile, "SEARCHED", 0.0)  # at all focal lengths: see the benchmark
-    told = hostile.judged(count, seed)
-    assert sum(one.looked for one in told.values()) == count
-    assert [line for one in told.values() for line in one.defects] == []
+    verdicts = hostile.judged(count, seed)
+    assert sum(one.looked for one in verdicts.values()) == count
+    assert [line for one in verdicts.values() for line in one.defects] == []
 
 
 @pytest.mark.parametrize("frames", [3, pytest.param(1000, marks=pytest.mark.long)])
@@ -151,8 +151,8 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> N
         picture, there = hostile.starry(np.random.default_rng([2026, n]))
         for seen in (picture[:, ::-1], picture[::-1]):
             assert not eye.solve(np.ascontiguousarray(seen)).attitude.solved
-        told = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
-        right += (told * there.inv()).magnitude() < metrics.WRONG_RAD
+        answered = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
+        right += (answered * there.inv()).magnitude() < metrics.WRONG_RAD
     assert right >= 0.9 * frames
 
 

@@ -146,5 +146,5 @@ def test_shares_are_those_of_the_catalogs() -> None:
         off_arcsec.append(np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD)
     for limit in (0.5, 1.5):
         found = float(np.mean(np.array(off_arcsec) > limit))
-        told = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
-        assert told == pytest.approx(found, rel=0.5)
+        expected = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
+        assert expected == pytest.approx(found, rel=0.5)

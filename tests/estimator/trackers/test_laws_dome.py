@@ -158,7 +158,7 @@ def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(
 @law(nearfield.infinity, nearfield.thesis, nearfield.thesis_points)
 @given(rng=SEEDS, name=some.sampled_from(["infinity", "thesis"]))
 def test_the_thesis_s_ways_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
-    """Some degrees by the field's few lights, and a light stands on its ray where the slip is put right."""
+    """Within a few degrees with few lights in view; with the corrected formula a light lies on its ray."""
     arm = lever(rng)
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, SPHERE, arm, truth, 12)
@@ -181,8 +181,8 @@ def test_any_rays_are_solved_or_refused(
     rng: np.random.Generator, rays: Floats, sigma: Floats, place: Floats, name: str
 ) -> None:
     arm = lever(rng)
-    told = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
-    assert told is None or told[1].shape == (3, 3)
+    solution = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
+    assert solution is None or solution[1].shape == (3, 3)
     answered(lambda: nearfield.thesis_points(rays, SPHERE, arm))
 
 
@@ -211,12 +211,12 @@ def test_lights_are_named_as_they_are_or_not_at_all(
         [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
     )
     star = np.concatenate([star, np.full(false, -1)])
-    told = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
+    solution = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
     truth_cam = eye.lever.cam_from_body * truth
-    assert not told.solved or (told.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
+    assert not solution.solved or (solution.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
     assert (
-        not told.solved
-        or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
+        not solution.solved
+        or (star[solution.match.observed] >= 0).sum() >= len(solution.match.observed) - false
     )
     rays = CAMERA.rays(xy)
     sigma = np.full(len(xy), 1e-4)
@@ -413,16 +413,16 @@ def test_a_home_catalog_is_of_the_lights_that_were_shown(
         )
         for _ in range(frames)
     ]
-    told = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
-    assert sorted(told.id) == sorted(leds.id)
-    assert (np.diff(told.brightness) <= 0).all()
-    assert (told.samples == frames).all()
-    for covariance in told.covariance_m2:
+    home = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
+    assert sorted(home.id) == sorted(leds.id)
+    assert (np.diff(home.brightness) <= 0).all()
+    assert (home.samples == frames).all()
+    for covariance in home.covariance_m2:
         assert_covariance(covariance)
-    assert 0 < told.epsilon_pos_rad < 0.01
-    on = home_position.led_map(told, SPHERE)
+    assert 0 < home.epsilon_pos_rad < 0.01
+    on = home_position.led_map(home, SPHERE)
     np.testing.assert_allclose(np.linalg.norm(on.position_m, axis=1), 1.2, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(np.cross(on.position_m, told.vectors), 0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(on.position_m, home.vectors), 0, rtol=0, atol=1e-9)
 
 
 @law(home_position.calibrate)

@@ -147,14 +147,14 @@ def test_a_global_frame_s_rate_has_the_sign_that_a_gyro_tells(tracker: StarTrack
     seen, _ = star_frame(tracker, 1)
     found = replace(seen, camera=still.camera).centroids()
     rough = RateEstimate(1.2 * seen.rate_rad_s, 1e-4 * np.eye(3))
-    told, open_sign = (
+    signed, open_sign = (
         still.solve_centroids(found, exposure_s=EXPOSURE_S, rate=rate).rate
         for rate in (rough, None)
     )
-    assert told is not None
+    assert signed is not None
     assert open_sign is not None
-    assert (told.sign_known, open_sign.sign_known) == (True, False)
-    assert_allclose(told.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-4)
+    assert (signed.sign_known, open_sign.sign_known) == (True, False)
+    assert_allclose(signed.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-4)
     assert_allclose(np.abs(open_sign.rate_rad_s), np.abs(seen.rate_rad_s), rtol=0, atol=1e-4)
     assert still.solve_centroids(found).rate is None
     with pytest.raises(ImageError, match=r"exposure_s: 0.0; allowed: finite, above 0"):

@@ -195,9 +195,9 @@ def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
         truth = turn * truth
         if gap == "knock":
             truth = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * truth
-        told = truth * then.inv() if gap != "knock" else Rotation.identity()
+        motion = truth * then.inv() if gap != "knock" else Rotation.identity()
         report = follower.solve(
-            photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, told
+            photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, motion
         )
         if gap == "dark":
             assert report.health == Health.LOST
