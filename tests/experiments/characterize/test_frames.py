@@ -368,10 +368,10 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
     )
     code, out, _ = command(capsys, monkeypatch, *folders, "--out", tmp_path, "--json")
     assert code == 0
-    told = json.loads(out)
-    rows = {row["what"]: row for row in told["values"]}
+    report = json.loads(out)
+    rows = {row["what"]: row for row in report["values"]}
     assert rows["gain_e_dn"]["file"] == 2.64
-    assert told == json.loads((tmp_path / "characterize.json").read_text())
+    assert report == json.loads((tmp_path / "characterize.json").read_text())
     preset = str(tmp_path / "camera.yaml")
     scene = loader.load(
         "shefex2", {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"}

@@ -110,9 +110,9 @@ def test_all_that_changes_the_frames_changes_the_digest(tmp_path: Path) -> None:
 def test_what_is_wrong_in_the_variations_is_told_in_one_line(
     tmp_path: Path, text: str, message: str
 ) -> None:
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as raised:
         small(variations(tmp_path, text))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_what_is_wrong_in_the_options_is_told() -> None:

@@ -240,8 +240,8 @@ from small_dataset import small
 from skysim.experiments import dataset_run
 from skysim.experiments.study.execution import engines
 if __name__ == "__main__":
-    told = small(Path(sys.argv[2]), 40)
-    dataset_run.run(told, sys.argv[3], engines.Pool(2), lambda progress: print(progress.done, flush=True))
+    plan = small(Path(sys.argv[2]), 40)
+    dataset_run.run(plan, sys.argv[3], engines.Pool(2), lambda progress: print(progress.done, flush=True))
 """
 
 

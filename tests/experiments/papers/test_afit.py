@@ -84,10 +84,10 @@ def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() ->
 
 def test_an_led_that_is_not_seen_is_in_no_order() -> None:
     """Of three images one has all LEDs, falling; one lacks the last; one has two in the wrong order."""
-    told = led_tests.fraction_in_order(
+    share = led_tests.fraction_in_order(
         np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]])
     )
-    assert told.value == pytest.approx(1 / 3)
+    assert share.value == pytest.approx(1 / 3)
 
 
 def test_a_magnitude_is_light_over_the_median_area() -> None:

@@ -43,14 +43,16 @@ def test_the_epsilons_are_those_of_the_thesis_s_calibration(
     measurements = measure(lab, sightings)
     believed = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)  # type: ignore[arg-type]
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
-    told = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
+    calibration = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
     found = [
         test3.largest_std(measurements.magnitude),
         test3.largest_std(measurements.lab_m.reshape(len(sightings), -1)),
         np.radians(test3.largest_std(measurements.separation_arcsec) / 3600),
     ]
     # The thesis divides by n - 1, ours by n: most of the spread is what differs between positions.
-    theirs = np.array([told.epsilon_mag, told.epsilon_pos_m, told.epsilon_sep_rad])
+    theirs = np.array(
+        [calibration.epsilon_mag, calibration.epsilon_pos_m, calibration.epsilon_sep_rad]
+    )
     np.testing.assert_allclose(found, theirs * np.sqrt(1 - 1 / len(sightings)), rtol=1e-9)
 
 
@@ -102,7 +104,7 @@ def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(lab: Lab) -
     found = test3_attitude.algorithm_errors(lab, 1, 2, np.random.default_rng(72))
     assert np.abs(found.error_deg[:, 0]).max() < 1e-9
     assert found.named == (5, 5)
-    assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
+    assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the error of eq. 44
 
 
 @pytest.mark.slow

@@ -95,8 +95,8 @@ def test_an_interval_wider_than_the_tolerance_is_told() -> None:
 def test_machines_get_the_keys_that_were_promised() -> None:
     bound = PublishedRow(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
-    told = line.as_dict()
-    assert list(told) == [
+    row = line.as_dict()
+    assert list(row) == [
         "id",
         "quantity",
         "published",
@@ -106,9 +106,9 @@ def test_machines_get_the_keys_that_were_promised() -> None:
         "verdict",
         "note",
     ]
-    assert told["published"] == [0.9, None]
-    assert told["ours"] == 0.95
-    assert told["interval"][0] < 0.95 < told["interval"][1]
+    assert row["published"] == [0.9, None]
+    assert row["ours"] == 0.95
+    assert row["interval"][0] < 0.95 < row["interval"][1]
 
 
 def test_an_answer_to_every_row_and_no_other() -> None:
@@ -127,8 +127,8 @@ def covered(
     hits = 0
     for n in range(TRIED):
         rng = np.random.default_rng([7, n])
-        told = interval(rng.normal(3.0, 2.0, 4))
-        hits += told.low <= target(rng) <= told.high
+        estimate = interval(rng.normal(3.0, 2.0, 4))
+        hits += estimate.low <= target(rng) <= estimate.high
     return hits / TRIED
 
 
@@ -147,7 +147,7 @@ def test_intervals_of_four_hold_what_they_promise() -> None:
 def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
     """Efron's own percentiles hold a mean of four in some 80 %."""
     few = np.random.default_rng(3).normal(3.0, 2.0, (300, 4))
-    held = [[told.low <= 3.0 <= told.high for told in pair] for pair in map(both, few)]
+    held = [[estimate.low <= 3.0 <= estimate.high for estimate in pair] for pair in map(both, few)]
     bare, wide = np.mean(held, axis=0)
     assert bare < 0.88
     assert wide > 0.91
@@ -266,7 +266,7 @@ def parts() -> dict[str, list[list[str]]]:
     return found
 
 
-def told(text: str) -> Summary:
+def read_summary(text: str) -> Summary:
     """A number and its interval as the page has them."""
     found = SUMMARY_PATTERN.search(text)
     assert found is not None, text
@@ -303,11 +303,13 @@ def test_the_page_has_every_published_row_as_it_is_published() -> None:
 def test_the_page_s_verdicts_follow_from_its_numbers() -> None:
     slack = 1e-3
     for id, row, cells in rows():
-        ours = told(cells[2])
+        ours = read_summary(cells[2])
         verdict = cells[3].strip("*")
         where = f"{id}: {row.quantity}"
         cause = re.match(rf"with .*?: ({NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?)(?=;|$)", cells[4])
-        explains = bool(cause) and compare.intervals_overlap(row, eased(told(cause[1]), slack))
+        explains = bool(cause) and compare.intervals_overlap(
+            row, eased(read_summary(cause[1]), slack)
+        )
         allowed = {
             "agrees": compare.intervals_overlap(row, eased(ours, slack)),
             "explained": explains and not compare.intervals_overlap(row, eased(ours, -slack)),
@@ -361,7 +363,7 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     lines = list(zip(done.comparisons, parts()[id], strict=True))
     for line, cells in lines:
         ours = line.result.ours
-        whole = told(cells[2])
+        whole = read_summary(cells[2])
         assert not ours.low > ours.value + 1e-12, line.row.quantity
         assert not ours.high < ours.value - 1e-12, line.row.quantity
         assert ours.trials > 0, line.row.quantity

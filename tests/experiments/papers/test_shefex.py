@@ -53,21 +53,21 @@ def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> Non
 @pytest.mark.long
 def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
     field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
-    told = shefex_identification.identify(
+    result = shefex_identification.identify(
         field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1)
     )
-    assert (told.right, told.wrong) == (1.0, 0.0)
-    assert np.abs(told.error_deg).max() < 1e-3
+    assert (result.right, result.wrong) == (1.0, 0.0)
+    assert np.abs(result.error_deg).max() < 1e-3
 
 
 def test_three_stars_are_no_success() -> None:
     field = StarField(
         np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity()
     )
-    told = shefex_identification.identify(
+    result = shefex_identification.identify(
         field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1)
     )
-    assert (told.right, told.wrong) == (0.0, 0.0)
+    assert (result.right, result.wrong) == (0.0, 0.0)
 
 
 def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
@@ -106,8 +106,8 @@ def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
 
 def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    told = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
-    np.testing.assert_allclose(told, np.degrees(2 * np.arctan(half)), rtol=1e-9)
+    field_deg = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    np.testing.assert_allclose(field_deg, np.degrees(2 * np.arctan(half)), rtol=1e-9)
 
 
 def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:

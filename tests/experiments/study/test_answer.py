@@ -150,8 +150,8 @@ def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_value
     lines = [line(0, 500, 200, identified=100), line(1, 900, 200, identified=200)]
     few = line(2, 200, 200, identified=3)
     few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
-    told = answer.ranges(study(), [*lines, few])
-    assert told == [
+    ranges = answer.ranges(study(), [*lines, few])
+    assert ranges == [
         "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.985..1) at leds = 900.",
         "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
     ]
@@ -256,10 +256,10 @@ def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None
     plan = loaded(tmp_path, set=STUDY["set"] | survey)
     scene, _ = resolve_point(plan.spec, plan.points[0].settings)
     (fact,) = [one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"]
-    told = dict(overview.overview(plan).rows)["tracker knows"]
-    assert told == "; ".join(fact.lines)
-    assert "measured by a total station" in told
-    assert "LEDs to 0.1 mm" not in told
+    knowledge = dict(overview.overview(plan).rows)["tracker knows"]
+    assert knowledge == "; ".join(fact.lines)
+    assert "measured by a total station" in knowledge
+    assert "LEDs to 0.1 mm" not in knowledge
 
 
 @pytest.mark.slow
@@ -289,8 +289,8 @@ def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
 
     def warned(tilt_deg: int) -> list[str]:
         trial = {"kind": "centroids", "tilt_deg": [0, tilt_deg]}
-        told = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
-        return [one for one in told.findings if "LEDs end at 27 deg" in one]
+        summary = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
+        return [one for one in summary.findings if "LEDs end at 27 deg" in one]
 
     assert not warned(10)
     assert "at a tilt of 25.0 deg" in warned(25)[0]
@@ -302,18 +302,18 @@ def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(
 ) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}
-    told = overview.overview(
+    summary = overview.overview(
         loaded(tmp_path, trial={"kind": "frames"}, factors={"disk": {"levels": levels}})
     )
-    wide = [one for one in told.findings if "px wide; local treats" in one]
+    wide = [one for one in summary.findings if "px wide; local treats" in one]
     assert len(wide) == 1
     assert wide[0].endswith("[disk = large]")
-    assert told.may_be_ambiguous
+    assert summary.may_be_ambiguous
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("texts", "told"),
+    ("texts", "expected"),
     [
         (["12 px of 3"] * 3, "12 px of 3"),
         (
@@ -323,9 +323,11 @@ def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(
         (["12 px of 3", "13 px of 3"], "12 px of 3 [a = 1; a = 2]"),
     ],
 )
-def test_a_finding_that_differs_in_its_numbers_is_told_once(texts: list[str], told: str) -> None:
+def test_a_finding_that_differs_in_its_numbers_is_told_once(
+    texts: list[str], expected: str
+) -> None:
     at = [(text, f"a = {n}") for n, text in enumerate(texts, 1)]
-    assert overview.finding_text(at, checked=3) == told
+    assert overview.finding_text(at, checked=3) == expected
 
 
 def test_a_place_has_its_unit() -> None:

@@ -1,4 +1,4 @@
-"""Whoever does a study's trials, and whoever of them dies on the way: the store is that of one process, row for row."""
+"""Any engine leaves the store of one process, row for row, even if workers die on the way."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ from pathlib import Path
 from skysim.experiments.study import loader
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution import engines, runner
-told = loader.load(sys.argv[1])
+study_plan = loader.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:
-    runner.prepare_store(told, kept, kept.counts()["done"] > 0)
-    runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
+    runner.prepare_store(study_plan, kept, kept.counts()["done"] > 0)
+    runner.run(study_plan, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
 ONE_THREAD = dict.fromkeys(workers.ONE_THREAD, "1")
 ENVIRONMENT = (
@@ -74,7 +74,7 @@ def plan_(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
 
 @pytest.fixture(scope="module")
 def serial_contents(plan_: plan.Plan) -> str:
-    """What one process leaves that nobody disturbs."""
+    """Contents of the store of one uninterrupted process."""
     path = plan_.path.with_name("whole.sqlite")
     assert done(plan_, path, engines.Serial()).failed == 0
     return contents(path)
@@ -420,7 +420,7 @@ def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
 
 
 def recipes() -> list[str]:
-    """The runs that a worker was told of."""
+    """Names of the runs that a worker has received."""
     from skysim.experiments.study.execution import dask_engine
 
     return list(dask_engine.JOBS)

@@ -39,7 +39,7 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("told", "law"),
+    ("factor", "law"),
     [
         ({"distribution": "normal", "mean": 3.0, "sigma": 2.0}, stats.norm(3, 2)),
         ({"distribution": "lognormal", "median": 3.0, "sigma": 0.5}, stats.lognorm(0.5, scale=3)),
@@ -62,17 +62,20 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
         ({"from": 2.0, "to": 50.0, "scale": "log"}, stats.loguniform(2, 50)),
     ],
 )
-def test_a_factor_drawn_is_distributed_as_told(told, law):
+def test_a_factor_drawn_is_distributed_as_told(factor, law):
     """Even shares through `at` against SciPy's law: mean and spread to the grid's own error."""
     drawn = np.array(
-        [READ(told | {"key": "x"}).value_at(share)[0] for share in (np.arange(4_000) + 0.5) / 4_000]
+        [
+            READ(factor | {"key": "x"}).value_at(share)[0]
+            for share in (np.arange(4_000) + 0.5) / 4_000
+        ]
     )
     assert np.mean(drawn) == pytest.approx(law.mean(), rel=2e-3)
     assert np.std(drawn) == pytest.approx(law.std(), rel=5e-3)
 
 
 @pytest.mark.parametrize(
-    ("told", "complaint"),
+    ("factor", "complaint"),
     [
         ({"key": "x", "from": "1 m", "to": "2 in"}, "have different units"),
         ({"key": "x", "from": 3, "to": 2}, "allowed: below to"),
@@ -108,21 +111,21 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
         ({"values": [1, 2]}, "key"),
     ],
 )
-def test_a_factor_that_makes_no_sense_is_refused(told, complaint):
+def test_a_factor_that_makes_no_sense_is_refused(factor, complaint):
     with pytest.raises(ValidationError, match=complaint):
-        READ(told)
+        READ(factor)
 
 
 @pytest.mark.parametrize("u", [0.0, 1e-9, 0.3, 1.0])
 def test_a_truncated_normal_stays_within_its_bounds(u):
-    told = {
+    factor = {
         "key": "x",
         "distribution": "truncated_normal",
         "mean": "1 mm",
         "sigma": "5 mm",
         "low": "0 mm",
     }
-    value, settings = READ(told | {"high": "3 mm"}).value_at(u)
+    value, settings = READ(factor | {"high": "3 mm"}).value_at(u)
     assert settings == {"x": value}
     assert 0 <= float(value.removesuffix(" mm")) <= 3
 

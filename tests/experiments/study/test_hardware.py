@@ -54,20 +54,20 @@ def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
 @pytest.mark.slow
 def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
     """Each replicate's scene has its own hash; the table has a row for a noise, none for a dome."""
-    told = loaded(tmp_path)
-    assert done(told, tmp_path / "study.sqlite").failed == 0
+    study_plan = loaded(tmp_path)
+    assert done(study_plan, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
         columns = kept.columns()
-        lines = table.table(kept, told.study.responses)
+        lines = table.table(kept, study_plan.study.responses)
         assert len(set(columns["scene"])) == 6
         assert np.ptp(columns["stars"]) > 0
         assert [line.levels for line in lines] == [{"noise": 0.1}, {"noise": 0.2}]
         assert lines[0].responses["stars_mean"].trials == 6
-        again = runner.replay(told, kept, 8, tmp_path / "trial_8")
+        again = runner.replay(study_plan, kept, 8, tmp_path / "trial_8")
     assert again.changed == []
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.prepare_store(
-            told, kept, resume=True
+            study_plan, kept, resume=True
         )  # its first and last scenes are those of their own hardware
 
 

@@ -57,7 +57,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
             0.1,
         )
     errors = rng.normal(size=3).tolist() if replicate % 7 else [np.nan] * 3
-    told = Outcome(
+    result = Outcome(
         "solved" if replicate % 7 else "refused",
         1,
         int(replicate % 7 > 0),
@@ -65,7 +65,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
         *errors,
     )
     for name in ("boresight_ra_deg", "boresight_dec_deg", "stars", "centroid_px"):
-        setattr_frozen(told, name, float(rng.uniform(0, 60)))
+        setattr_frozen(result, name, float(rng.uniform(0, 60)))
     return Row(
         trial,
         point,
@@ -73,7 +73,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
         7 * replicate,
         f"scene {point}",
         "code",
-        told,
+        result,
         None,
         1e-3 * (1 + replicate),
     )
@@ -336,9 +336,9 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told = study_file.load(tmp_path / "strays.yaml")
+    study_plan = study_file.load(tmp_path / "strays.yaml")
     draw = random.Random(2)
-    done(told, tmp_path / "whole.sqlite")
+    done(study_plan, tmp_path / "whole.sqlite")
     often = tmp_path / "often.sqlite"
     killed = 0
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
@@ -346,7 +346,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 
     def run(pause_s: float = 0.02) -> None:
         runs = engines.Serial() if engine == "serial" else engines.Pool(2)
-        done(told, often, runs, stored() > 0, lambda progress: time.sleep(pause_s))
+        done(study_plan, often, runs, stored() > 0, lambda progress: time.sleep(pause_s))
 
     def stored() -> int:
         try:
@@ -366,7 +366,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
                 run()
             finally:
                 os._exit(0)
-        while stored() == before < told.trials and time.monotonic() < end:
+        while stored() == before < study_plan.trials and time.monotonic() < end:
             time.sleep(0.005)
         time.sleep(draw.uniform(0.0, 0.3))
         os.kill(pid, signal.SIGKILL)

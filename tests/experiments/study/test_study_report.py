@@ -73,8 +73,8 @@ def filled(
     for trial in range(len(tried) * asked.replicates)[:done]:
         point, replicate = divmod(trial, asked.replicates)
         error = f"Traceback\nValueError: <b>{trial}</b>" if trial < failed else None
-        told = Outcome("failed") if error else outcome(point, replicate)
-        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
+        result = Outcome("failed") if error else outcome(point, replicate)
+        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", result, error, 0.001))
     with store.writing(path) as kept:
         kept.begin(
             kept.points(),
@@ -111,13 +111,13 @@ class Html(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = dict(attrs)
+        attributes = dict(attrs)
         self.tags.append(tag)
-        self.sources += [told[name] or "" for name in ("src", "href") if name in told]
+        self.sources += [attributes[name] or "" for name in ("src", "href") if name in attributes]
         if tag == "img":
-            self.images.append(told["src"] or "")
+            self.images.append(attributes["src"] or "")
         if tag in ("p", "code", "div", "pre"):
-            self._inside.append((told.get("id") or told.get("class") or tag).strip())
+            self._inside.append((attributes.get("id") or attributes.get("class") or tag).strip())
         if tag in ("h2", "summary"):
             self._in_title = True
             self._title = ""
@@ -132,8 +132,8 @@ class Html(HTMLParser):
             self._cell = True
             self.tables[self._section][-1].append("")
         if tag == "td" and self._section == POINTS:
-            self.keys[-1].append(told["data-key"] or "")
-            self.marked[-1] |= "marked" in (told["class"] or "")
+            self.keys[-1].append(attributes["data-key"] or "")
+            self.marked[-1] |= "marked" in (attributes["class"] or "")
 
     def handle_endtag(self, tag: str) -> None:
         if tag in ("p", "code", "div", "pre"):
@@ -217,12 +217,12 @@ def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
 def test_the_first_ten_failures_are_named_with_what_replays_them(tmp_path: Path) -> None:
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, failed=12), asked)
-    told = html.said["items bad"]
-    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [
+    items = html.said["items bad"]
+    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", items) == [
         (str(n), str(n)) for n in range(10)
     ]
-    assert told.startswith("12 trials failed")
-    assert "skysim study replay FILE 0" in told
+    assert items.startswith("12 trials failed")
+    assert "skysim study replay FILE 0" in items
 
 
 @pytest.mark.usefixtures("bare")
@@ -358,8 +358,8 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_nee
         [20, 0, 10], [(5, 4, 9, 70, 0), (3, 0, 6, 70, 0), (8, nan, nan, 40, 19)], strict=True
     )
     lines = [
-        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told)}, 70)
-        for n, (one, told) in enumerate(levels)
+        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*summary)}, 70)
+        for n, (one, summary) in enumerate(levels)
     ]
     for log in (False, True):
         fig = Canvas()

@@ -200,8 +200,8 @@ def test_the_brightest_are_kept_where_only_so_many_may_be():
 
 
 def test_other_noise_leaves_the_attitude():
-    told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in told)
+    prepared = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
+    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in prepared)
     assert (first.lab_from_body * again.lab_from_body.inv()).magnitude() == 0
     assert (first.xy_px == again.xy_px).all()
     assert not np.array_equal(seen.centroids.xy_px, other.centroids.xy_px)
@@ -310,13 +310,13 @@ def test_a_flight_counts_its_frames_after_it_settled():
 
 @pytest.mark.slow
 def test_a_flights_filter_is_scored_at_every_tick():
-    told = {
+    settings = {
         "vehicle.imu": {},
         "filter": {"start_deg": 0.1},
         "exposure.frames": 4,
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
-    spec = replace(DOME, base=told, trial={"kind": "flight"})
+    spec = replace(DOME, base=settings, trial={"kind": "flight"})
     ready = setups.prepared_setup(spec, {})
     came = trials.run_flight_trial(ready, 5)
     assert came.frames == came.solved == 4
@@ -345,11 +345,11 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     model = tmp_path / "ship.xml"
     text = (SCENES / "vehicles" / "shefex2.xml").read_text()
     model.write_text(text)
-    told = [
+    hashes = [
         setups.scene_hash(plan.resolve_point(SKY, sets)[0])
         for sets in ({}, {"camera.f_number": 1.5}, {})
     ]
-    assert told[0] == told[2] != told[1]
+    assert hashes[0] == hashes[2] != hashes[1]
     own = {"vehicle.model": str(model)}
     first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
     model.write_text(text.replace("<mujoco", "<!-- other --><mujoco", 1))
