@@ -145,8 +145,8 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
 )
 def test_each_cause_is_named(change: Change, fov_deg: float, says: str) -> None:
     assert hint(photograph(), FOV_DEG) == ""
-    told = hint(np.ascontiguousarray(change(photograph())), fov_deg)
-    assert re.search(says, told), told
+    advice = hint(np.ascontiguousarray(change(photograph())), fov_deg)
+    assert re.search(says, advice), advice
 
 
 @pytest.mark.slow
@@ -317,8 +317,8 @@ def test_a_refusal_is_printed_with_what_was_seen_and_tried(
         tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None), None
     )
     terminal.print_solutions([found], tmp_path)
-    told = capsys.readouterr().out.splitlines()
-    assert told[-5:-1] == [
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-5:-1] == [
         f"{tmp_path / 'x.png'}: no identification beyond chance",
         f"  seen:   {found['lights']} lights, the brightest pixel {image.max()} DN, the background"
         f" {np.median(image):g} DN",

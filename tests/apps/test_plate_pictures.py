@@ -179,11 +179,13 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
 
 
 def test_the_tracker_of_one_uncertainty_is_not_taken_for_another(gray: NDArray) -> None:
-    told = plate_solver.make_solver(20.0, None)
+    default_solver = plate_solver.make_solver(20.0, None)
     by_exif = solver.replace(
-        told, fov_uncertainty=0.1
+        default_solver, fov_uncertainty=0.1
     )  # of the same picture: they share their trackers' cache
-    first, second, again = (next(one.trackers(640, 480, None)) for one in (told, by_exif, told))
+    first, second, again = (
+        next(one.trackers(640, 480, None)) for one in (default_solver, by_exif, default_solver)
+    )
     assert (first.focal_uncertainty, second.focal_uncertainty) == (solver.FOV_UNCERTAINTY, 0.1)
     assert first is again
 

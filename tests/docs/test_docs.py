@@ -124,11 +124,11 @@ STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 @pytest.mark.long
 def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
     shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
-    told = re.findall(
+    listed = re.findall(
         r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES
     )
-    assert {name for name, page, _, command in told if name == page == command} == shipped
-    for name, _, verb, _ in told:
+    assert {name for name, page, _, command in listed if name == page == command} == shipped
+    for name, _, verb, _ in listed:
         assert (verb == "optimize") == (study_file.load(name).study.optimize is not None)
 
 
@@ -138,14 +138,14 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
 )
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    told = study_file.load(path.stem)
-    assert text.startswith(f"# {told.study.title}\n")
-    assert f"seed {told.study.seed}." in text
+    study_plan = study_file.load(path.stem)
+    assert text.startswith(f"# {study_plan.study.title}\n")
+    assert f"seed {study_plan.study.seed}." in text
     counted = re.search(r"(\d+) trials, (\d+) failed", text)
     assert counted is not None
     assert int(counted[2]) == 0
-    if told.study.optimize is None:
-        assert int(counted[1]) == told.trials
+    if study_plan.study.optimize is None:
+        assert int(counted[1]) == study_plan.trials
     pictures = re.findall(r"!\[[^]]*\]\((\w+\.png)\)", text)
-    assert len(pictures) >= len(told.study.figures)
+    assert len(pictures) >= len(study_plan.study.figures)
     assert all((path.parent / name).is_file() for name in pictures)

@@ -136,10 +136,10 @@ def test_a_page_s_blocks_run_in_their_order(
         elif block.language == "sh":
             printed = "".join(ran(line) for line in block.text.splitlines() if line)
         elif block.language == "text" and printed:
-            told = {shape(line) for line in printed.splitlines()}
-            assert [line for line in block.text.splitlines() if shape(line) not in told] == [], (
-                printed
-            )
+            printed_shapes = {shape(line) for line in printed.splitlines()}
+            assert [
+                line for line in block.text.splitlines() if shape(line) not in printed_shapes
+            ] == [], printed
         if block.language != "sh":
             printed = ""
     commands = "\n".join(
@@ -159,7 +159,7 @@ def ran(line: str) -> str:
         done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return ""
-    assert program == "skysim", f"{line}: a command of somebody else's belongs in a `text` block"
+    assert program == "skysim", f"{line}: another program's command belongs in a `text` block"
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         assert not main.app(words, standalone_mode=False), line

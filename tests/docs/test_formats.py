@@ -36,8 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.long
 def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    told = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
-    assert told <= left
+    expected = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
+    assert expected <= left
     assert {f"frame_000{n}.tif" for n in range(3)} <= left
     assert not [name for name in left if name.startswith(".")]
     named = set(re.findall(r"--to (\w+)", PAGE.partition("|---")[2]))

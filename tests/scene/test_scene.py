@@ -50,8 +50,8 @@ def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
     return message
 
 
-def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
-    """The complaint about a scene with one slip in it, and `(file, line N)` of the slip."""
+def complaint_and_place(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
+    """The complaint about a scene with one fault in it, and `(file, line N)` of the fault."""
     text = whole.read_text()
     assert text.count(right) == 1
     path = tmp_path / "bad.yaml"
@@ -302,7 +302,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(
     assert str(SHEFEX) not in message
 
 
-# Slips in a file
+# Faults in a file
 
 
 @pytest.mark.slow
@@ -425,7 +425,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(
 def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
-    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    message, place = complaint_and_place(tmp_path, AFIT, right, wrong)
     assert says in message
     assert message.endswith(place)
 
@@ -460,14 +460,14 @@ def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
 def test_a_slip_in_where_the_camera_points_is_not_taken_for_a_vehicle_s(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
-    message, place = spoilt(tmp_path, SHEFEX, right, wrong)
+    message, place = complaint_and_place(tmp_path, SHEFEX, right, wrong)
     assert says in message
     assert message.endswith(place)
 
 
 def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
     right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
-    message, place = spoilt(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
+    message, place = complaint_and_place(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
     assert (
         message == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
     )
@@ -515,7 +515,7 @@ UNIONS = [
 def test_a_kind_that_is_none_is_answered_with_those_that_are(
     tmp_path: Path, right: str, wrong: str, key: str, allowed: str
 ) -> None:
-    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    message, place = complaint_and_place(tmp_path, AFIT, right, wrong)
     assert re.fullmatch(
         rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message
     )
@@ -853,8 +853,11 @@ def test_nobody_need_fly_a_vehicle_that_is_told_nothing(kind: str) -> None:
         "jitter": ", components: [{kind: line, frequency_hz: 9, rms_arcsec: [1, 1, 1]}]",
         "bump": ", rate_deg_s: [1, 1, 1]",
     }[kind]
-    told = {"motion.maneuver": f"[{{kind: {kind}, duration: 1 s{more}}}]", "motion.control": "none"}
-    assert loader.load(AFIT, told).motion.control is None
+    settings = {
+        "motion.maneuver": f"[{{kind: {kind}, duration: 1 s{more}}}]",
+        "motion.control": "none",
+    }
+    assert loader.load(AFIT, settings).motion.control is None
 
 
 def test_a_controller_s_name_is_short_for_its_section() -> None:
@@ -1037,7 +1040,7 @@ def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
 @pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
 def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
     """There the image would be greater than the object; at the focal length there is none at all."""
-    message, _ = spoilt(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
+    message, _ = complaint_and_place(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
     assert re.match(r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message)
 
 
@@ -1059,24 +1062,24 @@ def test_a_focus_that_is_no_distance_is_refused(focus: str, says: str) -> None:
 
 
 def test_a_missing_key_is_named_with_its_section_s_line(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, '    apex: "48 in"\n', "")
+    message, _ = complaint_and_place(tmp_path, AFIT, '    apex: "48 in"\n', "")
     line = line_number(AFIT.read_text(), "surface:")
     assert message == f"light.surface.apex: missing ({tmp_path / 'bad.yaml'}, line {line})"
 
 
 def test_a_missing_section_is_named(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, "seed: 1\n", "")
+    message, _ = complaint_and_place(tmp_path, AFIT, "seed: 1\n", "")
     assert message == f"seed: missing ({tmp_path / 'bad.yaml'})"
 
 
 def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
-    message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
+    message, place = complaint_and_place(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
     late = "plus trigger_jitter 0.0001 s"
     assert message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
 
 
 def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, "control: pid", "control: none")
+    message, _ = complaint_and_place(tmp_path, AFIT, "control: pid", "control: none")
     allowed = "such as control: pid; allowed: maneuver: [] without one"
     assert message.startswith(f"motion: a maneuver requires a controller, {allowed}")
 

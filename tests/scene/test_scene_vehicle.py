@@ -33,14 +33,14 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         motion__control="{law: pd, actuators: wheels, desaturation: {start: 1.7 N m s, stop: 800 mN m s, time: 5 s}}",
     )
     vehicle = given.vehicle
-    told = given.motion.control
+    control = given.motion.control
     assert vehicle.wheels is not None
     assert vehicle.fans is not None
     assert vehicle.cmgs is not None
     assert vehicle.disturbances.cable is not None
     assert vehicle.disturbances.air_current is not None
-    assert told is not None
-    assert told.desaturation is not None
+    assert control is not None
+    assert control.desaturation is not None
     figures = {
         0.6: vehicle.wheels.torque_limit_nm,
         2e-3: vehicle.wheels.coulomb_nm,
@@ -57,9 +57,9 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         2e-3 * 57.29577951308232: vehicle.disturbances.cable.stiffness_nm_rad,
         3e-3: vehicle.disturbances.air_current.rms_nm[2],
         0.9: vehicle.disturbances.air_current.correlation_s,
-        1.7: told.desaturation.start_nms,
-        0.8: told.desaturation.stop_nms,
-        5.0: told.desaturation.time_s,
+        1.7: control.desaturation.start_nms,
+        0.8: control.desaturation.stop_nms,
+        5.0: control.desaturation.time_s,
     }
     assert list(figures.values()) == pytest.approx(list(figures), rel=1e-12)
 
@@ -145,11 +145,11 @@ def test_what_does_not_go_together_is_told_in_one_line(sets: dict[str, str], say
 
 
 def test_a_vehicle_that_nobody_flies_may_be_knocked() -> None:
-    told = loaded(
+    scene = loaded(
         motion__control="none",
         motion__maneuver="[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms}]",
     )
-    assert told.motion.control is None
+    assert scene.motion.control is None
 
 
 # --- base ---------------------------------------------------------------------------------------------------

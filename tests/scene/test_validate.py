@@ -133,8 +133,8 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
         (DATA / "catalogs" / "hipparcos_hp6.5.ecsv", "a catalog of 7996 stars"),
         (DATA / "catalogs" / "gaia_v8.0.ecsv", "a catalog of 45735 stars"),
     ):
-        told = check_file(path)
-        assert (told.fault, told.what[: len(what)]) == ("", what)
+        result = check_file(path)
+        assert (result.fault, result.what[: len(what)]) == ("", what)
     for path in (broken, xml, tmp_path / "none.yaml", ROOT / "data/published/afit.yaml"):
         fault = check_file(path).fault
         assert fault
@@ -151,8 +151,8 @@ def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
         (Path("end_to_end"), "a study of 6 trials"),
         (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
     ):
-        told = check_file(path)
-        assert (told.fault, told.what[: len(what)]) == ("", what)
+        result = check_file(path)
+        assert (result.fault, result.what[: len(what)]) == ("", what)
     assert "allowed: a .yaml file or one of afit_simsat" in check_file(Path("nosuch")).fault
 
 

@@ -160,15 +160,15 @@ def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float,
 @pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
 def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
-    told = {"tracker.refraction": "true"}
+    settings = {"tracker.refraction": "true"}
     later = {"exposure.first": "600 s"}
     without = errors_arcsec(
         build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg
     )
-    undone = errors_arcsec(lab_of(**told), altitude_deg)
+    undone = errors_arcsec(lab_of(**settings), altitude_deg)
     assert undone[0] < without[0] + 1.0
     assert undone[1] == pytest.approx(without[1], abs=0.02)
-    assert errors_arcsec(lab_of(**told, **later), altitude_deg)[0] < without[0] + 1.0
+    assert errors_arcsec(lab_of(**settings, **later), altitude_deg)[0] < without[0] + 1.0
 
 
 @pytest.mark.slow

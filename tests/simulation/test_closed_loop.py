@@ -85,7 +85,7 @@ def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(
 
 
 def off_deg(telemetry: Telemetry) -> Floats:
-    """(K,) by how much the vehicle is not where it was told to be."""
+    """(K,) angle between reference and true attitude, deg."""
     assert telemetry.lab_from_ref is not None
     return np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
 

@@ -258,9 +258,9 @@ def test_a_head_that_looks_at_the_earth_is_told_by_its_own_key() -> None:
         "light.occlusion": "false",
     }
     findings = check(build_lab(loader.load("shefex2", keys))).findings
-    told = [line for line in findings if "behind the Earth" in line]
-    assert len(told) == 1
-    assert told[0].startswith("heads.0.rotation_deg: ")
+    behind = [line for line in findings if "behind the Earth" in line]
+    assert len(behind) == 1
+    assert behind[0].startswith("heads.0.rotation_deg: ")
 
 
 def test_the_page_s_lighthouse_is_a_light(tmp_path: Path) -> None:

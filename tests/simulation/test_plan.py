@@ -104,7 +104,7 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (
             {"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"},
@@ -113,8 +113,10 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
         ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
     ],
 )
-def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], told: str) -> None:
-    with pytest.raises(InputError, match=f"{told}.*allowed: up to vehicle.tilt_stop_deg 30"):
+def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(
+    changes: dict[str, str], message: str
+) -> None:
+    with pytest.raises(InputError, match=f"{message}.*allowed: up to vehicle.tilt_stop_deg 30"):
         check(lab_of("afit_simsat", **changes))
 
 
@@ -271,8 +273,8 @@ def test_what_the_tracker_believes_is_said() -> None:
         "lever wrong by",
     ):
         assert words in lines
-    told = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
-    assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in told
+    knowledge = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
+    assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in knowledge
 
 
 def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
@@ -613,24 +615,25 @@ def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: st
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
     tracker = build_tracker(lab.camera)
-    told = []
+    statuses = []
     for n, lab_from_body in enumerate(reach):
         frame, _ = render_at_rest(lab.in_run(n).camera, lab_from_body)
-        told.append(solve_frame(tracker, frame).attitude.status)
-    ambiguous = np.mean([status.startswith("ambiguous") for status in told])
+        statuses.append(solve_frame(tracker, frame).attitude.status)
+    ambiguous = np.mean([status.startswith("ambiguous") for status in statuses])
     assert fact(check(lab), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
 
 
 def test_fields_whose_leds_have_names_are_not_alike() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
-    told = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
+    settings = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
     without = check(
-        lab_of("coded_spiral", **told, light__led__code="null", tracker__decoder="null")
+        lab_of("coded_spiral", **settings, light__led__code="null", tracker__decoder="null")
     )
     assert any("look like another one" in line for line in without.findings)
     assert not any(
-        "look like another one" in line for line in check(lab_of("coded_spiral", **told)).findings
+        "look like another one" in line
+        for line in check(lab_of("coded_spiral", **settings)).findings
     )
 
 

@@ -498,17 +498,17 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
     body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"
     away = {"motion__rate_deg_s": "[2, 0, 0]", "background": body}
     shots = shots_of(controlled(33, "24 ms", "{mean_dn: 150}", **away))
-    told = exposures_ms(shots)
+    exposure_ms = exposures_ms(shots)
     mean_dn = np.array([shot.frame.image_dn.mean() for shot in shots])
     gone = int(np.argmax(mean_dn < 70))
     assert 15 < gone < 25  # four degrees at 2 deg/s, ten frames a second
     # In its light every frame above the reference is followed by one a step shorter, down to the least.
-    assert told[1] == pytest.approx(22)
-    assert min(told[:gone]) < 5
+    assert exposure_ms[1] == pytest.approx(22)
+    assert min(exposure_ms[:gone]) < 5
     for n in range(gone):
-        assert (mean_dn[n] > 150) == (told[n + 1] < told[n])
+        assert (mean_dn[n] > 150) == (exposure_ms[n + 1] < exposure_ms[n])
     # After that it grows to what four stars take, and stays.
-    assert told[-1] == told[-5] > min(told)
+    assert exposure_ms[-1] == exposure_ms[-5] > min(exposure_ms)
     assert [shot.report.attitude.status for shot in shots[-5:]] == ["solved"] * 5
     assert not any(shot.report.attitude.solved for shot in shots[5:gone])
 

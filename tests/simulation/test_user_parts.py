@@ -106,7 +106,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (
             {"motion.maneuver": [{"kind": "step", "duration": "1 s"}]},
@@ -128,8 +128,10 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
         ),
     ],
 )
-def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_what_a_prescribed_motion_cannot_do_is_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
         simulate_motion(skysim.load_scene("afit_simsat", PRESCRIBED | changes))
 
 
@@ -171,10 +173,10 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
     table.write_text("\n".join([*lines[:9], lines[8], *lines[9:]]))
     with pytest.raises(InputError) as raised:
         build_lab(loader.load(path))
-    told = str(loader.located(raised.value, str(path), {}))
+    message = str(loader.located(raised.value, str(path), {}))
     assert re.fullmatch(
         rf"motion.maneuver.0: {table}, line 10: time 0.7 s is not after 0.7 s, by .* at least \({path}, line 7\)",
-        told,
+        message,
     )
     table.unlink()
     with pytest.raises(
@@ -185,7 +187,7 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "changes", "size_deg", "told"),
+    ("scene", "changes", "size_deg", "message"),
     [
         (
             "afit_simsat",
@@ -209,11 +211,11 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
     ],
 )
 def test_what_the_vehicle_cannot_follow_is_refused(
-    scene: str, changes: dict[str, Any], size_deg: float, told: str
+    scene: str, changes: dict[str, Any], size_deg: float, message: str
 ) -> None:
     """The torque of Euler's equation, the gyros' range and the tilt stop. A fifth of the angles is followed."""
     ways = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"}} | changes
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         moved(scene, ways, profile=swing(TIMES, size_deg))
     assert str(raised.value).startswith("motion.maneuver")
     if "torque_limit" not in str(changes):
@@ -255,11 +257,11 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
         InputError, match=r"a chirp of 60 Hz requires a motion\.control\.rate_hz above 120"
     ):
         loader.load("afit_simsat", {"motion.maneuver": str(chirp(from_hz=60.0)["motion.maneuver"])})
-    for wrong, told in (
+    for wrong, message in (
         ({"to_hz": 0.5}, "from_hz and to_hz are both 0.5"),
         ({"duration": "2.9 s"}, "shorter than a period"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             skysim.load_scene("afit_simsat", chirp(**wrong))  # type: ignore[arg-type]
 
 
@@ -398,11 +400,11 @@ def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
         InputError, match=r"tracker.name: unknown tracker 'nobody's'|unknown tracker 'nobody'"
     ):
         skysim.simulate(scene, tracker="nobody")
-    for wrong, told in (
+    for wrong, message in (
         (5, "tracker: int; allowed"),
         (estimator.StarTracker, "tracker: the class StarTracker; allowed"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             skysim.simulate(scene, tracker=wrong)
 
 

@@ -107,7 +107,7 @@ def test_compensated_earth_rate_is_taken_away_again() -> None:
 
 
 def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
-    """Turn-on bias and an Earth nobody takes away: minus the mean rate of the navigator's drift in body axes."""
+    """Turn-on bias and uncompensated Earth rate: minus the navigator's mean drift rate in body axes."""
     unit = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 30, scale_ppm: 0, quantum_arcsec: 0,"
     unit += " misalignment_arcsec: 0}, earth_rate: uncompensated}"
     telemetry = telemetry_of(
@@ -352,9 +352,9 @@ def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
 def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted: bool) -> None:
     """Of a tilted ellipsoid by how much it misses: turned by e it moves (a - b) e at the most, along its normal."""
     lines = doubted_of("afit_simsat", {"light.surface": surface})
-    told = [line for line in lines if line.startswith("light.surface")]
-    assert len(told) == doubted
-    for line in told:
+    doubts = [line for line in lines if line.startswith("light.surface")]
+    assert len(doubts) == doubted
+    for line in doubts:
         missed_mm = float(re.search(r"differs by (\S+) mm rms", line)[1])  # type: ignore[index]
         assert 1 < missed_mm < 300 * np.radians(3)
 
@@ -379,7 +379,7 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"light.led.disk_diameter": "8 mm"}, "tracker.detector: LED images are 87 px wide"),
         ({"camera.focus": "20 in"}, "tracker.detector: LED images are 54 px wide"),
@@ -389,12 +389,12 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
         ),
     ],
 )
-def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
+def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], message: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
     lines = dome_warnings.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
     assert len(lines) == 1
-    assert lines[0].startswith(told)
+    assert lines[0].startswith(message)
     assert lines[0] in check(lab).findings
 
 
@@ -422,10 +422,10 @@ def test_the_exposure_control_is_the_chart_s_unless_the_scene_says_otherwise() -
     )
     assert plain == Control(mean_dn=150.0)
     part = "{mean_dn: 99, shortest: 1 ms, longest: 90 ms, step: 3 ms, min_stars: 5, overexposed_objects: 6,"
-    told = factory.control_settings(
+    control = factory.control_settings(
         loader.load("shefex2", {"tracker.exposure_control": part + " saturated_px: 7}"})
     )
-    assert told == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
+    assert control == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
     assert factory.control_settings(loader.load("shefex2")) is None
 
 

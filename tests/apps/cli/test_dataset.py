@@ -34,8 +34,13 @@ WORDS = (
 def test_it_writes_the_frames_and_says_where(command: Command, tmp_path: Path) -> None:
     done = command(*WORDS, "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["out"], told["frames"], told["shards"], told["failed"]) == ("frames", 3, 2, 0)
+    report = json.loads(done.stdout)
+    assert (report["out"], report["frames"], report["shards"], report["failed"]) == (
+        "frames",
+        3,
+        2,
+        0,
+    )
     assert sorted(path.name for path in (tmp_path / "frames" / "shards").iterdir()) == [
         "000000.tar",
         "000001.tar",

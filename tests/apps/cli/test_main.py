@@ -183,12 +183,12 @@ def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(
     skysim: Skysim, tmp_path: Path
 ) -> None:
     words = ["render", "apl_dome", "--frames", "1", "--out", str(tmp_path)]
-    told = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
-    assert told.code == 0
-    assert told.err.startswith(
+    result = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
+    assert result.code == 0
+    assert result.err.startswith(
         "skysim: vehicle.camera: 5 m from the bearing, outside of light.surface"
     )
-    assert told.err.count("\n") == 1
+    assert result.err.count("\n") == 1
 
 
 @pytest.mark.slow
@@ -266,8 +266,8 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
     for key in ("ra_deg", "dec_deg", "roll_deg"):
         assert late[key] == none[key]
         assert late[key] != good[key]
-    told = ["--time", "2012-06-22T21:00:00", "--json", "--out", tmp_path / "out"]
-    ran = skysim("solve", frames["late"], "--camera", SHEFEX, *told)
+    options = ["--time", "2012-06-22T21:00:00", "--json", "--out", tmp_path / "out"]
+    ran = skysim("solve", frames["late"], "--camera", SHEFEX, *options)
     assert ran.err == ""
     assert json.loads(ran.out)[0]["ra_deg"] == good["ra_deg"]
 
@@ -326,11 +326,11 @@ def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_pa
 def test_a_run_s_json_parses_and_counts(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("run", "shefex2", "--frames", "2", "--json", "--out", tmp_path)
     assert (ran.code, ran.err) == (0, "")
-    told = json.loads(ran.out)
-    assert (told["scene"], told["frames"], len(told["rows"])) == ("shefex2", 2, 2)
-    assert told["solved"] == sum(row["status"] == "solved" for row in told["rows"])
-    assert told["wrong"] == 0
-    page = Path(told["report"]).read_text()
+    report = json.loads(ran.out)
+    assert (report["scene"], report["frames"], len(report["rows"])) == ("shefex2", 2, 2)
+    assert report["solved"] == sum(row["status"] == "solved" for row in report["rows"])
+    assert report["wrong"] == 0
+    page = Path(report["report"]).read_text()
     assert "<html" in page
     assert 'src="http' not in page
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
@@ -409,8 +409,8 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
     assert ran["exposures_ms"] == pytest.approx([40, 42], abs=1e-9)
     solved = [images.read_image(tmp_path / f"frame_000{n}.fits") for n in (0, 1)]
     assert skysim("render", *words).code == 0
-    told = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
-    assert told == pytest.approx([0.040, 0.042], abs=1e-12)
+    exposures_s = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
+    assert exposures_s == pytest.approx([0.040, 0.042], abs=1e-12)
     for n in (0, 1):
         np.testing.assert_array_equal(images.read_image(tmp_path / f"frame_000{n}.fits"), solved[n])
 
@@ -575,9 +575,9 @@ def text_as_png(folder: Path) -> Path:
 
 
 def with_nan(image: np.ndarray) -> np.ndarray:
-    spoilt = image.astype(np.float32)
-    spoilt[100, 200] = np.nan
-    return spoilt
+    changed = image.astype(np.float32)
+    changed[100, 200] = np.nan
+    return changed
 
 
 BAD_IMAGES: dict[str, tuple[Any, str]] = {
@@ -726,12 +726,12 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
 
 
 def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
-    told = json.loads(
+    report = json.loads(
         skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out
     )
-    assert told["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
-    assert told["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
-    assert any(line.startswith("light.layout.cap_deg: ") for line in told["findings"])
+    assert report["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
+    assert report["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
+    assert any(line.startswith("light.layout.cap_deg: ") for line in report["findings"])
 
 
 @pytest.mark.slow

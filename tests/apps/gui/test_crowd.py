@@ -51,12 +51,12 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
     monkeypatch.setattr(Hand, "alive", set())
     workers = session.Workers(WORKERS)
     served = list[tuple[int, Hand | None]]()
-    told = dict[int, str]()
+    status_texts = dict[int, str]()
     gone = set[int]()
 
     async def tab(number: int) -> None:
         got = await workers.wait(
-            lambda: number not in gone, lambda text: told.update({number: text})
+            lambda: number not in gone, lambda text: status_texts.update({number: text})
         )
         served.append((number, got))
 
@@ -66,8 +66,8 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
             await asyncio.sleep(0)
         assert [number for number, _ in served] == [0, 1]
         await asyncio.sleep(0.02)
-        assert told[2] == "2 of 2 workers in use."
-        assert told[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
+        assert status_texts[2] == "2 of 2 workers in use."
+        assert status_texts[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
         gone.add(2)  # it is closed while it waits
         await tabs[2]
         assert served[-1] == (2, None)

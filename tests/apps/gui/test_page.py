@@ -154,11 +154,11 @@ def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(gray, frame)
     truth = Table.read(kept["truth"])
-    told = json.loads(kept["solution"].read_text())
+    solution = json.loads(kept["solution"].read_text())
     assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute(
         "aria-label"
     )
-    np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
+    np.testing.assert_allclose(solution["angles_deg"], angles(page), rtol=0, atol=0.01)
     assert cv2.imread(str(kept["figure"])).shape[2] == 3
     assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load(
         "shefex2"
@@ -180,12 +180,12 @@ def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: 
     assert len(enlarged) == 7 * 11
     assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
     page.locator(".lab-under .mono", has_text="residual").wait_for()
-    told = page.locator(".lab-under .mono").inner_text()
-    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(
+    readout = page.locator(".lab-under .mono").inner_text()
+    assert float(re.search(r"residual ([\d.]+) px", readout)[1]) == pytest.approx(
         spot["residual_px"], abs=6e-4
     )
-    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
-    assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
+    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", readout)
+    assert float(re.search(r"V (-?[\d.]+)", readout)[1]) < 5
 
 
 def limits(page: Any) -> list[float]:
@@ -250,16 +250,16 @@ def test_the_readout_has_the_pixel_s_value_and_where_it_points(page: Any, tmp_pa
     sky = WCS(fits.getheader(path))
     for x, y in ((100, 80), (500, 400)):
         page.mouse.move(*screen(page, x, y))
-        told = page.locator(".lab-readout .mono").inner_text()
-        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", told).groups()]
-        assert int(re.search(r"(\d+) DN", told)[1]) == frame[y, x]
+        readout = page.locator(".lab-readout .mono").inner_text()
+        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", readout).groups()]
+        assert int(re.search(r"(\d+) DN", readout)[1]) == frame[y, x]
         ra_deg, dec_deg = sky.pixel_to_world_values(*place)
-        assert float(re.search(r"RA ([\d.]+)°", told)[1]) == pytest.approx(
+        assert float(re.search(r"RA ([\d.]+)°", readout)[1]) == pytest.approx(
             float(ra_deg), abs=6e-3
         )  # a place's 0.05 px
-        shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", told)[1].replace("−", "-"))
+        shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", readout)[1].replace("−", "-"))
         assert shown_dec == pytest.approx(float(dec_deg), abs=6e-3)
-        hours = Angle(re.search(r"\d+h\d+m[\d.]+s", told)[0]).degree
+        hours = Angle(re.search(r"\d+h\d+m[\d.]+s", readout)[0]).degree
         assert hours == pytest.approx(float(ra_deg), abs=6e-3)
 
 
@@ -477,8 +477,8 @@ def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: S
         has_text="trials of centroids do not use camera.detector.noise"
     ).wait_for()
     page.get_by_text("200 of 200 trials").wait_for()
-    told = page.get_by_text("identified", exact=False).last.inner_text()
-    assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
+    summary = page.get_by_text("identified", exact=False).last.inner_text()
+    assert float(re.search(r"identified\s+([\d.]+)", summary)[1]) > 0.9
     report = page.locator("a[href^='/report/']").first
     path = str(report.get_attribute("href")).removeprefix("/")
     assert (
@@ -504,7 +504,7 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     identifier = page.get_by_text(re.compile("^stages")).inner_text().split(" · ")[2]
     stage = "" if identifier == "default" else f"; identifier {identifier}"
     assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
-    assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
+    assert page.get_by_label("angle 1").input_value() == ""  # its attitude is unknown
     page.mouse.click(*screen(page, 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
         assert abs(dn - int(photo[y, x])) <= 2
@@ -662,10 +662,10 @@ def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Se
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("focal_length")
     set_to(page, "camera.focal_length", "45 mm")
-    for told in ("saved as mine.yaml", "mine.yaml: file exists"):
+    for message in ("saved as mine.yaml", "mine.yaml: file exists"):
         page.get_by_placeholder("new-name").fill("mine")
         page.get_by_role("button", name="Save as").click()
-        page.get_by_role("status").filter(has_text=told).wait_for()
+        page.get_by_role("status").filter(has_text=message).wait_for()
     assert loader.load(server.folder / "mine.yaml").camera.focal_length_m == 0.045
     frame = source(page)
     chosen(page, "Scene", "mine.yaml")
