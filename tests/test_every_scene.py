@@ -108,10 +108,10 @@ def test_its_light_is_on_the_frame(flown: Flown) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    told = flown.scene.camera.detector
-    step_e = told.full_well_e / 60000
+    detector_config = flown.scene.camera.detector
+    step_e = detector_config.full_well_e / 60000
     offset_dn = (
-        told.offset_dn * told.gain_e_dn / step_e
+        detector_config.offset_dn * detector_config.gain_e_dn / step_e
     )  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
@@ -305,7 +305,7 @@ TURNS = {"cubesat.xml": 2.0}  # times the rate of the others: its wheels hold it
 
 
 def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Simulation:
-    """A second of flight, every motor told something else each 10 ms, all over the range that it has.
+    """A second of flight; every 10 ms each motor gets another random control over its full range.
 
     A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
     """

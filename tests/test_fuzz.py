@@ -1,4 +1,4 @@
-"""Every parser against files that nobody wrote by hand: read, or refused in one line."""
+"""Every parser against random files: each is read or refused in one line."""
 
 from __future__ import annotations
 
@@ -147,18 +147,18 @@ def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "told",
+    "overrides",
     [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}],
 )
-def test_a_flight_that_no_memory_holds_is_refused(told: dict[str, str]) -> None:
+def test_a_flight_that_no_memory_holds_is_refused(overrides: dict[str, str]) -> None:
     with pytest.raises(InputError, match="allowed: up to 1000000, over a day"):
-        loader.load("shefex2", told)
+        loader.load("shefex2", overrides)
 
 
 @settings(max_examples=8, deadline=None)
 @given(some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3))
-def test_any_override_is_taken_or_refused(told: dict[str, str]) -> None:
-    rejects(lambda: loader.load("shefex2", told), InputError)
+def test_any_override_is_taken_or_refused(overrides: dict[str, str]) -> None:
+    rejects(lambda: loader.load("shefex2", overrides), InputError)
 
 
 # Tables
@@ -206,7 +206,7 @@ def test_a_header_of_gigapixels_is_refused_by_itself(
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".jpg"])
 def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> None:
     data = cv2.imencode(suffix, np.zeros((30, 41), np.uint8))[1].tobytes()
-    read = next(told for magic, told in encoded.FORMATS.items() if data.startswith(magic))
+    read = next(reader for magic, reader in encoded.FORMATS.items() if data.startswith(magic))
     assert list(read(data)) == [((41, 30), 1)]
 
 
@@ -226,9 +226,9 @@ def test_every_sample_of_a_tiff_s_pixels_counts(
 
 def pillow_bytes(mode: str, kind: str, **options: Any) -> bytes:
     """An image of 41 x 30 pixels as Pillow writes it."""
-    told = streams.BytesIO()
-    Image.new(mode, (41, 30)).save(told, kind, **options)
-    return told.getvalue()
+    buffer = streams.BytesIO()
+    Image.new(mode, (41, 30)).save(buffer, kind, **options)
+    return buffer.getvalue()
 
 
 ENCODED = [
@@ -251,7 +251,7 @@ ENCODED = [
 @pytest.mark.parametrize("data", ENCODED)
 def test_no_image_takes_more_memory_than_its_header_says(data: bytes) -> None:
     """And at most twice less: OpenCV may add an alpha channel to a palette, and leave one out."""
-    read = next(told for magic, told in encoded.FORMATS.items() if data.startswith(magic))
+    read = next(reader for magic, reader in encoded.FORMATS.items() if data.startswith(magic))
     ((sides, each_bytes),) = read(data)
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert decoded.nbytes <= np.prod(sides) * each_bytes <= 2 * decoded.nbytes
@@ -305,11 +305,11 @@ def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -
     if kind == "stream":
         path.write_bytes(gzip.compress(promise(".fits", 40_000, 50_000) + b"\0" * 2880))
     else:
-        told = streams.BytesIO()
+        buffer = streams.BytesIO()
         fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]).writeto(
-            told
+            buffer
         )
-        data = told.getvalue()
+        data = buffer.getvalue()
         for key, of in (("ZNAXIS1", 40_000), ("ZNAXIS2", 50_000)):
             at = data.index(key.encode())
             data = data[: at + 10] + f"{of:20d}".encode() + data[at + 30 :]

@@ -37,7 +37,7 @@ def by_file(rows, quick: int = 1):
 
 
 def answer(row, fov_error: float) -> dict:
-    """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
+    """Result of `skysim solve` for a photograph if the given field of view has this relative error."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
     return plate_solver.solve_file(
         FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None
@@ -46,7 +46,7 @@ def answer(row, fov_error: float) -> dict:
 
 @pytest.fixture(scope="module")
 def blind() -> plate_solver.Solver:
-    """Told nothing; it keeps its trackers for photographs of one size."""
+    """Solver without a field of view; it keeps its trackers for photographs of one size."""
     return plate_solver.make_solver(None, None)
 
 

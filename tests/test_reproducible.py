@@ -1,4 +1,4 @@
-"""Same seed and version, same bytes: of frames, truth and answers, whoever computes them and whatever was compiled."""
+"""Same seed and version give the same frames, truth and answers, in any process and after any compilation."""
 
 from __future__ import annotations
 
@@ -62,8 +62,10 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
         return lost(small)
 
     assert caller(1e-30) == (0, np.inf)
-    told = [path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()]
-    assert told == [Path(package.core.jit.__file__)]
+    compiling = [
+        path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()
+    ]
+    assert compiling == [Path(package.core.jit.__file__)]
 
 
 LOOPS = """
@@ -96,10 +98,10 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, script], stderr=stderr, env=environment, check=True)
         os.write(theirs, b"end\n")
-        told = done.stderr or b""
-        while not told.endswith(b"end\r\n"):
-            told += os.read(ours, 10_000)
-        said.append(told.decode().replace("\r", ""))
+        output = done.stderr or b""
+        while not output.endswith(b"end\r\n"):
+            output += os.read(ours, 10_000)
+        said.append(output.decode().replace("\r", ""))
         os.close(ours), os.close(theirs)
     assert re.fullmatch(r"skysim: compiling numba functions.*\nend\n", said[0])
     assert said[1:] == ["end\n"] * 3

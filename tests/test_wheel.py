@@ -17,10 +17,10 @@ from skysim.core.files import ROOT
 
 
 def test_versions_are_told_for_a_report() -> None:
-    told = CliRunner().invoke(main.app, ["--version"])
+    result = CliRunner().invoke(main.app, ["--version"])
     assert re.match(
         r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$",
-        told.stdout,
+        result.stdout,
     )
 
 

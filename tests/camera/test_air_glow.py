@@ -134,7 +134,7 @@ def test_dark_glow_is_that_of_the_told_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
     lab = lab_of("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
     ours = glow_toward(lab, up_pointing(lab))
-    told = SkyGlowConfig(kind="sky", mag_arcsec2=21)
-    even = glow_map((told,), lab.camera.optics, up_pointing(lab), lab.camera.band)
+    sky_glow = SkyGlowConfig(kind="sky", mag_arcsec2=21)
+    even = glow_map((sky_glow,), lab.camera.optics, up_pointing(lab), lab.camera.band)
     center = tuple(size // 2 for size in ours.shape)
     assert ours[center] == pytest.approx(even[center], rel=2e-3)

@@ -440,12 +440,12 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
     light_e = np.full((64, 32), 30.0)
     light_e[28:33, 8:13] += 40
     made = detector_with((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
-    told = detector.add_snr_and_saturation(
+    sources = detector.add_snr_and_saturation(
         seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
     )
     sums = [(expose(light_e, made, n)[28:33, 8:13]).sum() * 12.0 for n in range(400)]
-    assert told.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
-    assert not told.saturated[0]
+    assert sources.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
+    assert not sources.saturated[0]
 
 
 def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
@@ -455,17 +455,19 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
     for name in noise_e:
         one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {name: noise_e[name]}
         made = detector_with((64, 32), offset_dn=20.0, **one)
-        told = detector.add_snr_and_saturation(
+        sources = detector.add_snr_and_saturation(
             seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
         )
         pixel_e2 = one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
-        assert told.snr[0] == pytest.approx(1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6)
+        assert sources.snr[0] == pytest.approx(
+            1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6
+        )
 
 
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
     made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
-    told = detector.add_snr_and_saturation(
+    sources = detector.add_snr_and_saturation(
         seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
     )
-    assert told.saturated[0] == full
+    assert sources.saturated[0] == full

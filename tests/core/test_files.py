@@ -360,16 +360,16 @@ def test_other_truncated_pictures_are_one_line(tmp_path: Path, suffix: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("at", "told"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"]
+    ("at", "field_value"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"]
 )
 def test_a_png_that_tells_of_more_than_it_holds_is_not_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, told: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, field_value: int
 ) -> None:
     """A chunk's length stands after IHDR, the height in it; OpenCV would take the memory for both."""
     data = bytearray(
         cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8))[1]
     )
-    data[at : at + 4] = told.to_bytes(4, "big")
+    data[at : at + 4] = field_value.to_bytes(4, "big")
     (tmp_path / "much.png").write_bytes(data)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     assert "truncated" in complaint(tmp_path / "much.png")

@@ -244,10 +244,10 @@ def test_a_cube_of_one_plane_is_a_picture_and_of_many_is_refused_by_its_shape(
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
     for shape in ((12, 6, 9), (2, 6, 9), (3, 2, 6, 9), (5,)):
         path = fits_file(tmp_path / f"{len(shape)}_{shape[0]}.fits", np.zeros(shape, np.int16))
-        told = re.escape(
+        message = re.escape(
             f"a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)"
         )
-        assert re.search(told, complaint(path))
+        assert re.search(message, complaint(path))
 
 
 # What hostile files promise

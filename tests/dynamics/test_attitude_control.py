@@ -29,13 +29,13 @@ SLEW = {"kind": "slew", "roll_deg": 20, "pitch_deg": -12, "yaw_deg": 90}
 SLEW |= {"rate_deg_s": 20, "acceleration_deg_s2": 15}
 
 
-def told(*elements: object) -> Reference:
+def planned(*elements: object) -> Reference:
     return plan(MotionConfig.model_validate({"control": "pid", "maneuver": elements}))
 
 
 def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
     """A controller that is to keep the attitude (0, 0, 0)."""
-    return build_controller(told(), inertia, ControlConfig.model_validate(part))
+    return build_controller(planned(), inertia, ControlConfig.model_validate(part))
 
 
 def closed(
@@ -146,7 +146,7 @@ def test_what_a_constant_torque_leaves(law: str) -> None:
 
 def test_feed_forward_is_eulers_equation() -> None:
     """On the reference itself the torque is J a + w x (J w + h), of a full inertia tensor and of stored momentum."""
-    tour = told(SLEW)
+    tour = planned(SLEW)
     lab_from_ref, rate, acceleration = tour.state_at(1.3)
     torque = build_controller(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
     expected = TENSOR @ acceleration + np.cross(rate, TENSOR @ rate + STORED)
@@ -157,7 +157,7 @@ def test_feed_forward_is_eulers_equation() -> None:
 @pytest.mark.slow
 def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
     """By the feed-forward alone: the error that feedback might amend never comes to be."""
-    tour = told(SLEW)
+    tour = planned(SLEW)
     t_s = np.linspace(0.5, tour.duration_s + 1, 15)
     there, _ = closed(build_controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
     error = (tour.attitudes(t_s).inv() * there).as_rotvec()
@@ -209,7 +209,7 @@ def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(
 ) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
     config = ControlConfig.model_validate(PLACED)
-    law = build_controller(told(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
+    law = build_controller(planned(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
     here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
     np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)

@@ -69,7 +69,7 @@ def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Simulation
     )
 
 
-def told(flight_computer: FlightComputer, flight: multibody.Simulation) -> Floats:
+def present_controls(flight_computer: FlightComputer, flight: multibody.Simulation) -> Floats:
     """(nu,) controls of the present tick."""
     stored = flight_computer.momentum_nms(flight.angles_rad, flight.speeds_rad_s)
     now = ControlInput(
@@ -115,7 +115,7 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
     for _ in range(40):
         turn = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
         held.append(turn.apply(inertia @ flight.rate_body_rad_s))
-        flight.advance(np.tile(told(flight_computer, flight), (10, 1)))
+        flight.advance(np.tile(present_controls(flight_computer, flight), (10, 1)))
     torque = (held[-1] - held[-21]) / 0.2
     turned_by = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True).magnitude()
     assert np.linalg.norm(torque - wanted) < (within + turned_by) * np.linalg.norm(wanted)
@@ -128,7 +128,7 @@ def test_what_it_says_is_given_is_given(name: str) -> None:
     flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
     flight_computer.law = law  # type: ignore[assignment]
-    told(flight_computer, flight)
+    present_controls(flight_computer, flight)
     ((wanted, given),) = law.given
     np.testing.assert_array_equal(wanted, flight_computer.control_torque_nm)
     np.testing.assert_allclose(given, wanted, rtol=0, atol=1e-3 * np.linalg.norm(wanted))
@@ -143,7 +143,7 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
     flight_computer, flight = manned(name)
     flight.states[0, 1:5] = quaternion.from_rotation(Rotation.from_rotvec([1e-4, 1e-4, 0.0]))
     flight.rate_body_rad_s[:] = [0.5, 0, 0]
-    control = told(flight_computer, flight)
+    control = present_controls(flight_computer, flight)
     vehicle = flight.vehicle
     motors = {
         "ideal": vehicle.torques,
@@ -163,7 +163,9 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
 
 def test_controls_of_nobody_are_zeros() -> None:
     flight_computer, flight = manned("wheels", **{"motion.control": "none"})
-    np.testing.assert_array_equal(told(flight_computer, flight), np.zeros(flight.model.nu))
+    np.testing.assert_array_equal(
+        present_controls(flight_computer, flight), np.zeros(flight.model.nu)
+    )
     np.testing.assert_array_equal(flight_computer.control_torque_nm, np.zeros(3))
 
 
@@ -260,5 +262,5 @@ def test_desaturation_ends_below_its_stop_and_the_vehicle_stays_where_it_is(
     size = np.linalg.norm(relieved.momentum_nms, axis=1)
     assert size[0] > 1.7
     assert 0.7 < size[-1] < 0.8
-    assert np.ptp(size[relieved.t_s > 7]) < 1e-3  # nobody takes any more
+    assert np.ptp(size[relieved.t_s > 7]) < 1e-3  # no stored momentum left to remove
     assert np.degrees(relieved.lab_from_body.magnitude()).max() < 0.02

@@ -50,14 +50,14 @@ def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str,
     return {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
 
 
-def told(*maneuver: object, **motion: object) -> MotionConfig:
+def motion_config(*maneuver: object, **motion: object) -> MotionConfig:
     return MotionConfig.model_validate(
         {"control": "pid", "maneuver": maneuver, "start": START} | motion
     )
 
 
 def reference(*maneuver: object, **motion: object) -> Reference:
-    return plan(told(*maneuver, **motion))
+    return plan(motion_config(*maneuver, **motion))
 
 
 EVERY = {
@@ -406,7 +406,7 @@ def test_reference_holds_after_its_end_and_without_a_maneuver(tour: Reference) -
 
 def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
     """Whatever those are called: with the ICRS for lab, the angles are still counted from the start."""
-    motion = told(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
+    motion = motion_config(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
     lab_from_start = Rotation.from_rotvec([0.4, -1.0, 2.0])
     own = plan(motion)
     icrs = plan(motion, lab_from_start)
@@ -418,7 +418,7 @@ def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
 
 
 def test_a_given_start_of_a_vehicle_in_the_lab_moves_no_target() -> None:
-    ref = plan(told(turn_to(3, -5, 30)), euler(0, 0, 20))
+    ref = plan(motion_config(turn_to(3, -5, 30)), euler(0, 0, 20))
     assert between(there(ref, 0.0), euler(0, 0, 20)) < 1e-15
     assert between(there(ref, ref.duration_s), euler(3, -5, 30)) < 1e-14
 
@@ -470,7 +470,7 @@ def test_a_knock_is_a_half_sine_of_torque() -> None:
 
 
 def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None:
-    motion = told(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
+    motion = motion_config(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
     first, second, third = impulses(motion, plan(motion))
     assert [k.begin_s for k in (first, second, third)] == pytest.approx(
         [2.0, 5.05, 5.13], abs=1e-12
@@ -481,15 +481,15 @@ def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None
     left = sum(k.fraction(5.0, 9.0) * k.rate_rad_s for k in (second, third))
     np.testing.assert_allclose(left, np.zeros(3), rtol=0, atol=1e-15)
     assert plan(motion).start_s[4] == pytest.approx(5.18, abs=1e-12)  # caught_after + duration
-    assert impulses(told(HOLD, SPIN), reference(HOLD, SPIN)) == ()
+    assert impulses(motion_config(HOLD, SPIN), reference(HOLD, SPIN)) == ()
 
 
 def test_vibration_sounds_while_its_element_lasts() -> None:
-    motion = told(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
+    motion = motion_config(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
     (begin, end, parts), (later, last, _) = vibration_intervals(motion, plan(motion))
     assert (begin, end) == (2.0, 5.0)
     assert parts[0].frequency_hz == 30
     assert (later, last) == pytest.approx(
         (plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12
     )
-    assert vibration_intervals(told(HOLD, BUMP), reference(HOLD, BUMP)) == ()
+    assert vibration_intervals(motion_config(HOLD, BUMP), reference(HOLD, BUMP)) == ()

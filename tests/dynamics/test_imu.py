@@ -610,9 +610,9 @@ def test_a_turn_slower_than_the_counter_is_counted_in_the_end() -> None:
 def test_white_noise_of_the_rate() -> None:
     """ARW^2 / dt, of both kinds of sensor, whatever the step; one in sqrt(2 n) is 0.2 % of 300,000 draws."""
     for step_s in (2.5e-3, 0.1):
-        told = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
+        settings = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
         run = steady([0, 0, 0], 100_000, step_s)
-        got = Imu.from_config(told, np.random.default_rng(7)).measure(run)
+        got = Imu.from_config(settings, np.random.default_rng(7)).measure(run)
         rate_deg_h = got.angle_rad / step_s / DEG_H
         force_ug = got.velocity_m_s / step_s / G * 1e6
         np.testing.assert_allclose(rate_deg_h.std(), 0.07 * 60 / np.sqrt(step_s), rtol=6e-3)

@@ -231,10 +231,10 @@ def shaking(*while_s: float, parts: object = None, always: object = ()) -> Motio
     """Holds of a second, and between them the vibration for each of the given whiles."""
     hold = {"kind": "hold", "duration": "1 s"}
     parts = parts or [{"kind": "line", "frequency_hz": 40, "rms_arcsec": RMS}]
-    told: list[object] = [hold]
+    maneuver: list[object] = [hold]
     for one_s in while_s:
-        told += [{"kind": "jitter", "duration": f"{one_s} s", "components": parts}, hold]
-    return MotionConfig.model_validate({"maneuver": told, "jitter": always})
+        maneuver += [{"kind": "jitter", "duration": f"{one_s} s", "components": parts}, hold]
+    return MotionConfig.model_validate({"maneuver": maneuver, "jitter": always})
 
 
 LOUD = [{"kind": "line", "frequency_hz": 7, "rms_arcsec": [3600, 1800, 900]}]

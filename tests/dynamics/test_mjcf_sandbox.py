@@ -199,10 +199,10 @@ def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
     }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    told = mjcf.load(tmp_path / "v.xml")
-    assert told.compile().nmesh == 1
-    assert told.site("in") is not None
-    assert told.body("psecret") is not None
+    model = mjcf.load(tmp_path / "v.xml")
+    assert model.compile().nmesh == 1
+    assert model.site("in") is not None
+    assert model.body("psecret") is not None
 
 
 def nested(count: int) -> str:
@@ -218,7 +218,7 @@ def flexcomp(count: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             whole(ATTACHED.replace("c.xml", "v.xml").replace("secret", "bus")),
@@ -236,13 +236,13 @@ def flexcomp(count: str) -> str:
     ids=["contains itself", "flexcomp", "joints", "replicate", "height field", "nuser_body"],
 )
 def test_a_model_that_would_crash_or_never_end_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
 ) -> None:
-    if "1 s" in told:
+    if "1 s" in message:
         monkeypatch.setattr(mjcf, "TRIAL_CPU_S", 1)
     (tmp_path / "v.xml").write_text(text)
     with pytest.raises(
-        InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{told}$"
+        InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{message}$"
     ):
         mjcf.load(tmp_path / "v.xml")
 

@@ -311,7 +311,7 @@ def test_flight_starts_and_ends_where_and_when_it_was_told() -> None:
 
 
 def test_controller_is_asked_every_period_about_the_present() -> None:
-    """The state it is shown is the trajectory's at the very time it is told, not a step old."""
+    """The state passed to the controller is the trajectory's at the time passed with it, not a step older."""
     asked: list[tuple[float, Rotation, np.ndarray]] = []
 
     def listen(*now: object) -> np.ndarray:
@@ -351,9 +351,9 @@ def test_mujocos_warning_is_an_error_and_leaves_no_file(
 def test_pid_flies_the_afit_maneuver() -> None:
     """80 kg, tens of micrometers out of balance: below 0.02 deg throughout, below 0.001 deg when settled."""
     given = yaml.safe_load((SCENES / "afit_simsat.yaml").read_text(encoding="utf-8"))
-    told = MotionConfig.model_validate(given["motion"])
+    motion = MotionConfig.model_validate(given["motion"])
     flown = multibody.build(VehicleConfig.model_validate(given["vehicle"]))
-    reference = plan(told)
+    reference = plan(motion)
     law = build_controller(reference, flown.inertia_kg_m2)
 
     def steer(t_s: float, here: Rotation, rate_rad_s: Floats) -> Floats:
@@ -361,7 +361,7 @@ def test_pid_flies_the_afit_maneuver() -> None:
         law.integrate(wanted, wanted, 0.01)
         return wanted
 
-    flight = multibody.simulate(flown, start_attitude(told), STILL, reference.duration_s, steer)
+    flight = multibody.simulate(flown, start_attitude(motion), STILL, reference.duration_s, steer)
     t = np.append(np.arange(0, reference.duration_s, 0.2), reference.duration_s)
     error_deg = np.degrees((reference.attitudes(t).inv() * flight.attitude_at(t)).magnitude())
     assert error_deg.max() < 0.02
@@ -578,7 +578,9 @@ def test_free_vehicle_turns_about_its_center_of_mass() -> None:
 # --- what a file must not say, or says in another way -------------------------------------------------------
 
 
-def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody.VehicleModel:
+def changed_model(
+    folder: Path, right: str, wrong: str, **changes: object
+) -> multibody.VehicleModel:
     """simsat.xml with one thing changed."""
     text = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
     assert right in text
@@ -614,15 +616,15 @@ def test_what_the_scene_declares_is_not_the_file_s_to_say(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
     with pytest.raises(InputError, match=re.escape(says)):
-        spoilt(tmp_path, right, wrong, wheels={}, fans={})
+        changed_model(tmp_path, right, wrong, wheels={}, fans={})
 
 
 @pytest.mark.slow
 def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
     sensor = '<sensor><jointvel joint="wheel_x"/></sensor></mujoco>'
     with pytest.raises(InputError, match=r"vehicle\.wheels is off, which locks joint wheel_x"):
-        spoilt(tmp_path, "</mujoco>", sensor)
-    assert len(spoilt(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
+        changed_model(tmp_path, "</mujoco>", sensor)
+    assert len(changed_model(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
 
 
 @pytest.mark.slow
@@ -637,7 +639,7 @@ def test_a_wheel_s_inertia_is_the_file_s_however_it_is_written(
     tmp_path: Path, inertial: str
 ) -> None:
     given = f'<inertial pos="0 0 0" mass="2.5" {inertial}/><joint name="wheel_x" axis'
-    made = spoilt(
+    made = changed_model(
         tmp_path, '<joint name="wheel_x" axis', given, wheels={"dynamic_imbalance": "1 g cm2"}
     )
     assert made.wheels.inertia_kg_m2[0] == pytest.approx(0.0101, rel=1e-6)

@@ -50,7 +50,7 @@ def flown(
 
 
 def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
-    """Nobody at the controls: (K, nu) zeros."""
+    """(K, nu) zero controls."""
     return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
@@ -368,7 +368,7 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
 
 @pytest.mark.slow
 def test_pose_inside_an_exposure_while_gimbals_are_driven() -> None:
-    """CMGs at 2600 rpm whose gimbals are told another rate each 10 ms: within 1e-9 rad."""
+    """CMGs at 2600 rpm whose gimbal rates change every 10 ms: within 1e-9 rad."""
     vehicle = multibody.build(vehicle_config(cmgs={}))
     rng = np.random.default_rng(6)
     control = still(vehicle, 2.0)

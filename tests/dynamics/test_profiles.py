@@ -180,8 +180,8 @@ TABLES = {
     "scalar last": (quaternion_columns("lab_from_body_q", MOTION, "xyzw"), None),
     "any order": (quaternion_columns("lab_from_body_q", MOTION, "zwyx"), None),
     "inverse": (quaternion_columns("body_from_lab_q", MOTION.inv()), None),
-    "told": (quaternion_columns("q_", MOTION, "xyzw"), "lab_from_body"),
-    "told inverse": (quaternion_columns("q_", MOTION.inv(), "wxyz"), "body_from_lab"),
+    "frames given": (quaternion_columns("q_", MOTION, "xyzw"), "lab_from_body"),
+    "frames given, inverse": (quaternion_columns("q_", MOTION.inv(), "wxyz"), "body_from_lab"),
     "angles": (angles_columns(), None),
 }
 
@@ -251,7 +251,7 @@ def test_tables_of_astropy_and_pandas_are_read_with_their_dates(tmp_path: Path) 
 
 
 GOOD = "t_s,roll_deg,pitch_deg,yaw_deg\n0,0,0,0\n1,1,0,0\n2,2,0,0\n3,3,0,0\n"
-SLIPS = [
+FAULTY_TABLES = [
     (
         GOOD.replace("roll_deg", "roll"),
         r"line 1: unknown column 'roll'; allowed: t_s or utc, with A_from_B_qx",
@@ -300,18 +300,20 @@ SLIPS = [
 ]
 
 
-@pytest.mark.parametrize(("content", "told"), SLIPS)
-def test_a_slip_in_a_table_is_told_with_its_line(content: str, told: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("content", "message"), FAULTY_TABLES)
+def test_a_slip_in_a_table_is_told_with_its_line(
+    content: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "p.csv"
     path.write_text(content)
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         check_samples(read_profile(path, START))
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
 
 
 def test_the_good_table_is_read(tmp_path: Path) -> None:
-    """So that each of the slips above is what is refused."""
+    """Without a fault the same table is read, so each fault above is the cause of its refusal."""
     (tmp_path / "p.csv").write_text(GOOD)
     assert len(check_samples(read_profile(tmp_path / "p.csv", START)).t_s) == 4
 
@@ -528,7 +530,7 @@ def test_segments_are_joined(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (aem(version="3.0"), "CCSDS_AEM_VERS is '3.0'; allowed: 1.0, 2.0"),
         (aem(), "no segment"),
@@ -578,8 +580,8 @@ def test_segments_are_joined(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_slip_in_an_aem_is_told_with_its_line(content: str, told: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=told) as raised:
+def test_a_slip_in_an_aem_is_told_with_its_line(content: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message) as raised:
         read_text(content, tmp_path)
     assert str(raised.value).startswith(str(tmp_path / "p.aem"))
     assert "\n" not in str(raised.value)
@@ -592,9 +594,9 @@ def stk(
     rotations: Rotation, section: str = "AttitudeTimeQuaternions", more: str = "", **keywords: str
 ) -> str:
     rows = rotations.as_quat(scalar_first="First" in section)
-    told = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
-    told |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
-    lines = [f"  {key}\t{value}" for key, value in (told | keywords).items() if value]
+    defaults = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
+    defaults |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
+    lines = [f"  {key}\t{value}" for key, value in (defaults | keywords).items() if value]
     data = [
         f"{t!r} {' '.join(map(repr, row))}{more}"
         for t, row in zip(TIMES.tolist(), rows.tolist(), strict=True)
@@ -633,7 +635,7 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (
             stk(MOTION, CoordinateAxes="Fixed"),
@@ -681,9 +683,9 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
     ],
 )
 def test_a_slip_in_an_stk_file_is_told_with_its_line(
-    content: str, told: str, tmp_path: Path
+    content: str, message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         read_text(content, tmp_path, "p.a")
     assert "\n" not in str(raised.value)
 

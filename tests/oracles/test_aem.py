@@ -43,9 +43,9 @@ def test_it_is_valid_and_says_what_was_meant(
     assert (read.version, read.header.originator) == ("2.0", "SKYSIM")
     for message in (read, ndm.Aem.from_str(read.to_str("xml"))):
         (segment,) = message.segments
-        told = segment.metadata
-        assert (told.ref_frame_a, told.ref_frame_b) == frames
-        assert (told.time_system, told.attitude_type, told.object_name) == (
+        metadata = segment.metadata
+        assert (metadata.ref_frame_a, metadata.ref_frame_b) == frames
+        assert (metadata.time_system, metadata.attitude_type, metadata.object_name) == (
             "UTC",
             "QUATERNION",
             "AFIT_SIMSAT",
@@ -54,7 +54,7 @@ def test_it_is_valid_and_says_what_was_meant(
             datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs
         ]
         assert epochs == utc(count)
-        assert (told.start_time, told.stop_time) == (
+        assert (metadata.start_time, metadata.stop_time) == (
             run_export.epoch(epochs[0]),
             run_export.epoch(epochs[-1]),
         )
@@ -92,8 +92,8 @@ def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
     assert read.direction == "icrs_from_body"
     np.testing.assert_allclose(read.t_s, np.arange(9) / 10, rtol=0, atol=1e-9)
     (segment,) = theirs.segments
-    told = Rotation.from_quat(segment.data.attitude_states_numpy)
-    assert (read.a_from_b * told.inv()).magnitude().max() < 1e-14
+    their_attitudes = Rotation.from_quat(segment.data.attitude_states_numpy)
+    assert (read.a_from_b * their_attitudes.inv()).magnitude().max() < 1e-14
     assert (read.a_from_b * meant.inv()).magnitude().max() < 1e-14
 
 

@@ -59,13 +59,13 @@ def sky_flight(folder: Path) -> Flight:
 
 def dome_flight(folder: Path) -> Flight:
     """A dome photographed into a folder by a noise-free camera: frames and truths."""
-    told = {
+    settings = {
         "exposure.frames": "2",
         "motion.start": "{roll_deg: 4, yaw_deg: 70}",
         "camera.shutter": "{kind: global}",
     }
     small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
-    flight = open_flight(loader.load("afit_simsat", told | small))
+    flight = open_flight(loader.load("afit_simsat", settings | small))
     for shot in flight.shots(solves=False):
         recording.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
     return flight
@@ -133,8 +133,8 @@ def test_under_the_stars_the_message_puts_every_star_on_its_pixel(
     flight, run = stars
     camera = flight.lab.camera
     run_export.export(run, ["aem"], tmp_path, quiet)
-    told, epochs, quaternions = read_aem(tmp_path / "truth.aem")
-    assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == (
+    metadata, epochs, quaternions = read_aem(tmp_path / "truth.aem")
+    assert (metadata["REF_FRAME_A"], metadata["REF_FRAME_B"], metadata["TIME_SYSTEM"]) == (
         "ICRF",
         "STARTRACKER_1",
         "UTC",
@@ -161,8 +161,8 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
     flight, run = dome
     camera = flight.lab.camera
     run_export.export(run, ["aem"], tmp_path, quiet)
-    told, _, quaternions = read_aem(tmp_path / "truth.aem")
-    assert (told["REF_FRAME_A"], told["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
+    metadata, _, quaternions = read_aem(tmp_path / "truth.aem")
+    assert (metadata["REF_FRAME_A"], metadata["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
     place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
     for stem, q in zip(run.stems, quaternions, strict=True):
         seen = Table.read(f"{stem}.ecsv")
@@ -172,7 +172,7 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
         np.testing.assert_allclose(
             pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5
         )
-    assert not (tmp_path / "solutions.aem").exists()  # nobody solved
+    assert not (tmp_path / "solutions.aem").exists()  # no frame was solved
 
 
 @pytest.mark.parametrize("which", ["stars", "dome"])
@@ -366,11 +366,11 @@ def test_the_header_s_polynomials_are_the_renderer_s_lens(
 def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
     lens = camera((-0.3, 0.1, 0.0, 0.0, -0.02), "6.5 mm")
     forwards, backwards = misfits(lens)
-    told = wcs.header(lens, Rotation.identity())["SIPERR"]
-    assert told > 2 * wcs.MAX_ERROR_PX
-    assert told == pytest.approx(forwards, rel=2 / 3)
+    error_px = wcs.header(lens, Rotation.identity())["SIPERR"]
+    assert error_px > 2 * wcs.MAX_ERROR_PX
+    assert error_px == pytest.approx(forwards, rel=2 / 3)
     assert backwards < 1e-6
-    assert f"{told:.2g} px" in wcs.accuracy_warning(lens)
+    assert f"{error_px:.2g} px" in wcs.accuracy_warning(lens)
     wide = loader.load(
         "shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"}
     )

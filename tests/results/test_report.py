@@ -156,9 +156,9 @@ def test_json_holds_the_numbers_themselves(tmp_path: Path) -> None:
     path = of(Verdict("yes"), Section("s", [table, Figure(PICTURE, "seen")])).save(
         tmp_path / "report.json"
     )
-    told = json.loads(path.read_text())
-    assert (told["title"], told["command"]) == ("a report", "skysim run x")
-    verdict, section = told["blocks"]
+    document = json.loads(path.read_text())
+    assert (document["title"], document["command"]) == ("a report", "skysim run x")
+    verdict, section = document["blocks"]
     assert verdict == {"kind": "verdict", "text": "yes", "tone": ""}
     assert section["blocks"][0]["columns"] == [{"title": "error", "unit": "″"}]
     assert section["blocks"][0]["rows"] == [[1.239], [None], ["WRONG"]]

@@ -20,9 +20,9 @@ def test_a_share_has_wilsons_interval(hits, of):
     z2 = stats.norm.ppf(0.975) ** 2
     p = hits / of
     roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
-    told = metrics.proportion(hits, of)
-    assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
-    assert (told.value, told.trials) == (p, of)
+    share = metrics.proportion(hits, of)
+    assert (share.low, share.high) == pytest.approx(tuple(roots), abs=1e-9)
+    assert (share.value, share.trials) == (p, of)
 
 
 @pytest.mark.parametrize("count", [1, 12, 1200])
@@ -65,8 +65,8 @@ def test_intervals_hold_what_they_promise():
     for _ in range(400):
         sample = rng.exponential(size=60)
         for name, value in truth.items():
-            told = metrics.STATISTICS[name](sample)
-            inside[name] += told.low <= value <= told.high
+            estimate = metrics.STATISTICS[name](sample)
+            inside[name] += estimate.low <= value <= estimate.high
     error = math.sqrt(0.95 * 0.05 / 400)
     assert (
         min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error
@@ -142,8 +142,8 @@ def test_the_interval_of_a_p95_holds_it() -> None:
     truth = math.log(20)
     inside = 0
     for sample in rng.exponential(size=(2000, 100)):
-        told = metrics.STATISTICS["p95"](sample)
-        inside += told.low <= truth <= told.high
+        estimate = metrics.STATISTICS["p95"](sample)
+        inside += estimate.low <= truth <= estimate.high
     assert 0.95 - 4 * math.sqrt(0.95 * 0.05 / 2000) < inside / 2000 < 0.99
 
 
@@ -220,8 +220,8 @@ def test_the_interval_of_many_holds_the_truth(name: str) -> None:
         values = (
             rng.exponential(size=3000) if name == "exponential" else 1e4 * (rng.random(3000) < rate)
         )
-        told = metrics.mean_of(values)
-        inside += told.low <= truth <= told.high
+        estimate = metrics.mean_of(values)
+        inside += estimate.low <= truth <= estimate.high
     assert (
         inside / runs
         > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[name]

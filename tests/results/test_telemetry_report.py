@@ -22,7 +22,7 @@ def turned(axis: str, degrees: np.ndarray | float) -> Rotation:
 
 
 def bare() -> Telemetry:
-    """Nobody flies it: a yaw at 10 deg/s."""
+    """Telemetry without control: a yaw at 10 deg/s."""
     nothing = np.zeros((len(T_S), 3))
     return Telemetry(
         T_S,
@@ -39,7 +39,7 @@ def bare() -> Telemetry:
 
 
 def full() -> Telemetry:
-    """Told to be 2 deg farther in yaw, the IMU 0.5 deg off in roll at the end, the filter 3 arcsec all along."""
+    """The reference is 2 deg ahead in yaw, the IMU ends 0.5 deg off in roll, the filter is 3 arcsec off throughout."""
     log = bare()
     bias = np.full((len(T_S), 3), 5 * DEG / 3600)
     return replace(

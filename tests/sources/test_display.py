@@ -347,11 +347,11 @@ def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(
     conjugate_m: float | None,
 ) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
-    told = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
+    settings = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
     lab = build_lab(
         loader.load(
             "collimated_display",
-            told | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
+            settings | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
         )
     )
     central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
@@ -472,7 +472,7 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
     )
 
 
-# Slips
+# Faulty keys
 
 
 @pytest.mark.slow

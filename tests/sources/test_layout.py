@@ -293,13 +293,16 @@ def test_glue_moves_each_led_in_its_board_s_plane_by_as_much_as_declared() -> No
     real = lit(BOARDS | {"glue_scatter": "0.12 mm"}, MEASURED)
     np.testing.assert_array_equal(ideal.id, real.id)
     np.testing.assert_array_equal(ideal.start_s, real.start_s)
-    slip = (real.place - ideal.place)[:, :3]
-    n = len(slip)
+    displacement = (real.place - ideal.place)[:, :3]
+    n = len(displacement)
     assert n > 1000
-    np.testing.assert_allclose(np.einsum("nj,nj->n", slip, ideal.normal), 0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.einsum("nj,nj->n", displacement, ideal.normal), 0, rtol=0, atol=1e-15
+    )
     one = unit(np.cross(ideal.normal, [0, 1.0, 0]))
     a, b = (
-        np.einsum("nj,nj->n", slip, axis) / 0.12e-3 for axis in (one, np.cross(ideal.normal, one))
+        np.einsum("nj,nj->n", displacement, axis) / 0.12e-3
+        for axis in (one, np.cross(ideal.normal, one))
     )
     for value in (a, b):
         assert abs(value.mean()) < 4 / np.sqrt(n)

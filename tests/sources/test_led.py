@@ -216,8 +216,8 @@ def test_a_dome_ages_and_nothing_else_of_it_changes() -> None:
     band = Band.from_efficiency(0.3)
 
     def leds(keys: str) -> Sources:
-        told = {"light.led.aging": keys} if keys else {}
-        return sources(loader.load("afit_simsat", told).light, band)
+        settings = {"light.led.aging": keys} if keys else {}
+        return sources(loader.load("afit_simsat", settings).light, band)
 
     new, even, own = (leds(keys) for keys in ("", "{hours: 9000, life_hours: 18000}", UNEVEN))
     np.testing.assert_allclose(even.strength / new.strength, math.sqrt(0.7), rtol=1e-12)
@@ -273,7 +273,9 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[s
     dark = keys | {"light.led.intensity": "1e-20 cd"}
     warm = keys | {"light.led.warm_up": "{steady: 0.8, time: 2 s}"}
     for index in (0, 1):
-        dark_dn, cold_dn, warm_dn = (still(scene, told, index) for told in (dark, keys, warm))
+        dark_dn, cold_dn, warm_dn = (
+            still(scene, settings, index) for settings in (dark, keys, warm)
+        )
         t_s = exposure_window(loader.load(scene, keys), index).middle_s(len(dark_dn))
         left = 0.8 + 0.2 * math.exp(-t_s / 2)
         np.testing.assert_allclose(

@@ -462,7 +462,7 @@ def test_a_cloud_with_noise_comes_back_within_theory(cloud: dict) -> None:
 
 
 def test_a_cloud_s_best_ellipsoid_is_the_dome_s_within_its_noise(cloud: dict) -> None:
-    """The axes themselves are ill told by a cap; where the ellipsoid is, is not."""
+    """A cap determines the axes poorly but the position of the ellipsoid's surface well."""
     believed = made(cloud, rim_deg=38).nearest_ellipsoid()
     assert believed.rms_m < 3e-5
     met = (
@@ -519,7 +519,7 @@ def test_what_is_drawn_goes_out_to_the_rim(name: str) -> None:
     assert np.isnan(shape.meet(np.zeros(3), beyond)[:, 0]).all()
 
 
-# Slips
+# Faulty keys
 
 
 def complaint(more: str) -> str:
@@ -530,7 +530,7 @@ def complaint(more: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("surface", "says"),
     [
         ("{kind: torus}", "light.surface.kind: 'torus' is not allowed; allowed: 'sphere', 'ellipsoid', 'flat'"),
         ("{kind: [flat]}", r"light.surface.kind: \['flat'\] is not allowed"),
@@ -570,8 +570,8 @@ def complaint(more: str) -> str:
         ("{kind: surveyed, file: pyproject.toml, unit: mm}", "light.surface.file: 'pyproject.toml' is not a file"),
     ],
 )  # fmt: skip
-def test_a_slip_is_one_line_with_its_key_and_what_is_allowed(told: str, says: str) -> None:
-    assert re.search(says, complaint(told))
+def test_a_slip_is_one_line_with_its_key_and_what_is_allowed(surface: str, says: str) -> None:
+    assert re.search(says, complaint(surface))
 
 
 def surveyed_complaint(path: Path, more: str = "") -> str:

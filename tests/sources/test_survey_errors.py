@@ -152,8 +152,8 @@ ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
 @pytest.mark.slow
 def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_does() -> None:
     def places(seed: int, own: int) -> tuple[bytes, ...]:
-        told = ALL.format(lever="0.1 mm", seed=own)
-        eyes, _ = believing(seed=str(seed), tracker__survey=told, light__surface__error="0.1 mm")
+        survey = ALL.format(lever="0.1 mm", seed=own)
+        eyes, _ = believing(seed=str(seed), tracker__survey=survey, light__surface__error="0.1 mm")
         return tuple(
             one.tobytes()
             for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m)
@@ -175,8 +175,8 @@ def test_one_error_more_leaves_the_others_as_they_were() -> None:
 def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
     """Frames are the same whatever is believed."""
     frames = []
-    for told in ("{}", ALL.format(lever="5 mm", seed=1)):
-        lab = build_lab(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
+    for survey in ("{}", ALL.format(lever="5 mm", seed=1)):
+        lab = build_lab(loaded(tracker__survey=survey, exposure=BARE_CAMERA["exposure"]))
         frames.append(render_at_rest(lab.camera, lab.start)[0].image_dn.tobytes())
     assert frames[0] == frames[1]
 
@@ -192,8 +192,8 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
 
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
     """
-    told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
-    eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
+    survey = f"{{lever_sigma: 2 mm, seed: {seed}}}"
+    eyes, lab = believing(tracker__survey=survey, motion__start="{roll_deg: 7}", **BARE_CAMERA)
     frame, truth = render_at_rest(lab.camera, lab.start)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
