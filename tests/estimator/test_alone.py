@@ -58,7 +58,7 @@ assert len(StarCatalog.read(CATALOG)) > 7000
 """
 
 
-def test_what_is_blocked_cannot_be_imported() -> None:
+def test_a_blocked_module_cannot_be_imported() -> None:
     for name in ("skysim", "astropy", "erfa", "lazy_loader"):
         done = subprocess.run(
             [sys.executable, "-c", f"{BLOCK}import {name}"], capture_output=True, text=True
@@ -67,7 +67,7 @@ def test_what_is_blocked_cannot_be_imported() -> None:
 
 
 @pytest.mark.slow
-def test_it_solves_where_nothing_else_can_be_imported() -> None:
+def test_estimator_solves_without_any_other_package() -> None:
     catalog = f"CATALOG = {str(ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv')!r}"
     done = subprocess.run(
         [sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"], cwd=ROOT, capture_output=True, text=True
@@ -79,7 +79,7 @@ def test_it_solves_where_nothing_else_can_be_imported() -> None:
 
 
 @pytest.mark.long
-def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
+def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     """With what pip brings along, and nothing of this environment; then with the extra for dates."""
     wheels = tmp_path / "wheels"
     bare = tmp_path / "bare"

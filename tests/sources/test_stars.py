@@ -44,7 +44,7 @@ def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(stars: Catalog, date: datetime.datetime) -> None:
+def test_apparent_places_match_skycoord(stars: Catalog, date: datetime.datetime) -> None:
     # Stars whose parallax is known: SkyCoord needs a distance for space motion.
     near = stars.take(stars.parallax_rad > 1 * MAS_RAD)
     with (

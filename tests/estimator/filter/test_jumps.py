@@ -88,7 +88,7 @@ def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_a_tracker_that_stays_wrong_prevails_after_half_a_minute() -> None:
+def test_the_filter_adopts_a_persistently_wrong_tracker_after_half_a_minute() -> None:
     """Nothing that the filter knows distinguishes it then from a gyro that failed without a flag."""
     vehicle = Vehicle(2)
     vehicle.updates(HOME, 60)
@@ -104,7 +104,7 @@ def test_a_wrong_start_is_given_up_at_the_third_solution(off: float) -> None:
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_what_confirmed_a_restart_supports_the_filter_after_it() -> None:
+def test_after_a_restart_ten_wrong_solutions_do_not_cause_another() -> None:
     vehicle = Vehicle(9, start=WRONG.inv())
     assert vehicle.updates(HOME, 3)[-1].status == RESET
     assert RESET not in [update.status for update in vehicle.updates(WRONG, 10)]
@@ -170,7 +170,7 @@ def test_after_a_knock_the_filter_is_back_within_three_solutions(
     assert vehicle.error_rad(after) < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_a_knock_that_the_gyro_measures_is_no_licence_for_a_wrong_solution() -> None:
+def test_a_measured_knock_does_not_admit_a_wrong_solution() -> None:
     """A turn of 20 degrees below the limit, at rates that change smoothly, and ten wrong solutions after it."""
     gyro = GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf, limit_rad_s=10.0)
     vehicle = Vehicle(6, gyro)
@@ -220,7 +220,7 @@ def jump(**changes: float) -> Jump:
     return Jump(np.radians(5.0), 1800.0, 3, 3.0, 0.0, 100)._replace(**changes)  # type: ignore[arg-type]
 
 
-def test_the_odds_are_those_of_the_docstring() -> None:
+def test_the_odds_match_the_docstring_s_formula() -> None:
     model = JumpModel(1e-6, 1e-3, 0.5, 0.02)
     wrong = math.log(1e-3) + 2 * math.log(0.5)
     assert log_odds(jump(), model) == pytest.approx(math.log(3e-6) - wrong, rel=1e-9)
@@ -239,7 +239,7 @@ def test_a_small_jump_is_put_to_the_filter_s_own_model_at_the_third_solution() -
     assert log_odds(jump(distance=40.0, agreeing=CONFIRMATIONS), JumpModel()) < ENOUGH
 
 
-def test_a_shock_is_the_sharpest_change_of_rate_and_no_noise() -> None:
+def test_a_shock_is_the_largest_change_of_rate_above_noise() -> None:
     rng = np.random.default_rng(8)
     samples = np.zeros((100, 5))
     samples[:, 0] = 2.0 + np.cumsum(rng.uniform(0.005, 0.015, 100))
@@ -254,6 +254,6 @@ def test_a_shock_is_the_sharpest_change_of_rate_and_no_noise() -> None:
 
 @pytest.mark.parametrize("name", ["missed_per_s", "wrong_share", "wrong_repeat", "wrong_start"])
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, np.nan])
-def test_a_bad_probability_is_one_clear_line(name: str, value: float) -> None:
+def test_a_bad_probability_is_refused_in_one_line(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"jumps: {name} is .*; allowed: above 0, below 1$"):
         JumpModel(**{name: value})

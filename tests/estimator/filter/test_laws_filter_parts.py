@@ -56,7 +56,7 @@ def solution_near(
 
 @law(states.of_head, states.build_layout)
 @given(heads=some.integers(1, 8), considered=CHOICES)
-def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
+def test_every_head_has_its_own_mounting_and_slow_error_states(
     heads: int, considered: tuple[str, ...]
 ) -> None:
     """They share no row; only the first mounting can be considered, the slow errors all together."""
@@ -94,7 +94,7 @@ def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None
 
 @law(consistency.checked_samples)
 @given(rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5))
-def test_samples_keep_what_was_measured_and_say_how(
+def test_checked_samples_keep_measured_angles_and_mark_lost_and_limited_ones(
     rng: np.random.Generator, angle: NDArray, lost: NDArray
 ) -> None:
     t_s = np.cumsum(rng.uniform(0.01, 0.1, 5))
@@ -115,7 +115,7 @@ def test_samples_keep_what_was_measured_and_say_how(
 
 @law(consistency.checked_covariances, consistency.is_covariance)
 @given(rng=SEEDS, any_matrix=NUMBERS | arrays("f8", (3, 3), elements=ANY))
-def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(
+def test_a_solution_s_covariance_is_the_sum_of_noise_and_common_errors(
     rng: np.random.Generator, any_matrix: NDArray
 ) -> None:
     noise = covariance(rng, 3)
@@ -209,7 +209,7 @@ def test_the_slow_error_returns_to_its_unit_variance(
 
 @law(states.decorrelate)
 @given(rng=SEEDS)
-def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random.Generator) -> None:
+def test_a_rotation_decorrelates_the_slow_error_alone(rng: np.random.Generator) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
     before = state_of(rng, layout)
     after = states.decorrelate(before, TRACKER, layout)
@@ -230,7 +230,7 @@ def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random
 
 @law(correct.innovation, correct.offset_rows)
 @given(rng=SEEDS, off_rad=some.floats(0, 0.5))
-def test_the_residual_follows_the_errors_that_it_is_linear_in(
+def test_the_residual_is_linear_in_the_error_states(
     rng: np.random.Generator, off_rad: float
 ) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
@@ -261,7 +261,7 @@ def test_the_residual_follows_the_errors_that_it_is_linear_in(
 
 @law(correct.correct)
 @given(rng=SEEDS, considered=CHOICES)
-def test_a_correction_leaves_the_considered_and_shrinks_the_estimated(
+def test_a_correction_shrinks_estimated_states_and_keeps_considered_ones(
     rng: np.random.Generator, considered: tuple[str, ...]
 ) -> None:
     layout = states.build_layout(GYRO, TRACKER, considered)
@@ -308,7 +308,9 @@ def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(
 
 @law(correct.wxyz_of, correct.right_jacobian, correct.root)
 @given(rng=SEEDS, length=some.floats(0, 3))
-def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, length: float) -> None:
+def test_rotation_vectors_and_matrix_roots_reproduce_their_arguments(
+    rng: np.random.Generator, length: float
+) -> None:
     some_turn = turn(rng)
     same = Rotation.from_quat(correct.wxyz_of(some_turn), scalar_first=True) * some_turn
     assert same.magnitude() < 1e-12
@@ -338,7 +340,7 @@ def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, leng
     lost=some.floats(0, 10),
     support=some.integers(0, 10000),
 )
-def test_odds_rise_with_what_speaks_against_the_filter(
+def test_odds_rise_with_evidence_against_the_filter(
     angle: float, distance: float, agreeing: int, since_s: float, lost: float, support: int
 ) -> None:
     model = JumpModel()
@@ -361,7 +363,7 @@ def test_odds_rise_with_what_speaks_against_the_filter(
 
 @law(consistency.shock_rad)
 @given(rng=SEEDS, step=some.floats(1e-3, 1.0), slope=some.floats(-10, 10))
-def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
+def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_not(
     rng: np.random.Generator, step: float, slope: float
 ) -> None:
     at = int(rng.integers(2, 18))

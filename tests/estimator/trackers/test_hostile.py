@@ -55,7 +55,7 @@ def tracker(stars: catalog.StarCatalog) -> StarTracker:
 @pytest.mark.parametrize("detector", DETECTORS)
 @BRIEF
 @given(image=IMAGES, centroider=some.sampled_from(sorted(CENTROIDERS)))
-def test_any_image_gives_centroids_or_one_line(
+def test_any_image_gives_centroids_or_one_error_line(
     detector: str, centroider: str, image: NDArray
 ) -> None:
     try:
@@ -95,7 +95,7 @@ def test_no_lights_of_noise_have_an_attitude(
 @pytest.mark.parametrize("solver", SOLVERS)
 @BRIEF
 @given(count=some.integers(0, 6), data=some.data())
-def test_any_directions_give_a_rotation_or_one_line(
+def test_any_directions_give_a_rotation_or_one_error_line(
     solver: str, count: int, data: some.DataObject
 ) -> None:
     cam, ref = (data.draw(arrays("f8", (count, 3), elements=ANY)) for _ in range(2))
@@ -157,7 +157,7 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> N
 
 
 @pytest.mark.slow
-def test_four_stars_among_twice_as_many_strangers_are_no_sky(tmp_path: Path) -> None:
+def test_four_stars_among_twice_as_many_false_ones_are_refused(tmp_path: Path) -> None:
     """A mirrored sky that once had an answer: 4 of 12 lights on stars, a chance of one in ten thousand by itself."""
     name, shot, answer, _, _ = hostile.Judge(tmp_path).take(68, 14)
     assert (name, shot.skies) == ("mirrored", ())

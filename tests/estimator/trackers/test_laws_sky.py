@@ -77,7 +77,7 @@ class World:
     false=some.integers(0, 6),
     with_magnitudes=some.booleans(),
 )
-def test_what_is_identified_is_what_is_there(
+def test_identified_stars_are_the_true_stars(
     rng: np.random.Generator, name: str, false: int, with_magnitudes: bool
 ) -> None:
     """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
@@ -111,7 +111,7 @@ def test_what_is_identified_is_what_is_there(
     mag=NUMBERS,
     name=some.sampled_from(sorted(IDENTIFIERS)),
 )
-def test_directions_of_nothing_are_no_stars(
+def test_random_directions_match_each_star_once_or_none(
     rng: np.random.Generator, rays: NDArray, tolerance: float, mag: NDArray, name: str
 ) -> None:
     world = World(rng, 60)
@@ -147,7 +147,7 @@ def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, 
 @law(Options.magnitudes, Options.require_known_focal)
 @given(mag=NUMBERS, count=some.integers(0, 6))
 @example(mag=np.array(3.0), count=1)
-def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
+def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> None:
     magnitudes = answered(lambda: Options(magnitude=mag).magnitudes(count), ImageError)
     assert (magnitudes is not None) == (mag.shape == (count,))
     assert np.isnan(Options().magnitudes(count)).tolist() == [True] * count
@@ -156,7 +156,7 @@ def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
 
 @law(AssumptionPool.log10_chance, AssumptionPool.best_match)
 @given(rng=SEEDS)
-def test_a_pool_without_assumptions_answers_nothing(rng: np.random.Generator) -> None:
+def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) -> None:
     world = World(rng, 60)
     known = world.index
     unknown = np.full(len(world.seen), np.nan)
@@ -223,7 +223,7 @@ def seen_by(
 
 @law(FieldMatcher.nearest, FieldMatcher.refine)
 @given(rng=SEEDS)
-def test_a_field_is_matched_from_a_near_attitude(
+def test_a_field_is_matched_from_a_nearby_attitude(
     eye: StarTracker, rng: np.random.Generator
 ) -> None:
     truth = turn(rng)
@@ -238,7 +238,7 @@ def test_a_field_is_matched_from_a_near_attitude(
 
 @law(FieldMatcher.misfits, FieldMatcher.near_misses, FieldMatcher.fits, FieldMatcher.lens_radii_px)
 @given(rng=SEEDS, aside=some.booleans())
-def test_stars_beside_detections_tell_a_wrong_camera(
+def test_stars_beside_detections_reveal_a_wrong_camera(
     eye: StarTracker, rng: np.random.Generator, aside: bool
 ) -> None:
     truth = turn(rng)
@@ -272,7 +272,7 @@ def test_stars_beside_detections_tell_a_wrong_camera(
     Attitude.solved,
 )
 @given(rng=SEEDS, false=some.integers(0, 8))
-def test_an_attitude_is_the_sky_s_or_none(
+def test_an_attitude_is_correct_or_none(
     eye: StarTracker, rng: np.random.Generator, false: int
 ) -> None:
     truth = turn(rng)
@@ -304,7 +304,7 @@ def test_an_attitude_is_the_sky_s_or_none(
     sigma_px=arrays("f8", 9, elements=ANY),
     flux=arrays("f8", 9, elements=ANY),
 )
-def test_any_lights_are_told_apart_from_a_sky(
+def test_any_valid_lights_get_an_answer_and_invalid_ones_are_refused(
     eye: StarTracker, xy_px: NDArray, sigma_px: NDArray, flux: NDArray
 ) -> None:
     lights = Centroids(xy_px, sigma_px, flux)
@@ -388,7 +388,9 @@ def test_mutual_neighbors_are_each_other_s_nearest(
 
 @law(refinement.log10_chance)
 @given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
-def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
+def test_more_matches_are_less_likely_by_chance(
+    blobs: int, predicted: int, radius_px: float
+) -> None:
     chances = [
         refinement.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000)
         for n in range(2, blobs + 1)
