@@ -67,7 +67,7 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.long
-def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> None:
+def test_a_full_disk_is_reported_and_written_files_are_complete(mounted: Path) -> None:
     done = asked("run", "shefex2", "--frames", "20", "--out", str(mounted / "run"), *SMALL)
     assert done.returncode == 2
     last = done.stderr.splitlines()[-1]
@@ -186,7 +186,7 @@ def test_a_picture_without_room_names_file_and_reason(
 
 
 @pytest.mark.long
-def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported_in_one_line(mounted: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", mounted], check=True)
     for words in (("run", "shefex2", "--frames", "1"), ("study", "run", "led_count")):
         done = asked(*words, "--out", str(mounted / "run"))

@@ -99,7 +99,7 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> None:
+def test_a_path_out_of_the_folder_that_mujoco_follows_is_refused(tmp_path: Path, way: str) -> None:
     """MuJoCo compiles each, and could not without the file outside."""
     files, links = WAYS[way]
     folder = tmp_path / "theirs"
@@ -138,7 +138,7 @@ def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> Non
         '<worldbody><INCLUDE file="part.xml"/></worldbody>',
     ],
 )
-def test_any_name_that_leaves_the_folder_is_refused(tmp_path: Path, names: str) -> None:
+def test_any_file_name_outside_the_folder_is_refused(tmp_path: Path, names: str) -> None:
     (tmp_path / "v.xml").write_text(whole(names))
     (tmp_path / "part.xml").write_text(CHILD)
     (tmp_path / "round.xml").symlink_to(tmp_path / "round.xml")
@@ -186,7 +186,7 @@ def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
         mjcf.load(path)
 
 
-def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
+def test_files_within_the_folder_are_read(tmp_path: Path) -> None:
     """Includes of includes from a folder beneath, meshes, an attached model; `..` that stays inside."""
     for name, text in {
         "v.xml": whole(
@@ -256,7 +256,7 @@ def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, va
         mjcf.load(tmp_path / "v.xml")
 
 
-def test_a_shipped_vehicle_needs_no_child_and_another_file_one(
+def test_a_shipped_vehicle_is_loaded_in_process_and_any_other_in_a_child(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second import of MuJoCo would lengthen the start of every run."""

@@ -164,7 +164,7 @@ def test_unbalanced_wheel_shakes_the_body(
     np.testing.assert_allclose(fine, coarse, rtol=0, atol=2e-5 * largest)
 
 
-def test_shaking_by_hand() -> None:
+def test_the_force_of_an_imbalance_matches_a_hand_calculation() -> None:
     """Wheel z, dynamic 10 g cm2: 1e-6 / 6 rad about x and 1e-6 / 6.5 rad about y, whatever its speed; none about z."""
     wheels = {"dynamic_imbalance": "10 g cm2", "start_rpm": [0, 0, 3000]}
     found = shaking_rad(multibody.build(vehicle_config(mount="free", wheels=wheels)), 3000 * RPM)

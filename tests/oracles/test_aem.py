@@ -29,7 +29,7 @@ def utc(count: int) -> list[datetime.datetime]:
     "frames", [(run_export.ICRF, run_export.CAMERA), (run_export.LAB, run_export.BODY)]
 )
 @pytest.mark.parametrize("count", [1, 2, 200])
-def test_it_is_valid_and_says_what_was_meant(
+def test_our_aem_is_valid_and_has_the_intended_metadata(
     tmp_path: Path, frames: tuple[str, str], count: int
 ) -> None:
     """Version, frames, span and every digit of every quaternion; and it survives being written by them as XML."""
@@ -62,7 +62,7 @@ def test_it_is_valid_and_says_what_was_meant(
         assert off.max() < 1e-14
 
 
-def test_their_reader_refuses_what_ours_never_writes() -> None:
+def test_ccsds_ndm_refuses_a_malformed_aem() -> None:
     """So that the tests above can fail."""
     good = run_export.message(
         "x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2)
@@ -81,7 +81,7 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
         )
 
 
-def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
+def test_an_aem_written_by_ccsds_ndm_is_read_by_skysim(tmp_path: Path) -> None:
     """Both readers take the same numbers for the same epochs. Theirs does not know the keywords of version 1.0."""
     meant = Rotation.from_rotvec(np.outer(np.arange(9.0), [0.01, -0.02, 0.005]))
     text = run_export.message("x", ["of ours"], (run_export.ICRF, run_export.BODY), utc(9), meant)
@@ -97,7 +97,7 @@ def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
     assert (read.a_from_b * meant.inv()).magnitude().max() < 1e-14
 
 
-def test_the_page_s_code_reads_it(
+def test_the_page_s_code_reads_our_aem(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")

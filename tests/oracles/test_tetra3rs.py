@@ -26,7 +26,7 @@ from skysim.tracking.tracker_interface import Setup
 tetra3rs = pytest.importorskip("tetra3rs")
 
 
-def test_its_camera_is_ours() -> None:
+def test_tetra3rs_s_camera_model_matches_ours() -> None:
     """Distorted, off-center: both turn pixels to the same tangents, by two pieces of code."""
     f = 2500.0
     center = (331.0, 244.0)
@@ -41,7 +41,7 @@ def test_its_camera_is_ours() -> None:
 
 
 @pytest.mark.parametrize("options", ["{}", "{fast: true}"])
-def test_it_solves_our_frames_without_a_bias(options: str) -> None:
+def test_tetra3rs_solves_our_frames_without_bias(options: str) -> None:
     """Twelve fields; proper motion and aberration (20 arcsec) are both its own, so what is left is noise."""
     keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
     scene = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
@@ -58,7 +58,7 @@ def test_it_solves_our_frames_without_a_bias(options: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["afit_simsat", "collimated_display"])
-def test_it_refuses_what_is_no_sky(name: str) -> None:
+def test_tetra3rs_is_refused_for_a_scene_without_a_sky(name: str) -> None:
     with pytest.raises(InputError, match=re.escape("tetra3rs solves star fields only")):
         build_tracker(build_lab(loader.load(name, {"tracker.name": "tetra3rs"})).camera)
 
@@ -89,5 +89,5 @@ def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> No
     assert min(line["right"] for line in lines) > 0.9
 
 
-def test_it_is_an_entry_point_of_skysim() -> None:
+def test_tetra3rs_is_an_entry_point_of_skysim() -> None:
     assert tracker_interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs

@@ -61,7 +61,7 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
         st.tuples(*[numbers] * 5),
     )
 )
-def test_every_digit_comes_back_by_opencv_and_by_us(
+def test_a_calibration_round_trips_exactly_through_opencv_and_skysim(
     tmp_path: Path, calibration: OpencvCalibration
 ) -> None:
     path = tmp_path / "camera.yml"
@@ -76,7 +76,7 @@ def test_every_digit_comes_back_by_opencv_and_by_us(
     assert tuple(file.getNode("distortion_coefficients").mat().ravel()) == calibration.distortion
 
 
-def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
     """By OpenCV 5, by 4, whose first line is no YAML, and as ROS has it, without tags."""
     path = by_opencv(tmp_path / "five.yml")
     assert opencv_calibration.read(path) == CALIBRATION
@@ -171,7 +171,7 @@ def lens(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("focus", ["infinity", "3 m"])
-def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> None:
+def test_a_scene_s_camera_has_opencv_s_calibration(lens: Path, focus: str) -> None:
     """A file beside the scene; directions go through `cv2.projectPoints` and our lens to the same pixels."""
     own = lens.parent / "mine.yaml"
     own.write_text(
@@ -207,7 +207,7 @@ def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> N
         ("calibration: lens.yml, focal_length: null, pixel: 5", "camera.pixel: 5 has no unit"),
     ],
 )
-def test_a_contradiction_is_told_with_its_line(lens: Path, said: str, complaint: str) -> None:
+def test_a_contradiction_is_reported_with_its_line(lens: Path, said: str, complaint: str) -> None:
     own = lens.parent / "mine.yaml"
     own.write_text(f"schema: 1\nbase: shefex2\ncamera: {{{said}}}\n")
     with pytest.raises(InputError) as raised:

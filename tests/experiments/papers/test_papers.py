@@ -49,7 +49,7 @@ def interval(low: float, high: float) -> Summary:
         (1, 20, True),
     ],
 )
-def test_ours_agrees_where_its_interval_and_the_tolerance_meet(
+def test_a_result_agrees_if_its_interval_overlaps_the_tolerance(
     low: float, high: float, agrees: bool
 ) -> None:
     assert compare.verdict(TEN, RowResult(interval(low, high))) == (
@@ -57,13 +57,13 @@ def test_ours_agrees_where_its_interval_and_the_tolerance_meet(
     )
 
 
-def test_a_number_without_an_interval_is_held_by_itself() -> None:
+def test_a_number_without_an_interval_is_compared_alone() -> None:
     nan = float("nan")
     assert compare.verdict(TEN, RowResult(Summary(10.4, nan, nan, 5))) == "agrees"
     assert compare.verdict(TEN, RowResult(Summary(10.6, nan, nan, 5))) == "disagrees"
 
 
-def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_there() -> None:
+def test_a_cause_explains_only_a_disagreement_that_it_removes() -> None:
     off = exact(12.0)
     near = exact(10.1)
     assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", near))) == "explained"
@@ -82,17 +82,17 @@ def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_ther
         (PublishedRow(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
     ],
 )
-def test_a_bound_is_held_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
+def test_a_bound_is_compared_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
     assert (compare.verdict(row, RowResult(exact(ours))) == "agrees") == agrees
 
 
-def test_an_interval_wider_than_the_tolerance_is_told() -> None:
+def test_an_interval_wider_than_the_tolerance_is_noted() -> None:
     line = compare.Comparison("x", TEN, RowResult(interval(8, 12), note="few"), "agrees")
     assert line.note == "interval wider than the tolerance; few"
     assert line._replace(result=RowResult(interval(9.8, 10))).note == ""
 
 
-def test_machines_get_the_keys_that_were_promised() -> None:
+def test_the_json_of_a_row_has_the_documented_keys() -> None:
     bound = PublishedRow(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
     row = line.as_dict()
@@ -111,7 +111,7 @@ def test_machines_get_the_keys_that_were_promised() -> None:
     assert row["interval"][0] < 0.95 < row["interval"][1]
 
 
-def test_an_answer_to_every_row_and_no_other() -> None:
+def test_every_published_row_has_one_answer() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN})
     with pytest.raises(ValueError, match="eleven, ten"):
         compare.compare("x", one, ExperimentResult({"eleven": RowResult(exact(1))}), 0.0)
@@ -135,7 +135,7 @@ def covered(
 TRIED = 1500
 
 
-def test_intervals_of_four_hold_what_they_promise() -> None:
+def test_intervals_of_four_values_have_their_stated_coverage() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
     assert abs(covered(compare.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
     assert (
@@ -144,7 +144,7 @@ def test_intervals_of_four_hold_what_they_promise() -> None:
 
 
 @pytest.mark.slow
-def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
+def test_a_bootstrap_of_four_values_is_widened_to_its_stated_coverage() -> None:
     """Efron's own percentiles hold a mean of four in some 80 %."""
     few = np.random.default_rng(3).normal(3.0, 2.0, (300, 4))
     held = [[estimate.low <= 3.0 <= estimate.high for estimate in pair] for pair in map(both, few)]
@@ -160,7 +160,7 @@ def both(values: np.ndarray) -> tuple[Summary, Summary]:
 # What was published.
 
 
-def test_a_row_says_a_number_or_bounds() -> None:
+def test_a_row_has_a_number_or_bounds() -> None:
     for wrong in (
         {"quantity": "x"},
         {"quantity": "x", "published": 1, "at_most": 2},
@@ -170,7 +170,7 @@ def test_a_row_says_a_number_or_bounds() -> None:
             PublishedRow.model_validate(wrong)
 
 
-def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(
         "paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n"
@@ -179,7 +179,7 @@ def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
         published.read(path)
 
 
-def test_every_published_experiment_is_run_and_none_else() -> None:
+def test_exactly_the_published_experiments_are_run() -> None:
     assert set(published.experiments()) == set(EXPERIMENTS)
     assert all(one.title and one.source and one.paper for one in published.experiments().values())
 
@@ -193,12 +193,12 @@ def asked(*words: str) -> str:
     return done.output
 
 
-def test_without_an_id_it_lists_them() -> None:
+def test_without_an_id_the_papers_are_listed() -> None:
     assert [line.split()[0] for line in asked().splitlines()] == list(published.experiments())
     assert json.loads(asked("--json"))[0].keys() == {"id", "title", "source"}
 
 
-def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
+def test_an_unknown_id_is_answered_with_the_allowed_ones() -> None:
     with pytest.raises(
         InputError, match=r"unknown experiment 'afit-table-99'; allowed: all, .*afit-table-1"
     ):
@@ -208,7 +208,7 @@ def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
 
 
 @pytest.mark.slow
-def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None:
+def test_report_and_page_show_the_numbers_of_the_json(tmp_path: Path) -> None:
     markdown = tmp_path / "papers.md"
     words = ["afit-table-1", "--report", "--out", str(tmp_path), "--markdown", str(markdown)]
     shown = asked(*words)
@@ -225,7 +225,7 @@ def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None
     assert html.count("data:image/png") == 1
 
 
-def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
+def test_disagreements_are_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
@@ -318,7 +318,7 @@ def test_the_page_s_verdicts_follow_from_its_numbers() -> None:
         assert allowed[verdict], where
 
 
-def test_the_page_s_pictures_are_there() -> None:
+def test_the_page_s_pictures_exist() -> None:
     named = re.findall(r"^!\[.+\]\((papers/.+\.png)\)$", PAGE.read_text("utf-8"), re.MULTILINE)
     assert len(named) >= len(published.experiments())
     assert {
@@ -356,7 +356,7 @@ QUICK = ("afit-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second ea
         for id in published.experiments()
     ],
 )
-def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
+def test_a_shortened_experiment_has_correct_intervals(id: str) -> None:
     """Each inside its interval; the whole experiment's, on the page, within the two intervals' widths of it; and what
     agrees on the page does not disagree."""
     done = reproduce(id, ExperimentOptions(quick=True))

@@ -38,7 +38,7 @@ def columns(**given):
     return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
 
 
-def test_responses_are_of_what_their_names_say():
+def test_responses_compute_the_named_quantity():
     c = columns(
         frames=[1, 1, 1, 1, 0],
         solved=[1, 1, 1, 0, 0],
@@ -85,7 +85,7 @@ def test_responses_are_of_what_their_names_say():
     assert metrics.response("filter_arcsec_rms")(c) == metrics.NO_VALUE
 
 
-def test_honest_answers_are_not_called_overconfident():
+def test_correct_covariances_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
     share = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
     assert share.value == 0
@@ -97,14 +97,14 @@ def test_honest_answers_are_not_called_overconfident():
 @pytest.mark.parametrize(
     "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
 )
-def test_a_response_that_is_none_is_refused_with_those_that_are(name):
+def test_an_unknown_response_is_refused_with_the_known_ones(name):
     with pytest.raises(
         InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"
     ):
         metrics.response(name, "responses.2")
 
 
-def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
+def test_sobol_indices_of_two_outputs_match_a_hand_calculation():
     """f = (2 x + y, 3 z + x y) over the unit cube: V = 175/144; x: 51/175, y: 15/175, z: 108/175, x with y: 1/175."""
     shares = qmc.Sobol(6, rng=1).random(4096)
     a = shares[:, :3]
@@ -140,7 +140,7 @@ responses: [identified]
 
 
 @pytest.mark.long
-def test_the_error_budget_blames_whom_it_should(tmp_path):
+def test_the_error_budget_attributes_errors_to_their_factors(tmp_path):
     """A survey turned about z is roll alone, one about x is cross alone; a lever across is mostly cross: 0.2 mm at
     33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""
     study_plan, kept = done(tmp_path, ERRORS)
@@ -157,7 +157,7 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
 
 
-def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
+def test_a_budget_without_trials_is_nan_and_no_error(tmp_path):
     path = tmp_path / "question.yaml"
     path.write_text(ERRORS)
     study_plan = study_file.load(path)
@@ -197,7 +197,7 @@ def loaded_with_a_fault(path):
 
 
 @pytest.mark.long
-def test_exports_say_what_the_store_says(tmp_path):
+def test_exports_have_the_values_of_the_store(tmp_path):
     pandas = pytest.importorskip("pandas")
     pyarrow = pytest.importorskip("pyarrow.parquet")
     xarray = pytest.importorskip("xarray")
@@ -270,7 +270,7 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
         ([0, 30], "0, 30"),
     ],
 )
-def test_a_level_is_told_shortly(value, text):
+def test_a_level_is_formatted_briefly(value, text):
     assert table.format_level(value) == text
 
 
@@ -289,7 +289,7 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
     assert again.pictures[0].is_file()
 
 
-def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
+def test_a_store_of_a_changed_scene_is_not_resumed(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
     study_plan, _ = done(
         tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
@@ -314,7 +314,7 @@ def test_failed_trials_can_be_forgotten(tmp_path):
         assert kept.counts()["done"] == 16
 
 
-def test_frames_of_a_flight_are_counted_as_one_another_s_like():
+def test_frames_of_one_flight_count_as_one_trial():
     """Two flights of a hundred frames each, all identified: the interval is of two, not of two hundred."""
     c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
     share = metrics.response("identified")(c)
@@ -323,7 +323,7 @@ def test_frames_of_a_flight_are_counted_as_one_another_s_like():
     assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 
-def test_a_table_is_of_every_point(tmp_path):
+def test_a_table_has_a_row_for_every_point(tmp_path):
     study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
         lines = table.table(rows, study_plan.study.responses)

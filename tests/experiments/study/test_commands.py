@@ -39,7 +39,7 @@ def typed(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.long
-def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
+def test_a_study_is_run_reported_exported_and_replayed(typed, tmp_path):
     code, out, _ = typed("study", "run", "question.yaml", "--engine", "serial")
     assert code == 0
     assert "60 of 60 trials, 0 failed, 0 wrong" in out
@@ -74,7 +74,7 @@ def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
 
 
 @pytest.mark.slow
-def test_what_was_overridden_is_remembered(typed):
+def test_overrides_are_kept_on_resume(typed):
     words = ("question.yaml", "--engine", "serial", "--out", "here")
     assert typed("study", "run", *words, "--set", "replicates=3")[0] == 0
     assert (
@@ -86,7 +86,7 @@ def test_what_was_overridden_is_remembered(typed):
 
 
 @pytest.mark.slow
-def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
+def test_a_study_named_by_its_folder_can_be_grown(typed, tmp_path):
     assert (
         typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0]
         == 0
@@ -108,7 +108,7 @@ def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
 
 
 @pytest.mark.long
-def test_the_worst_are_named_with_what_repeats_them(typed):
+def test_the_worst_trials_are_listed_with_their_replay_command(typed):
     assert typed("study", "run", "question.yaml", "--engine", "serial")[0] == 0
     code, out, _ = typed(
         "study", "worst", "question.yaml", "--response", "cross_arcsec_p95", "--json"
@@ -196,7 +196,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
         ),
     ],
 )
-def test_a_slip_is_told_in_one_line(typed, words, complaint):
+def test_wrong_input_is_refused_in_one_line(typed, words, complaint):
     code, _, err = typed("study", *words)
     assert code == 2
     assert complaint in err

@@ -207,7 +207,7 @@ class FakePool:
 
 
 @pytest.mark.parametrize(("deaths", "failed"), [(0, []), (1, []), (3, []), (4, [2])])
-def test_trials_that_are_lost_with_a_worker_are_retried_alone(
+def test_trials_lost_with_a_worker_are_retried_one_by_one(
     plan_: plan.Plan, monkeypatch: pytest.MonkeyPatch, deaths: int, failed: list[int]
 ) -> None:
     """Four chunks of three trials. The first death counts for no trial, as others run; the next three for trial 2."""
@@ -384,7 +384,7 @@ def on_dask(cluster: Cluster, workers: int) -> Any:
     return engine
 
 
-def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
+def test_a_chunk_round_trips_as_text_bit_for_bit() -> None:
     from skysim.experiments.study.execution import dask_engine
 
     settings = {
@@ -451,7 +451,7 @@ def change_code(version: str) -> None:
 
 
 @pytest.mark.long
-def test_dask_loses_a_worker_and_makes_the_same_rows(
+def test_dask_gives_the_same_rows_after_losing_a_worker(
     cluster: Cluster, plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
     engine = on_dask(cluster, 2)
@@ -476,7 +476,7 @@ def test_dask_loses_a_worker_and_makes_the_same_rows(
 @pytest.mark.parametrize(
     "scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"]
 )
-def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
+def test_an_invalid_address_is_refused_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786") as refused:
         dask(scheduler)
@@ -484,7 +484,7 @@ def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
 
 
 @pytest.mark.long
-def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     from skysim.experiments.study.execution import dask_engine
 
@@ -522,7 +522,7 @@ def test_a_trial_that_kills_dask_workers_fails_and_no_other(
 
 
 @pytest.mark.long
-def test_a_lost_scheduler_is_told_and_what_came_is_kept(
+def test_a_lost_scheduler_is_reported_and_received_rows_are_kept(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "lost.sqlite"

@@ -17,18 +17,18 @@ READ = TypeAdapter(Factor).validate_python
     ("value", "number", "unit"),
     [(3, 3.0, ""), ("48 in", 48.0, "in"), ("-1.5e-3 N m", -1.5e-3, "N m"), (".5", 0.5, "")],
 )
-def test_a_quantity_comes_apart(value, number, unit):
+def test_a_quantity_splits_into_number_and_unit(value, number, unit):
     assert split_quantity(value) == (number, unit)
 
 
 @given(some.floats(-1e9, 1e9, allow_nan=False), some.sampled_from(["", "mm", "N m", "deg"]))
-def test_a_quantity_comes_together_to_twelve_digits(number, unit):
+def test_a_quantity_is_formatted_to_twelve_digits(number, unit):
     again, its_unit = split_quantity(join_quantity(number, unit))
     assert its_unit == unit
     assert again == pytest.approx(number, rel=1e-11, abs=1e-300)
 
 
-def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
+def test_a_range_includes_its_ends_and_may_be_logarithmic():
     even = READ({"key": "a.b", "from": "1 m", "to": "3 m", "steps": 3})
     assert [value for value, _ in even.options()] == ["1 m", "2 m", "3 m"]
     ratios = READ({"key": "a.b", "from": 1, "to": 100, "steps": 3, "scale": "log"})
@@ -62,7 +62,7 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
         ({"from": 2.0, "to": 50.0, "scale": "log"}, stats.loguniform(2, 50)),
     ],
 )
-def test_a_factor_drawn_is_distributed_as_told(factor, law):
+def test_a_drawn_factor_has_its_declared_distribution(factor, law):
     """Even shares through `at` against SciPy's law: mean and spread to the grid's own error."""
     drawn = np.array(
         [
@@ -111,7 +111,7 @@ def test_a_factor_drawn_is_distributed_as_told(factor, law):
         ({"values": [1, 2]}, "key"),
     ],
 )
-def test_a_factor_that_makes_no_sense_is_refused(factor, complaint):
+def test_an_invalid_factor_is_refused(factor, complaint):
     with pytest.raises(ValidationError, match=complaint):
         READ(factor)
 
@@ -192,7 +192,7 @@ def test_saltellis_blocks_are_a_b_and_a_with_a_column_of_b():
 
 
 @pytest.mark.parametrize("kind", ["lhs", "sobol", "saltelli"])
-def test_a_drawn_design_is_its_seeds(kind):
+def test_a_drawn_design_depends_on_its_seed_alone(kind):
     design = Design(kind=kind, points=8)
     assert points(design, THREE, 1) == points(design, THREE, 1)
     assert points(design, THREE, 1) != points(design, THREE, 2)
@@ -211,6 +211,6 @@ def test_a_drawn_design_is_its_seeds(kind):
         ),
     ],
 )
-def test_factors_and_design_that_do_not_go_together_are_refused(design, factors, complaint):
+def test_incompatible_factors_and_design_are_refused(design, factors, complaint):
     with pytest.raises(InputError, match=complaint):
         points(design, factors, 1)

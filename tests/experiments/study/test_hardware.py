@@ -37,7 +37,7 @@ def loaded(folder: Path, **keys: Any) -> plan.Plan:
     return study_file.load(path)
 
 
-def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
+def test_every_replicate_has_its_own_hardware_the_same_at_every_point(
     tmp_path: Path,
 ) -> None:
     spec = loaded(tmp_path).spec
@@ -106,7 +106,7 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(
+def test_hardware_that_cannot_be_drawn_is_refused(
     tmp_path: Path, change: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(InputError, match=complaint):

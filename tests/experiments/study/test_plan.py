@@ -35,7 +35,7 @@ def test_a_plan_has_every_trial_of_every_point(tmp_path):
     assert scene.exposure.frames == 1
 
 
-def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
+def test_the_digest_covers_exactly_what_determines_the_trials(tmp_path):
     study_plan = study_file.load(written(tmp_path, STUDY))
     same = study_file.load(
         written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
@@ -122,7 +122,7 @@ def test_an_override_changes_the_study(tmp_path):
         ),
     ],
 )
-def test_a_slip_is_told_in_one_line_with_its_place(tmp_path, change, complaint):
+def test_an_error_in_a_study_is_one_line_with_its_place(tmp_path, change, complaint):
     with pytest.raises(InputError, match=complaint) as raised:
         study_file.load(written(tmp_path, STUDY.replace(*change)))
     assert "\n" not in str(raised.value)
@@ -137,7 +137,7 @@ def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
     assert plan.resolve_point(study_plan.spec, {})[0].title == "mine"
 
 
-def test_there_is_no_such_study():
+def test_an_unknown_study_is_refused():
     with pytest.raises(
         InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"
     ):
@@ -146,7 +146,7 @@ def test_there_is_no_such_study():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_study_that_comes_along_can_be_asked(path):
+def test_every_shipped_study_loads(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
     study_plan = study_file.load(path)
     assert study_plan.study.title
@@ -164,7 +164,7 @@ responses: [identified]
 """
 
 
-def test_codes_of_leds_need_a_flight(tmp_path):
+def test_led_codes_without_a_flight_are_refused(tmp_path):
     """One frame shows one bit."""
     assert (
         study_file.load(
@@ -218,7 +218,7 @@ def test_codes_of_leds_need_a_flight(tmp_path):
         ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
     ],
 )
-def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, tmp_path):
+def test_a_random_start_is_allowed_by_the_scene(scene, start, complaint, tmp_path):
     path = written(tmp_path, FLIGHT.format(scene=scene, start=start))
     if complaint is None:
         assert study_file.load(path).trials == 2
@@ -239,7 +239,7 @@ def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, 
         ("{lab: [1, 0, 0]}", "rate_axis.lab: unknown key"),
     ],
 )
-def test_an_axis_is_a_name_or_one_vector(axis, complaint, tmp_path):
+def test_an_axis_is_a_name_or_a_vector(axis, complaint, tmp_path):
     trial = f"{{kind: frames, rate_deg_s: 1, rate_axis: {axis}}}"
     text = STUDY.replace("{kind: centroids, noise_px: 0.1}", trial).replace(
         "trial.false_lights", "seed"

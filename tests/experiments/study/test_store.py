@@ -106,7 +106,7 @@ def test_a_writer_killed_at_any_instant_leaves_whole_batches(
 
 
 @pytest.mark.long
-def test_one_run_at_a_time(study_plan: plan.Plan, tmp_path: Path) -> None:
+def test_a_second_run_on_the_same_store_is_refused(study_plan: plan.Plan, tmp_path: Path) -> None:
     path = tmp_path / "one.sqlite"
     pid = child(lambda: done(study_plan, path, watch=lambda progress: time.sleep(0.05)))
     try:
@@ -125,7 +125,7 @@ def test_one_run_at_a_time(study_plan: plan.Plan, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_interrupted_by_the_keyboard_it_resumes(
+def test_a_run_interrupted_by_the_keyboard_resumes(
     study_plan: plan.Plan, whole: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "interrupted.sqlite"
@@ -185,7 +185,7 @@ def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
         done(other(study_plan, replicates="4"), grown, resume=True)
 
 
-def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_store_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "text.sqlite"
     path.write_text("ten thousand identifications\n" * 100)
     for opened in (store.open_store, store.writing):
@@ -213,7 +213,7 @@ COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything b
 @pytest.mark.parametrize(
     ("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]]
 )
-def test_a_value_of_another_type_is_one_clear_line(
+def test_a_value_of_a_wrong_type_is_refused_in_one_line(
     table: str, column: str, value: str, tmp_path: Path
 ) -> None:
     """SQLite stores any type in any column, so a damaged file can hold bytes where skysim wrote text or numbers."""
@@ -261,7 +261,7 @@ def taken(folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_out_of_time_it_stops_and_resumes(
+def test_a_run_out_of_time_stops_and_resumes(
     study_plan: plan.Plan, whole: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "short.sqlite"
@@ -273,7 +273,7 @@ def test_out_of_time_it_stops_and_resumes(
     assert contents(path) == whole
 
 
-def test_trials_that_raise_are_rows_until_they_are_too_many(
+def test_trials_that_raise_become_rows_up_to_a_limit(
     study_plan: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fragile(ready: TrialSetup, seed: int) -> Outcome:
@@ -306,7 +306,7 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
 # Columns.
 
 
-def test_rows_come_back_as_they_went_in(tmp_path: Path) -> None:
+def test_rows_round_trip_through_the_store(tmp_path: Path) -> None:
     rows = [
         Row(1, 0, 1, 2**63 - 1, "scene", "code", Outcome("solved", 1, 1, 0, 1.5, -0.1), None, 2e-3),
         Row(0, 0, 0, 0, "", "code", Outcome("failed"), "Traceback\nboom", 1e-3),
@@ -324,7 +324,7 @@ def test_rows_come_back_as_they_went_in(tmp_path: Path) -> None:
         assert list(kept.done(3)) == [True, True, False]
 
 
-def test_rows_are_kept_all_or_none(tmp_path: Path) -> None:
+def test_a_batch_of_rows_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:
     good = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
     with store.writing(tmp_path / "rows.sqlite") as kept:
         with pytest.raises(sqlite3.IntegrityError):
@@ -379,7 +379,9 @@ def test_chunks_are_sized_by_time() -> None:
 
 
 @pytest.mark.parametrize(("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)])
-def test_many_workers_complete_no_more_chunks_than_few(workers: int, rate_hz: float) -> None:
+def test_the_rate_of_completed_chunks_is_bounded_for_many_workers(
+    workers: int, rate_hz: float
+) -> None:
     """Of trials of 10 ms: the chunks of a second, from their size."""
     todo = runner.ChunkQueue(
         [Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers)
