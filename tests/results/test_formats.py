@@ -111,7 +111,7 @@ def matrix_b_from_a(q: Floats) -> Floats:
     )
 
 
-def test_the_standard_s_own_examples() -> None:
+def test_quaternions_match_the_standard_s_examples() -> None:
     """Annex F2.2: B is A turned by 90 deg about Z. F5.4: by 90, 10 and 45 deg about Z, X and Z, one after the other."""
     turns = Rotation.from_euler("ZXZ", [[90, 0, 0], [90, 10, 45]], degrees=True)
     text = run_export.message(
@@ -189,7 +189,7 @@ def test_angles_of_a_solution_are_its_attitude(which: str, request: pytest.Fixtu
     np.testing.assert_allclose((back * meant.inv()).magnitude(), 0, rtol=0, atol=1e-12)
 
 
-def test_a_message_is_what_the_notation_allows() -> None:
+def test_a_message_follows_the_standard_s_notation() -> None:
     """Printable ASCII, 254 characters a line, times that ascend, quaternions that do not jump."""
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
@@ -211,7 +211,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
 # Tables
 
 
-def test_parquet_is_the_ecsv_with_units(stars: Flown, tmp_path: Path) -> None:
+def test_parquet_has_the_columns_and_units_of_the_ecsv(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
     run_export.export(run, ["parquet", "ecsv"], tmp_path, quiet)
     answers = pyarrow.parquet.read_table(tmp_path / "solutions.parquet")
@@ -292,7 +292,7 @@ def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) 
     assert off.max() < 1e-12
 
 
-def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> None:
+def test_a_film_has_the_frame_rate_of_the_run(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
     (path,) = run_export.export(run, ["video"], tmp_path, quiet)
     film = cv2.VideoCapture(str(path))
@@ -351,7 +351,7 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
         ((-0.3, 0.1, 0.0, 0.0, -0.02), "10 mm"),
     ],
 )
-def test_the_header_s_polynomials_are_the_renderer_s_lens(
+def test_the_header_s_sip_polynomials_match_the_renderer_s_lens(
     distortion: tuple[float, ...], focal_length: str
 ) -> None:
     """Distortion of up to 100 px: forwards to 0.01 px, backwards exactly, as Brown's law is a polynomial."""
@@ -363,7 +363,7 @@ def test_the_header_s_polynomials_are_the_renderer_s_lens(
 
 
 @pytest.mark.slow
-def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
+def test_a_lens_beyond_sip_is_noted_in_header_and_warning() -> None:
     lens = camera((-0.3, 0.1, 0.0, 0.0, -0.02), "6.5 mm")
     forwards, backwards = misfits(lens)
     error_px = wcs.header(lens, Rotation.identity())["SIPERR"]
@@ -378,7 +378,7 @@ def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*datfix")
-def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
+def test_a_distorted_frame_s_header_maps_stars_to_their_pixels(stars: Flown) -> None:
     flight, run = stars
     sources = flight.lab.camera.sources
     seen = Table.read(f"{run.stems[2]}.ecsv")
@@ -403,7 +403,7 @@ def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
 # What cannot be
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(stars: Flown, tmp_path: Path) -> None:
+def test_bad_input_is_refused_in_one_line_and_leaves_no_file(stars: Flown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of a run"):
         recording.open_recording(tmp_path)
     with pytest.raises(
@@ -438,7 +438,7 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(
         ("# %ECSV 1.0", "# ECSV", "not an ECSV table"),
     ],
 )
-def test_a_damaged_truth_is_one_line(
+def test_a_damaged_truth_table_is_refused_in_one_line(
     stars: Flown, tmp_path: Path, old: str, new: str, complaint: str
 ) -> None:
     text = Path(f"{stars[1].stems[0]}.ecsv").read_text()

@@ -69,7 +69,7 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (None, "allowed: Answer"),
     ],
 )
-def test_what_is_no_answer_is_told_in_one_line(answer: object, message: str) -> None:
+def test_an_invalid_answer_is_refused_in_one_line(answer: object, message: str) -> None:
     with pytest.raises(
         ValueError, match=message if isinstance(answer, Answer) else "allowed: Answer"
     ) as raised:
@@ -77,7 +77,7 @@ def test_what_is_no_answer_is_told_in_one_line(answer: object, message: str) -> 
     assert "\n" not in str(raised.value)
 
 
-def test_an_answer_of_single_precision_is_made_a_unit() -> None:
+def test_an_answer_in_single_precision_is_normalized() -> None:
     checked = check_answer(
         Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9)
     )
@@ -85,7 +85,7 @@ def test_an_answer_of_single_precision_is_made_a_unit() -> None:
     assert check_answer(Answer("no\nstars")).status == "no stars"
 
 
-def test_a_set_up_comes_through_json_as_it_was() -> None:
+def test_a_setup_round_trips_through_json() -> None:
     stars = Stars(np.array([5, 9]), np.eye(3)[:2], np.array([1.25, 3.0]))
     leds = Leds(np.array([1]), np.ones((1, 3)), np.array([0.1, 0, 0.2]), np.array(UNIT))
     for setup in (
@@ -112,7 +112,7 @@ def program(
     return tracker_interface.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
 
-def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
+def test_a_program_gets_the_pixels_and_its_answer_is_returned() -> None:
     """The sum of the pixels of its lower right corner and the header come back as centroids."""
     text = (
         FRAMES + "import array; a = array.array('H', p); w = h['width_px']\n"
@@ -126,7 +126,7 @@ def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
 
 
 @pytest.mark.parametrize("kind", ["png", "fits"])
-def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
+def test_the_frame_s_folder_is_removed_with_the_program(kind: str) -> None:
     """The frame alone: the truth that a run's own files carry is not in it."""
     text = "for line in g:\n    h = json.loads(line); print(json.dumps({'frame': 7, 'status': h['file']}), flush=True)"
     runs = program(READY + text, kind=kind)
@@ -166,7 +166,9 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
         ("sys.stdout.write('x' * 17_000_000)", "more than 16000000 bytes"),
     ],
 )
-def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, message: str) -> None:
+def test_every_fault_of_a_program_is_one_line_within_the_time_limit(
+    text: str, message: str
+) -> None:
     runs = program(FRAMES + text, 0.5 if "sleep" in text else 5.0)
     begin_s = time.monotonic()
     with pytest.raises(ProgramError, match=message) as raised:
@@ -184,7 +186,7 @@ def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, mess
         ("os.remove(h['file']); os.mkdir(h['file'])", r"Is a directory|Operation not permitted"),
     ],
 )
-def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(
+def test_a_program_that_damages_its_folder_is_reported_and_restarted(
     kind: str, harm: str, reason: str
 ) -> None:
     answer = 'print(\'{"frame": 7, "status": "x"}\', flush=True)'
@@ -197,14 +199,16 @@ def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(
     runs.close()
 
 
-def test_a_program_that_does_not_read_is_not_waited_for() -> None:
+def test_a_program_that_does_not_read_times_out() -> None:
     """A frame larger than any pipe's buffer."""
     large = replace(PICTURE, image_dn=np.zeros((2000, 2000), np.uint16))
     with pytest.raises(ProgramError, match=r"no answer within 0\.5 s"):
         program(READY + "time.sleep(60)", 0.5).solve(large)
 
 
-def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: Path) -> None:
+def test_a_program_is_restarted_and_abandoned_after_three_successive_failures(
+    tmp_path: Path,
+) -> None:
     """The first dies once; of the other every one does."""
     mark = str(tmp_path / "mark")
     answer = 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
@@ -222,7 +226,7 @@ def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: P
         hopeless.solve(PICTURE)
 
 
-def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
+def test_child_processes_of_a_program_end_with_it(tmp_path: Path) -> None:
     beat = tmp_path / "beat"
     child = f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
     runs = program(
@@ -250,7 +254,7 @@ def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
         ("import sys; sys.exit('no licence')", r"ended \(code 1\): no licence"),
     ],
 )
-def test_a_program_that_will_not_begin_says_why(text: str, message: str) -> None:
+def test_a_program_that_does_not_start_is_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         program(text)
 
@@ -301,7 +305,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
-def test_a_trial_of_another_release_of_a_tracker_is_another(
+def test_another_release_of_a_tracker_changes_the_trial_s_hash(
     installed: None, tmp_path: Path
 ) -> None:
     scene = loader.load("shefex2", {"tracker.name": "offset"})
@@ -315,7 +319,7 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(
 
 
 @pytest.mark.slow
-def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
+def test_a_package_s_tracker_is_scored_by_its_error(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     scene = loader.load("shefex2", {"exposure.frames": "3"})
     truths = [shot.truth.cam_from_lab for shot in open_flight(scene).shots(solves=False)]
@@ -353,7 +357,7 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     assert summed.cross_arcsec_worst == pytest.approx(36, abs=1e-6)  # of the right ones
 
 
-def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_list_of_trackers_states_requirements(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, needs in ((None, "skysim[oracle]"), (object(), "")):
         monkeypatch.setattr(tracker_interface, "find_spec", lambda name, there=there: there)
         listed = json.loads(CliRunner().invoke(main.app, ["trackers", "--json"]).stdout)
@@ -383,7 +387,7 @@ responses: [identified, refused]
 """
 
 
-def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
+def test_a_tracker_can_be_a_study_s_factor(tmp_path: Path) -> None:
     path = tmp_path / "who.yaml"
     path.write_text(STUDY)
     with pytest.raises(
@@ -459,7 +463,7 @@ def test_the_page_s_commands_do_what_it_says(folder: Path, words: list[str]) -> 
     assert "failed:" not in page
 
 
-def test_the_page_s_json_is_of_the_protocol() -> None:
+def test_the_page_s_json_follows_the_protocol() -> None:
     header, *answers = [json.loads(block) for block in blocks("json")]
     said = json.loads(program(FRAMES + "pass").frame_message(PICTURE)[0])
     assert list(header) == list(said)
