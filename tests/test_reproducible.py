@@ -50,7 +50,7 @@ def made(scene: str, out: Path, **environment: str) -> Path:
 
 
 @pytest.mark.parametrize("package", [estimator, skysim])
-def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
+def test_a_loop_is_compiled_equally_for_any_first_caller(package: Any) -> None:
     """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
 
     @package.core.jit.jit(cache=False)
@@ -81,7 +81,7 @@ assert two(1) == 3 and two(1.0) == 3.0
 
 
 @pytest.mark.long
-def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: Path) -> None:
+def test_a_command_announces_compilation_once_and_not_after_it(tmp_path: Path) -> None:
     """Before a terminal: cold, warm, and as a package; into a file never."""
     said = []
     for name, attended, seen in (
@@ -108,7 +108,7 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
 
 
 @pytest.mark.slow
-def test_the_first_picture_ever_says_that_it_compiles(tmp_path: Path) -> None:
+def test_the_first_rendered_picture_announces_compilation(tmp_path: Path) -> None:
     """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
     cv2.imwrite(
         str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8)

@@ -49,7 +49,7 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
         ("ZNAXIS2", 2**31 - 1, "2147483647x80 pixels by its header"),
     ],
 )
-def test_a_wrong_size_of_a_compressed_image_is_one_line(
+def test_a_wrong_size_of_a_compressed_image_is_refused_in_one_line(
     tmp_path: Path, key: str, value: int, message: str
 ) -> None:
     path = tmp_path / "x.fits"

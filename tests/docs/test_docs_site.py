@@ -72,7 +72,7 @@ def test_a_section_has_the_options_that_help_shows(name: str) -> None:
     assert [what for what, meaning in rows.items() if not re.match(r"\w", meaning)] == []
 
 
-def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
+def test_a_key_s_row_states_its_type_and_default() -> None:
     exposure = keys.table(ExposureConfig)
     survey = keys.table(SurveyErrorsConfig)
     assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
@@ -89,7 +89,7 @@ GENERATED = KEYS | {commands.PAGE: commands.page(), responses.PAGE: responses.pa
 
 
 @pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.stem)
-def test_a_committed_reference_page_is_that_of_the_code(path: Path) -> None:
+def test_a_committed_reference_page_matches_the_code(path: Path) -> None:
     """`make reference` writes these pages anew."""
     assert path.read_text(encoding="utf-8") == GENERATED[path]
 
@@ -163,7 +163,7 @@ def test_the_site_s_search_needs_no_server(tmp_path: Path) -> None:
     assert re.search(r"md-search-result__meta\">[0-9]+ matching documents", done.stdout)
 
 
-def test_what_a_page_tells_to_make_is_a_target() -> None:
+def test_every_make_target_named_by_a_page_exists() -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     pages += (ROOT / ".github").rglob("*.md")
     named_targets = {
@@ -179,7 +179,7 @@ def test_what_a_page_tells_to_make_is_a_target() -> None:
 
 
 @pytest.mark.parametrize("name", ["run", "weekly"])
-def test_what_ci_makes_is_a_target(name: str) -> None:
+def test_every_make_target_of_ci_exists(name: str) -> None:
     """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
     script = ROOT / ".ci" / name
     subprocess.run(["bash", "-n", script], check=True)
@@ -198,7 +198,7 @@ def test_what_ci_makes_is_a_target(name: str) -> None:
     ] == []
 
 
-def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_path: Path) -> None:
+def test_the_weekly_script_runs_every_part_and_reports_failures(tmp_path: Path) -> None:
     """With a `make` that fails at the oracles."""
     (tmp_path / ".ci").mkdir()
     weekly = shutil.copy(ROOT / ".ci/weekly", tmp_path / ".ci/weekly")

@@ -67,7 +67,7 @@ def test_the_table_names_every_algorithm(name: str, algorithms: dict) -> None:
     assert set(algorithms) - named == set()
 
 
-def test_every_link_leads_somewhere() -> None:
+def test_every_link_has_an_existing_target() -> None:
     links = re.findall(r"\]\(([\w/]+\.py)\)", README)
     assert len(links) > 10
     assert [link for link in links if not (ROOT / "estimator" / link).is_file()] == []

@@ -33,7 +33,7 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.mark.long
-def test_the_camera_block_is_a_camera_that_sees(folder):
+def test_the_camera_block_gives_solved_frames(folder):
     """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
     block = pages.yaml_block(PAGE, "camera")
     tree = yaml.safe_load((ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8"))
@@ -48,7 +48,7 @@ def test_the_camera_block_is_a_camera_that_sees(folder):
     assert (report["frames"], report["solved"], report["wrong"]) == (2, 2, 0)
 
 
-def test_every_kind_that_the_camera_block_names_is_one():
+def test_the_camera_block_names_every_existing_kind():
     """`# or ...` beside a kind lists the others, all of them."""
     block = pages.yaml_block(PAGE, "camera")
     rest = re.findall(r"(\w+): \{kind: (\w+)[^#]*# or ([\w, ]+)", block)
@@ -62,7 +62,7 @@ def test_every_kind_that_the_camera_block_names_is_one():
 
 
 @pytest.mark.long
-def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
+def test_the_dome_block_gives_solved_frames(folder):
     path = folder / "dome.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\n" + pages.yaml_block(PAGE, "light"))
     report = pages.answer(folder, "run", str(path), "--frames", "3")
@@ -70,7 +70,7 @@ def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
 
 
 @pytest.mark.long
-def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
+def test_the_vehicle_block_flies_with_a_filtered_attitude(folder):
     """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
     path = folder / "flown.yaml"
     path.write_text("schema: 1\n" + pages.yaml_block(PAGE, "base"))
@@ -80,7 +80,7 @@ def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
     assert [row["filter"] for row in report["rows"]] == ["used"] * 3
 
 
-def test_every_choice_that_the_vehicle_block_names_is_one():
+def test_the_vehicle_block_names_every_existing_choice():
     """`# or ...` beside a choice lists the others, all of them; and every kind of maneuver is shown."""
     block = pages.yaml_block(PAGE, "base")
     named_choices = {
@@ -106,7 +106,7 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
 
 
 @pytest.mark.long
-def test_the_controller_of_the_page_damps(folder):
+def test_the_page_s_controller_damps_the_motion(folder):
     """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometers adds 0.1 deg or so."""
     (block,) = pages.blocks(PAGE, "python")
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)

@@ -22,7 +22,7 @@ def test_the_commands_leave_a_report_and_a_table(folder):
     assert (folder / "out" / "led_count.csv").is_file()
 
 
-def test_the_study_block_is_a_study(folder):
+def test_the_study_block_loads_as_a_study(folder):
     path = folder / "lens.yaml"
     path.write_text(pages.yaml_block(PAGE, "trial"))
     report = pages.answer(

@@ -72,7 +72,7 @@ def angle(a: Rotation, b: Rotation) -> np.ndarray:
 # --- prescribed motions -------------------------------------------------------------------------------------
 
 
-def test_a_prescribed_motion_is_the_reference_itself() -> None:
+def test_a_prescribed_motion_equals_its_reference() -> None:
     """A slew of a vehicle out of balance, at every step of a millisecond; and the rate is the reference's."""
     flight = moved(changes=PRESCRIBED)
     reference = plan(flight.lab.scene.motion)
@@ -128,7 +128,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
         ),
     ],
 )
-def test_what_a_prescribed_motion_cannot_do_is_refused(
+def test_keys_that_contradict_a_prescribed_motion_are_refused(
     changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
@@ -165,7 +165,7 @@ def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_pa
     )
 
 
-def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> None:
+def test_an_error_in_a_profile_names_the_lines_of_file_and_scene(tmp_path: Path) -> None:
     columns = swing(TIMES)
     path = profile_scene(tmp_path, columns)
     table = tmp_path / "swing.csv"
@@ -210,7 +210,7 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
         ("afit_simsat", {}, 40, r"tilt of 30.\d deg at"),
     ],
 )
-def test_what_the_vehicle_cannot_follow_is_refused(
+def test_a_profile_that_the_vehicle_cannot_follow_is_refused(
     scene: str, changes: dict[str, Any], size_deg: float, message: str
 ) -> None:
     """The torque of Euler's equation, the gyros' range and the tilt stop. A fifth of the angles is followed."""
@@ -223,7 +223,7 @@ def test_what_the_vehicle_cannot_follow_is_refused(
 
 
 @pytest.mark.slow
-def test_the_torque_of_a_profile_is_eulers() -> None:
+def test_the_torque_of_a_profile_satisfies_eulers_equation() -> None:
     """Just refused by a limit below it and just allowed above: J alpha + w x J w, largest over the samples."""
     columns = swing(TIMES)
     lab = open_flight(skysim.load_scene("afit_simsat", ONE), profile=columns).lab
@@ -266,7 +266,7 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("sweep", "middle_hz"), [("linear", 1.75), ("log", math.sqrt(0.5 * 3.0))])
-def test_a_chirp_has_the_frequency_that_it_says(sweep: str, middle_hz: float) -> None:
+def test_a_chirp_has_its_declared_frequency(sweep: str, middle_hz: float) -> None:
     """From zero crossings of the angle half way: amplitude and period of the oscillation there."""
     element = {
         "kind": "chirp",
@@ -370,7 +370,7 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
         (ZeroDivisionError("by\nday"), "failed: ZeroDivisionError: by day"),
     ],
 )
-def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status: str) -> None:
+def test_an_exception_of_a_tracker_function_is_the_frame_s_status(answer: Any, status: str) -> None:
     def mine(image: np.ndarray) -> Any:
         if isinstance(answer, Exception):
             raise answer
@@ -383,7 +383,7 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
 
 
 @pytest.mark.slow
-def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
+def test_an_estimator_or_a_registered_name_serves_as_tracker(sky: Run) -> None:
     height_px, width_px = sky[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
     theirs = estimator.StarTracker.for_sky(
@@ -434,7 +434,7 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
     assert np.degrees(telemetry.lab_from_body[-1].as_rotvec()[2]) > 0.1
 
 
-def test_a_profile_that_is_not_there_is_refused() -> None:
+def test_a_missing_profile_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"profile: nowhere\.csv is not a file; allowed: a file, or a table"
     ):

@@ -408,5 +408,5 @@ CHECKS: dict[str, Check] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CHECKS)
-def test_function_of_2005_has_a_counterpart(name: str, tmp_path: Path) -> None:
+def test_every_function_of_the_2005_program_has_a_counterpart(name: str, tmp_path: Path) -> None:
     assert CHECKS[name](tmp_path)

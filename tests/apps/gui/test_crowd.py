@@ -42,7 +42,7 @@ class Hand:
         self.alive.discard(self)
 
 
-def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
+def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
@@ -91,7 +91,7 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
+def test_twenty_tabs_share_two_workers(browser: Any, tmp_path: Path) -> None:
     with (
         Server(tmp_path, "--workers", str(WORKERS)) as server,
         opened(browser, server.login, NARROW) as first,
@@ -108,7 +108,7 @@ def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
                 page.set_default_timeout(QUICK_MS)
                 page.get_by_text("This page opens when another one has been closed.").wait_for()
             assert come(lambda: sorted(map(place, waiting)) == list(range(TABS - WORKERS)))
-            pictured(waiting[-1], "test_twenty_tabs_on_two_workers")
+            pictured(waiting[-1], "test_twenty_tabs_share_two_workers")
             for page in waiting:  # an animation would take the processor from those who work
                 assert page.evaluate("document.getAnimations().length") == 0
                 assert page.locator(".lab-waited").inner_text().endswith(" s")
