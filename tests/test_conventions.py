@@ -113,7 +113,7 @@ def test_roll_is_the_position_angle_of_up_from_north_through_east():
     np.testing.assert_allclose(north, (320 + offset, 240), rtol=0, atol=1e-9)
 
 
-def test_three_stars_keep_their_handedness():
+def test_the_image_of_three_stars_is_not_mirrored():
     """From the Belt (Mintaka, west, to Alnitak, east) Betelgeuse is north: counter-clockwise on the sky.
 
     Seen north up, Mintaka is right of Alnitak and Betelgeuse above both; a mirrored image would not do.
@@ -126,7 +126,7 @@ def test_three_stars_keep_their_handedness():
     assert pixels[2, 1] < pixels[0, 1] < pixels[1, 1]
 
 
-def test_the_tracker_reads_the_pointing_that_the_simulator_set():
+def test_the_tracker_s_attitude_is_the_simulator_s_pointing():
     """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
     np.testing.assert_allclose(
@@ -148,14 +148,14 @@ def hand_made(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
     return np.array([right, -up, out])
 
 
-def test_a_known_star_at_a_known_pixel():
+def test_a_known_star_is_at_its_known_pixel():
     """Sirius (101.2872, -16.7161) seen from a boresight 2 deg south of it, north up: 34.92 px above the middle."""
     sirius = cam_from_icrs(101.2872, -18.7161, 0).apply(icrs(101.2872, -16.7161))
     expected = (320.0, 240 - 1000 * np.tan(np.radians(2)))  # 34.9208 px
     np.testing.assert_allclose(OPTICS.project(sirius[None])[0], expected, rtol=0, atol=1e-9)
 
 
-def test_quaternion_orders():
+def test_quaternions_have_their_documented_order():
     """A quarter turn about z: SciPy and the papers (x, y, z, w), MuJoCo (w, x, y, z)."""
     half = np.sqrt(0.5)
     quarter = Rotation.from_euler("z", 90, degrees=True)
@@ -170,7 +170,7 @@ def test_quaternion_orders():
     np.testing.assert_allclose(quarter.apply([1, 0, 0]), [0, 1, 0], rtol=0, atol=EXACT)
 
 
-def test_names_of_rotations_cancel():
+def test_rotation_names_chain_by_equal_frames():
     """v_a = a_from_b.apply(v_b), and neighbors cancel: cam_from_lab = cam_from_body * body_from_lab."""
     lab_from_body = Rotation.from_euler("z", 90, degrees=True)  # the vehicle has yawed to the left
     cam_from_body = Rotation.identity()
@@ -179,7 +179,7 @@ def test_names_of_rotations_cancel():
     np.testing.assert_allclose(cam_from_lab.apply([0, 1, 0]), [1, 0, 0], rtol=0, atol=EXACT)
 
 
-def test_mujocos_camera_against_ours():
+def test_mujocos_camera_axes_convert_to_ours():
     """SimSat level: its camera is 15 in up, looks at the zenith, the image's right along lab x, down along lab y.
 
     MuJoCo's own camera (+y up, looks along -z) then has its x along lab x, y along lab -y, z along lab -z.
@@ -227,7 +227,7 @@ def test_a_fan_pushes_the_vehicle_along_its_own_z():
     assert flight.rate_body_rad_s[0] == pytest.approx(0.1 * 0.46 * (1 - 5e-3) / 6, rel=1e-4)
 
 
-def test_a_gimbal_turned_takes_the_torque_the_rotors_momentum_gains():
+def test_a_turned_gimbal_gives_the_body_the_opposite_of_the_rotor_s_momentum_change():
     """Rotor 1 has h = 0.00225 kg m2 * 2600 rpm = 0.6126 N m s along +y; gimbal 1 leans from z to x: (s, 0, c).
 
     A positive gimbal rate moves h along g x h = h (-c, 0, s), s = 0.8165, c = 0.5774; the body gains the opposite,
@@ -259,7 +259,7 @@ def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
     )
 
 
-def test_no_code_comes_out_of_data():
+def test_reading_data_executes_no_code():
     """YAML by the safe loader, arrays and results without pickle, and nothing that runs a text."""
     loads = r"yaml\.(unsafe_|full_)?load\((?!.*, Loader\))|pickle\b|marshal\b|shelve\b|allow_pickle=True"
     banned = rf"\b({loads}|(?<![.\w])(eval|exec)\()"

@@ -62,7 +62,7 @@ def flown(request: pytest.FixtureRequest) -> Flown:
     return Flown(flight, list(flight.shots(cameras=[0])))
 
 
-def test_there_are_scenes() -> None:
+def test_scenes_are_shipped() -> None:
     steered = {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"}
     lit = {
         "afit_test1",
@@ -77,13 +77,13 @@ def test_there_are_scenes() -> None:
 
 
 @pytest.mark.slow
-def test_it_says_what_it_is(flown: Flown) -> None:
+def test_every_scene_has_its_name_and_a_title(flown: Flown) -> None:
     assert flown.scene.name in NAMES
     assert 10 < len(flown.scene.title) < 80
 
 
 @pytest.mark.slow
-def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(flown: Flown) -> None:
+def test_the_first_frame_shows_five_sources_or_the_published_number(flown: Flown) -> None:
     frame = flown.shots[0].frame
     truth = flown.shots[0].truth
     camera = flown.scene.camera
@@ -98,7 +98,7 @@ def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(flown
 
 
 @pytest.mark.slow
-def test_its_light_is_on_the_frame(flown: Flown) -> None:
+def test_the_light_of_the_sources_is_on_the_frame(flown: Flown) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
     A display's black pixels glow beside them.
@@ -108,10 +108,10 @@ def test_its_light_is_on_the_frame(flown: Flown) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    told = flown.scene.camera.detector
-    step_e = told.full_well_e / 60000
+    detector_config = flown.scene.camera.detector
+    step_e = detector_config.full_well_e / 60000
     offset_dn = (
-        told.offset_dn * told.gain_e_dn / step_e
+        detector_config.offset_dn * detector_config.gain_e_dn / step_e
     )  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
@@ -151,14 +151,14 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(flown: Flown
 
 
 @pytest.mark.long
-def test_a_frame_alone_is_the_frame_of_a_sequence(flown: Flown) -> None:
+def test_a_frame_rendered_alone_equals_that_of_a_sequence(flown: Flown) -> None:
     """Also one that is rendered again from the whole motion."""
     sequence = flown.shots[1].frame.image_dn.tobytes()
     assert render(scene_of(flown.scene.name, 2), 1)[0].image_dn.tobytes() == sequence
     assert flown.flight.render(1)[0].image_dn.tobytes() == sequence
 
 
-def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
+def test_the_first_frames_are_solved_correctly(flown: Flown) -> None:
     assert len(flown.shots) == 2
     for shot in flown.shots:
         answer = shot.report.attitude
@@ -183,7 +183,7 @@ def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IDEAL)
-def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
+def test_an_ideal_scene_s_tracker_has_the_true_dome(name: str) -> None:
     """It differs from its base in the tracker alone, whose map and lever are the true ones."""
     ideal = loader.load(name)
     base = loader.load(name.removesuffix("_ideal"))
@@ -224,7 +224,7 @@ FRAMES = 3
 @pytest.mark.parametrize(
     "name", [name for name in ALL_NAMES if name.removesuffix("_ideal") not in SHOWN]
 )
-def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
+def test_the_claimed_error_matches_the_actual_error(name: str) -> None:
     """NEES e^T P^-1 e is 3 on average where the claimed covariance P is that of the errors e.
 
     300 frames at random attitudes and the median rate of the scene's motion. Every three have a new survey of the dome,
@@ -272,7 +272,7 @@ def whole(request: pytest.FixtureRequest) -> Flight:
 
 
 @pytest.mark.long
-def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Flight) -> None:
+def test_the_camera_sees_five_leds_throughout_the_maneuver(whole: Flight) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
     if isinstance(whole.lab.scene.light, StarsConfig):
         pytest.skip("no LEDs")
@@ -288,7 +288,7 @@ def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Flight) -> None
 
 
 @pytest.mark.long
-def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Flight) -> None:
+def test_the_vehicle_reaches_its_targets_and_stays_off_its_stop(whole: Flight) -> None:
     telemetry = whole.telemetry()
     assert telemetry.lab_from_ref is not None
     error_deg = np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
@@ -305,7 +305,7 @@ TURNS = {"cubesat.xml": 2.0}  # times the rate of the others: its wheels hold it
 
 
 def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Simulation:
-    """A second of flight, every motor told something else each 10 ms, all over the range that it has.
+    """A second of flight; every 10 ms each motor gets another random control over its full range.
 
     A vehicle's own motors have the range of their file. `Flight.check` raises where MuJoCo warned.
     """
@@ -324,7 +324,7 @@ def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.S
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
+def test_a_second_of_random_control_gives_no_mujoco_warning(name: str) -> None:
     flight = at_random(loader.load(name).vehicle, np.zeros(3))
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
@@ -333,7 +333,7 @@ def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
 
 @pytest.mark.parametrize("mount", ["free", "air_bearing"])
 @pytest.mark.parametrize("model", MODELS)
-def test_a_second_of_random_control_of_all_that_a_vehicle_has_makes_no_warning(
+def test_a_second_of_random_control_of_every_actuator_gives_no_mujoco_warning(
     model: str, mount: str
 ) -> None:
     """At 1.1 rad/s and, on the bearing, against its stop; wheels at 3000 rpm and out of balance."""

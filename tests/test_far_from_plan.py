@@ -30,7 +30,7 @@ def off_deg(believed: Rotation | None, telemetry: Telemetry) -> np.ndarray:
         ("wheels", {"vehicle.wheels": "{torque_limit: 1 N m, speed_limit_rpm: 20000}"}),
     ],
 )
-def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_back(
+def test_after_a_blow_beyond_the_torque_limit_the_vehicle_brakes_and_returns(
     actuators: str, more: dict[str, str]
 ) -> None:
     """80 deg/s about z: J w / T = 12.6 s at the least to stop, more than once round; home within four times that."""
@@ -61,7 +61,7 @@ def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
     assert np.degrees(np.linalg.norm(telemetry.rate_body_rad_s[-1])) < 0.05
 
 
-def test_a_maneuver_beyond_the_stop_is_refused_before_the_flight() -> None:
+def test_a_maneuver_beyond_the_tilt_stop_is_refused_before_the_flight() -> None:
     overrides = {
         "motion.maneuver": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]",
         "exposure": QUIET % 20,
@@ -72,7 +72,7 @@ def test_a_maneuver_beyond_the_stop_is_refused_before_the_flight() -> None:
         open_flight(loader.load("afit_simsat", overrides))
 
 
-def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
+def test_a_flight_that_cannot_be_integrated_is_one_error_line_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -88,7 +88,7 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
 
 
 @pytest.mark.slow
-def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
+def test_the_navigator_drifts_by_the_gyros_apparent_bias() -> None:
     """Turning at a constant rate with scale errors, misalignments and a bias, and no noise: the integral of it."""
     overrides = {
         "vehicle.imu": "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 20, scale_ppm: 500,"
@@ -110,7 +110,7 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
     np.testing.assert_allclose(off, drift, rtol=0, atol=2e-3 * np.linalg.norm(drift))
 
 
-def test_a_vehicle_of_one_tick_is_reported_too() -> None:
+def test_a_flight_of_one_tick_has_a_report() -> None:
     overrides = {
         "vehicle.imu": "{}",
         "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}",

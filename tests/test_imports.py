@@ -56,17 +56,17 @@ def circles(uses_of: dict[str, set[str]]) -> list[str]:
     return sorted(left)
 
 
-def test_a_circle_is_found() -> None:
+def test_an_import_cycle_is_found() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_no_module_imports_itself_through_others() -> None:
     assert len(graph()) > 250
     assert circles(graph()) == []
 
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
-def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
+def test_no_folder_holds_too_many_modules(package: str) -> None:
     """A dozen or a little more; a folder needs a sentence of its own, so that many small ones read no better."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
         entries = {path.name for path in folder.iterdir()} - {

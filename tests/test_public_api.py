@@ -22,7 +22,7 @@ def run() -> "skysim.results.run.Run":  # type: ignore[name-defined]
 
 
 @pytest.mark.parametrize("package", [skysim, estimator])
-def test_every_public_name_is_there(package: object) -> None:
+def test_every_public_name_exists(package: object) -> None:
     assert all(hasattr(package, name) for name in package.__all__)  # type: ignore[attr-defined]
     assert not hasattr(package, "no_such_name")
 
@@ -51,14 +51,14 @@ def test_a_run_is_a_sequence_of_scored_frames(run) -> None:
     assert not np.shares_memory(run[0].image, run[1].image)
 
 
-def test_the_error_is_the_rotation_angle_of_its_parts(run) -> None:
+def test_the_total_error_is_the_rotation_angle_of_its_parts(run) -> None:
     """For small angles the error squared is that across the boresight squared plus that of the roll squared."""
     for frame in run:
         parts = np.hypot(frame.row.cross_arcsec, frame.row.roll_arcsec)
         assert frame.error_arcsec == pytest.approx(parts, rel=1e-6)
 
 
-def test_a_frame_rendered_alone_is_that_of_the_run(run) -> None:
+def test_a_frame_rendered_alone_equals_that_of_the_run(run) -> None:
     frame, truth = skysim.render(run.scene, index=2)
     np.testing.assert_array_equal(frame.image_dn, run[2].image)
     np.testing.assert_array_equal(truth.cam_from_lab.as_quat(), run[2].truth.cam_from_lab.as_quat())
@@ -71,7 +71,7 @@ def test_an_index_outside_of_the_scene_is_refused(run, index: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_saved_run_is_what_the_command_writes(run, tmp_path) -> None:
+def test_a_saved_run_equals_the_command_s_output(run, tmp_path) -> None:
     ours = run.save(tmp_path / "ours")
     words = ["run", "shefex2", "--frames", "3", "--set", "motion.rate_deg_s=[0,0,0]"]
     done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "theirs")])
@@ -96,12 +96,12 @@ def test_only_a_report_of_several_frames_has_plots_against_time(run, tmp_path) -
     assert headings[1] == ["The last solved frame", *headings[0][3:]]
 
 
-def test_a_table_has_one_row_a_frame(run) -> None:
+def test_a_table_has_one_row_per_frame(run) -> None:
     assert list(run.table()["frame"]) == [0, 1, 2]
     assert list(run.to_pandas()["status"]) == ["solved"] * 3
 
 
-def test_a_notebook_shows_picture_and_numbers(run) -> None:
+def test_notebook_views_show_image_and_numbers(run) -> None:
     for shown in (run, run[0], run.scene):
         page = shown._repr_html_()
         assert page.count("<table") == page.count("</table>")
@@ -110,7 +110,7 @@ def test_a_notebook_shows_picture_and_numbers(run) -> None:
 
 
 @pytest.mark.slow
-def test_an_image_is_solved_where_the_truth_is(run, tmp_path) -> None:
+def test_a_solved_image_has_the_true_attitude(run, tmp_path) -> None:
     folder = run.save(tmp_path)
     found = skysim.solve(folder / "frame_0000.fits", fov_deg=14.87)
     ra_deg, dec_deg, _ = run[0].row.truth_deg
@@ -120,7 +120,7 @@ def test_an_image_is_solved_where_the_truth_is(run, tmp_path) -> None:
         skysim.solve(folder / "missing.png")
 
 
-def test_overrides_of_python_are_those_of_the_command_line() -> None:
+def test_overrides_in_python_equal_those_of_the_command_line() -> None:
     scene = skysim.load_scene(
         "afit_simsat", {"exposure.time": "5 ms", "exposure.frames": 2, "seed": 7}
     )

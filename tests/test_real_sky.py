@@ -37,7 +37,7 @@ def by_file(rows, quick: int = 1):
 
 
 def answer(row, fov_error: float) -> dict:
-    """What `skysim solve` says of a photograph when told a field of view wrong by so much."""
+    """Result of `skysim solve` for a photograph if the given field of view has this relative error."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
     return plate_solver.solve_file(
         FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None
@@ -46,7 +46,7 @@ def answer(row, fov_error: float) -> dict:
 
 @pytest.fixture(scope="module")
 def blind() -> plate_solver.Solver:
-    """Told nothing; it keeps its trackers for photographs of one size."""
+    """Solver without a field of view; it keeps its trackers for photographs of one size."""
     return plate_solver.make_solver(None, None)
 
 
@@ -110,7 +110,7 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 @pytest.mark.long
 @needs_photographs
 @by_file(TO_SOLVE)
-def test_a_photograph_in_a_mirror_is_refused(row, blind):
+def test_a_mirrored_photograph_is_refused(row, blind):
     """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
     outcome = plate_solver.solve_picture(
@@ -125,7 +125,7 @@ def test_a_photograph_in_a_mirror_is_refused(row, blind):
 @needs_photographs
 @pytest.mark.parametrize("fov_error", [-0.05, -0.025, 0.0, 0.025, 0.05])
 @by_file(TO_SOLVE)
-def test_a_photograph_is_solved_wherever_its_field_lies_within_five_per_cent(row, fov_error):
+def test_a_photograph_is_solved_with_any_field_error_below_five_per_cent(row, fov_error):
     check_right(answer(row, fov_error), row)
 
 

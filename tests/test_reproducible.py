@@ -1,4 +1,4 @@
-"""Same seed and version, same bytes: of frames, truth and answers, whoever computes them and whatever was compiled."""
+"""Same seed and version give the same frames, truth and answers, in any process and after any compilation."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def made(scene: str, out: Path, **environment: str) -> Path:
 
 
 @pytest.mark.parametrize("package", [estimator, skysim])
-def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
+def test_a_loop_is_compiled_equally_for_any_first_caller(package: Any) -> None:
     """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
 
     @package.core.jit.jit(cache=False)
@@ -62,8 +62,10 @@ def test_a_loop_is_compiled_alike_whoever_calls_it_first(package: Any) -> None:
         return lost(small)
 
     assert caller(1e-30) == (0, np.inf)
-    told = [path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()]
-    assert told == [Path(package.core.jit.__file__)]
+    compiling = [
+        path for path in Path(*package.__path__).rglob("*.py") if "njit" in path.read_text()
+    ]
+    assert compiling == [Path(package.core.jit.__file__)]
 
 
 LOOPS = """
@@ -79,7 +81,7 @@ assert two(1) == 3 and two(1.0) == 3.0
 
 
 @pytest.mark.long
-def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: Path) -> None:
+def test_a_command_announces_compilation_once_and_not_after_it(tmp_path: Path) -> None:
     """Before a terminal: cold, warm, and as a package; into a file never."""
     said = []
     for name, attended, seen in (
@@ -96,17 +98,17 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, script], stderr=stderr, env=environment, check=True)
         os.write(theirs, b"end\n")
-        told = done.stderr or b""
-        while not told.endswith(b"end\r\n"):
-            told += os.read(ours, 10_000)
-        said.append(told.decode().replace("\r", ""))
+        output = done.stderr or b""
+        while not output.endswith(b"end\r\n"):
+            output += os.read(ours, 10_000)
+        said.append(output.decode().replace("\r", ""))
         os.close(ours), os.close(theirs)
     assert re.fullmatch(r"skysim: compiling numba functions.*\nend\n", said[0])
     assert said[1:] == ["end\n"] * 3
 
 
 @pytest.mark.slow
-def test_the_first_picture_ever_says_that_it_compiles(tmp_path: Path) -> None:
+def test_the_first_rendered_picture_announces_compilation(tmp_path: Path) -> None:
     """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
     cv2.imwrite(
         str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8)

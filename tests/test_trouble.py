@@ -67,7 +67,7 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.long
-def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> None:
+def test_a_full_disk_is_reported_and_written_files_are_complete(mounted: Path) -> None:
     done = asked("run", "shefex2", "--frames", "20", "--out", str(mounted / "run"), *SMALL)
     assert done.returncode == 2
     last = done.stderr.splitlines()[-1]
@@ -119,9 +119,9 @@ def test_an_export_without_room_names_file_and_reason_and_leaves_nothing(
     def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
         yield from items
 
-    with no_room(500), pytest.raises(OSError, match="File too large") as told:
+    with no_room(500), pytest.raises(OSError, match="File too large") as raised:
         run_export.export(flown, [name], tmp_path, quiet)
-    assert told.value.filename == str(tmp_path / file)
+    assert raised.value.filename == str(tmp_path / file)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
 
@@ -129,12 +129,12 @@ def test_an_export_without_room_names_file_and_reason_and_leaves_nothing(
 def test_a_film_that_lost_frames_is_refused(
     flown: recording.Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There is room again when it is asked for: nobody can tell why, but that frames are missing."""
+    """There is room again when the film is checked: the cause is unknown, but frames are missing."""
     film = cv2.VideoWriter
 
     class Forgetful:
-        def __init__(self, *told: Any) -> None:
-            self.film = film(*told)
+        def __init__(self, *arguments: Any) -> None:
+            self.film = film(*arguments)
             self.frames = 0
             self.isOpened = self.film.isOpened
             self.release = self.film.release
@@ -168,8 +168,8 @@ def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(tmp_path:
     with no_room(100_000):
         done = CliRunner().invoke(main.app, [*command, "--json"])
     assert str(done.exception) == f"--folder: {tmp_path / 'frame_000000.png'}: File too large"
-    told = json.loads(done.stdout)
-    assert told["sinks"]["folder"]["dropped"] == told["made"] >= 1
+    report = json.loads(done.stdout)
+    assert report["sinks"]["folder"]["dropped"] == report["made"] >= 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -178,15 +178,15 @@ def test_a_picture_without_room_names_file_and_reason(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str
 ) -> None:
     image = np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8)
-    with no_room(500), pytest.raises(OSError, match="File too large") as told:
+    with no_room(500), pytest.raises(OSError, match="File too large") as raised:
         files.write_image(tmp_path / f"a.{suffix}", image)
-    assert told.value.filename == str(tmp_path / f"a.{suffix}")
+    assert raised.value.filename == str(tmp_path / f"a.{suffix}")
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.long
-def test_a_folder_that_cannot_be_written_is_told_in_a_line(mounted: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported_in_one_line(mounted: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", mounted], check=True)
     for words in (("run", "shefex2", "--frames", "1"), ("study", "run", "led_count")):
         done = asked(*words, "--out", str(mounted / "run"))
@@ -210,7 +210,7 @@ def test_a_run_that_is_stopped_leaves_whole_frames(tmp_path: Path, number: signa
         assert time.monotonic() < until
         time.sleep(0.02)
     os.kill(run.pid, number)
-    told = run.communicate(timeout=60)[1]
+    errors = run.communicate(timeout=60)[1]
     assert run.returncode == 130
-    assert told.splitlines()[-1] == "skysim: stopped"
+    assert errors.splitlines()[-1] == "skysim: stopped"
     assert whole_frames(tmp_path) >= 3

@@ -16,11 +16,11 @@ from skysim.apps.cli import main
 from skysim.core.files import ROOT
 
 
-def test_versions_are_told_for_a_report() -> None:
-    told = CliRunner().invoke(main.app, ["--version"])
+def test_the_version_option_prints_versions_for_a_bug_report() -> None:
+    result = CliRunner().invoke(main.app, ["--version"])
     assert re.match(
         r"skysim \d+\.\d+\.\d+, MuJoCo \d+\.\d+\.\d+, numpy \d+\.\d+\.\d+, Python 3\.\d+\.\d+$",
-        told.stdout,
+        result.stdout,
     )
 
 

@@ -63,7 +63,7 @@ def field(
     ],
 )
 @pytest.mark.parametrize("fields", [FIELDS // 3, pytest.param(40 * FIELDS, marks=pytest.mark.long)])
-def test_a_dome_is_never_answered_wrongly(afit, missing, false, least_solved, fields):
+def test_a_dome_is_never_solved_wrongly(afit, missing, false, least_solved, fields):
     solved = 0
     for n in range(fields):
         rng = np.random.default_rng([2012, n])

@@ -36,7 +36,7 @@ def blurred(drawn: tuple[NDArray, Rotation]) -> NDArray:
 
 
 @pytest.mark.slow
-def test_a_picture_out_of_focus_is_solved_binned_and_says_so(
+def test_a_defocused_image_is_solved_binned_and_reported_as_such(
     drawn: tuple[NDArray, Rotation],
 ) -> None:
     blurred, truth = drawn
@@ -51,7 +51,7 @@ def test_a_picture_out_of_focus_is_solved_binned_and_says_so(
     assert found["hint"] == "its lights are large: they were found in the picture binned 4x4"
 
 
-def test_places_are_those_of_the_picture() -> None:
+def test_centroids_of_a_binned_image_are_in_its_full_resolution_pixels() -> None:
     """Centers of disks to a small part of a disk, for both parities of the squares' corner."""
     rng = np.random.default_rng(2)
     image = np.zeros((1700, 2100), np.uint8)
@@ -79,7 +79,7 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
     assert list(retries.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
 
 
-def test_a_binned_picture_needs_more_evidence(
+def test_a_binned_image_needs_more_evidence(
     monkeypatch: pytest.MonkeyPatch, blurred: NDArray
 ) -> None:
     """No chance of a false match is added: a thousand times less than by the picture itself."""

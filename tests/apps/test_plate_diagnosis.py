@@ -143,10 +143,10 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
     ],
     ids=["mirrored", "flipped", "wide", "tall", "blurred", "streaked", "white", "noise", "dots"],
 )
-def test_each_cause_is_named(change: Change, fov_deg: float, says: str) -> None:
+def test_each_cause_of_a_refusal_is_named(change: Change, fov_deg: float, says: str) -> None:
     assert hint(photograph(), FOV_DEG) == ""
-    told = hint(np.ascontiguousarray(change(photograph())), fov_deg)
-    assert re.search(says, told), told
+    advice = hint(np.ascontiguousarray(change(photograph())), fov_deg)
+    assert re.search(says, advice), advice
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
     assert math.degrees((ours * truth.inv()).magnitude()) < 0.05
 
 
-def test_short_trails_are_those_that_the_detector_measures() -> None:
+def test_short_trails_match_the_detector_s_streak() -> None:
     """Thick for their length: their shapes alone would not show them. sqrt(59^2 + 30^2) = 66, and some noise."""
     solvers = (plate_solver.make_solver(20.0, None),)
     short = diagnosis.Refusal(spread(trail(60))(photograph()), Centroids.empty(), solvers)
@@ -183,7 +183,7 @@ def test_a_mirrored_sky_is_named_with_the_field_unknown() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
+def test_an_unsolved_unknown_field_gets_the_advice_for_a_narrow_one() -> None:
     deeper = "; if the field is below 4°, give it and take the catalog gaia_v10.0, after"
     assert deeper in hint(dots(photograph()), None)
 
@@ -195,9 +195,7 @@ def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
 @pytest.mark.parametrize(
     ("focal", "expected"), [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)]
 )
-def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(
-    focal: str, expected: str
-) -> None:
+def test_a_too_shallow_catalog_is_named_and_a_deeper_one_solves(focal: str, expected: str) -> None:
     """Near the galactic pole. The expectation by hand: 7996 stars on 41,253 deg^2, times the field's."""
     fov_deg = math.degrees(2 * math.atan(658 * 9.9e-3 / 2 / float(focal.removesuffix(" mm"))))
     by_hand = 7996 / 41_253 * fov_deg**2 * 493 / 659
@@ -235,7 +233,7 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
         (1.0, 6.7, "a wider picture: the deepest catalog, to V 10, has too few as well"),
     ],
 )
-def test_the_deeper_catalog_has_stars_enough(fov_deg: float, limit_mag: float, says: str) -> None:
+def test_the_deeper_catalog_has_enough_stars(fov_deg: float, limit_mag: float, says: str) -> None:
     """Fifteen in the field: of 4:3, 45,709 stars to V 8, 130,337 to V 9 and 357,037 to V 10 (`catalog info`)."""
     one = plate_solver.make_solver(fov_deg, None, catalog="hipparcos_hp6.5")
     limit = np.append(one.stars.v_mag[:-1], limit_mag)
@@ -248,7 +246,7 @@ def test_the_deeper_catalog_has_stars_enough(fov_deg: float, limit_mag: float, s
     assert named is not None or counts[10.0] * share < 15
 
 
-def test_the_numbers_of_stars_are_the_catalog_s() -> None:
+def test_numbers_of_stars_match_the_catalog() -> None:
     shipped = catalog.read(CATALOGS / "gaia_v8.0.ecsv").v_mag
     assert np.count_nonzero(shipped < 8) == diagnosis.GAIA_STARS
     for limit, count in ((9, 130_337), (10, 357_037)):
@@ -260,7 +258,7 @@ def test_the_numbers_of_stars_are_the_catalog_s() -> None:
 @pytest.mark.parametrize(
     ("size_px", "fov_deg"), [((640, 480), 10.0), ((300, 900), 60.0), ((500, 500), 90.0)]
 )
-def test_a_field_s_share_of_the_sphere_is_that_of_random_directions(
+def test_a_field_s_share_of_the_sphere_matches_random_directions(
     size_px: tuple[int, int], fov_deg: float
 ) -> None:
     camera = Camera.from_fov(*size_px, math.radians(fov_deg))
@@ -275,7 +273,7 @@ def test_a_field_s_share_of_the_sphere_is_that_of_random_directions(
 # Parts
 
 
-def test_reversed_centroids_are_those_of_the_reversed_image() -> None:
+def test_reversed_centroids_match_those_of_the_reversed_image() -> None:
     """Streaks have covariances of their own, whose x and y are correlated."""
     image = spread(trail(20))(photograph())
     camera = Camera.from_fov(*image.shape[::-1], math.radians(FOV_DEG))
@@ -308,7 +306,7 @@ def test_few_lights_are_not_tried_any_further(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_a_refusal_is_printed_with_what_was_seen_and_tried(
+def test_a_refusal_is_printed_with_detections_and_attempts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     image = mirror(photograph())
@@ -317,8 +315,8 @@ def test_a_refusal_is_printed_with_what_was_seen_and_tried(
         tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None), None
     )
     terminal.print_solutions([found], tmp_path)
-    told = capsys.readouterr().out.splitlines()
-    assert told[-5:-1] == [
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-5:-1] == [
         f"{tmp_path / 'x.png'}: no identification beyond chance",
         f"  seen:   {found['lights']} lights, the brightest pixel {image.max()} DN, the background"
         f" {np.median(image):g} DN",

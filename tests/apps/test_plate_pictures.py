@@ -108,7 +108,7 @@ def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -
 
 @pytest.mark.parametrize("orientation", STORED)
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_the_answer_is_that_of_the_viewed_picture(
+def test_the_answer_refers_to_the_image_as_viewed(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, suffix: str, orientation: int
 ) -> None:
     """Also for pictures that are stored mirrored (2, 4, 5, 7); the annotated one is the viewed one."""
@@ -119,7 +119,7 @@ def test_the_answer_is_that_of_the_viewed_picture(
 
 
 @pytest.mark.parametrize(("orientation", "turned_deg"), [(3, 180), (6, -90), (8, 90)])
-def test_without_its_tag_the_same_file_is_another_picture(
+def test_without_its_orientation_tag_an_image_has_another_attitude(
     sky: tuple[Scene, Frame, Truth],
     gray: NDArray,
     tmp_path: Path,
@@ -142,7 +142,7 @@ def test_without_its_tag_the_same_file_is_another_picture(
 # Focal length
 
 
-def test_exif_tells_the_field_by_the_diagonal(
+def test_exif_gives_the_field_by_the_diagonal(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
 ) -> None:
     """43.27 mm over the chip's 8.15 mm: the 25 mm lens is one of 133 mm."""
@@ -178,12 +178,14 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     )
 
 
-def test_the_tracker_of_one_uncertainty_is_not_taken_for_another(gray: NDArray) -> None:
-    told = plate_solver.make_solver(20.0, None)
+def test_trackers_are_cached_by_their_uncertainty(gray: NDArray) -> None:
+    default_solver = plate_solver.make_solver(20.0, None)
     by_exif = solver.replace(
-        told, fov_uncertainty=0.1
+        default_solver, fov_uncertainty=0.1
     )  # of the same picture: they share their trackers' cache
-    first, second, again = (next(one.trackers(640, 480, None)) for one in (told, by_exif, told))
+    first, second, again = (
+        next(one.trackers(640, 480, None)) for one in (default_solver, by_exif, default_solver)
+    )
     assert (first.focal_uncertainty, second.focal_uncertainty) == (solver.FOV_UNCERTAINTY, 0.1)
     assert first is again
 
@@ -196,7 +198,7 @@ def test_a_phone_s_wide_field_is_solved_by_its_focal_length(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_wrong_focal_length_is_given_up(
+def test_a_wrong_exif_focal_length_is_abandoned(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
 ) -> None:
     """A crop, or a lens without contacts; 0 and absurd ones are not even tried."""
@@ -225,7 +227,7 @@ class FixedTracker:
 
 @pytest.mark.parametrize("fov_deg", [12.0, None])
 @pytest.mark.parametrize("hypotheses", [1, 4])
-def test_every_hypothesis_takes_its_share_of_chance(
+def test_every_hypothesis_reduces_the_allowed_chance_probability(
     monkeypatch: pytest.MonkeyPatch, fov_deg: float | None, hypotheses: int
 ) -> None:
     one = solver.replace(plate_solver.make_solver(fov_deg, None), hypotheses=hypotheses)
@@ -247,7 +249,7 @@ def test_every_hypothesis_takes_its_share_of_chance(
     ["TOP-DOWN", *(pytest.param(order, marks=pytest.mark.slow) for order in ("BOTTOM-UP", None))],
 )
 @pytest.mark.parametrize("highest_first", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_fits_picture_is_the_same_sky_in_either_row_order(
+def test_a_fits_image_has_the_same_attitude_in_either_row_order(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path, order: str | None, highest_first: bool
 ) -> None:
     """Without ROWORDER both are tried, since the header leaves it open. With a wrong one the sky is a mirrored one."""
@@ -276,7 +278,7 @@ def test_a_mirrored_fits_picture_of_known_order_is_refused(
 
 
 @pytest.mark.slow
-def test_our_own_frames_say_their_row_order_and_read_as_written(
+def test_our_frames_state_their_row_order_and_are_read_unchanged(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path
 ) -> None:
     scene, frame, truth = sky
@@ -291,7 +293,7 @@ def test_our_own_frames_say_their_row_order_and_read_as_written(
 # Files, folders and names
 
 
-def test_a_folder_is_a_list_of_its_pictures(tmp_path: Path) -> None:
+def test_a_folder_stands_for_the_list_of_its_images(tmp_path: Path) -> None:
     inner = tmp_path / "folder.jpg"
     inner.mkdir()
     for name in ("b.JPG", "a.fits.gz", "c.annotated.png", ".hidden.png", "notes.txt", "d.tiff"):
@@ -306,7 +308,7 @@ def test_a_folder_is_a_list_of_its_pictures(tmp_path: Path) -> None:
         plate_solver.pictures_in([tmp_path / "empty"])
 
 
-def test_annotated_pictures_have_the_pictures_names() -> None:
+def test_annotated_images_have_the_images_names() -> None:
     def names(*paths: str) -> list[str]:
         return [
             path.as_posix()
@@ -325,7 +327,7 @@ def test_annotated_pictures_have_the_pictures_names() -> None:
     ]
 
 
-def test_stars_are_named_by_their_catalog() -> None:
+def test_stars_have_their_catalog_s_designation() -> None:
     assert [solver.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
         "HIP 71683",
         "HD 48915",
@@ -337,7 +339,7 @@ def test_stars_are_named_by_their_catalog() -> None:
 
 
 @pytest.mark.slow
-def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> None:
+def test_python_gets_detections_and_attempts(gray: NDArray, tmp_path: Path) -> None:
     path = with_exif(tmp_path / "x.png", gray, 2)  # as stored it is upright: seen, it is mirrored
     found = package.solve(path, fov_deg=FOV_DEG)
     assert (found.status, found.ra_deg, found.matches) == (
@@ -362,7 +364,7 @@ def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> N
         package.solve(path, catalog="deep")
 
 
-def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
+def test_json_output_keeps_its_keys_and_adds_details(gray: NDArray, tmp_path: Path) -> None:
     found = answer(with_exif(tmp_path / "x.png", gray))
     assert list(json.loads(json.dumps(found))) == [
         "file",
@@ -388,7 +390,7 @@ def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["x.JPG", pytest.param("x.fits.gz", marks=pytest.mark.slow)])
-def test_the_browser_s_panel_sees_the_same_picture(
+def test_the_browser_s_panel_solves_the_same_image(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, name: str
 ) -> None:
     from skysim.apps.gui.worker.photo import photo_from_file

@@ -34,7 +34,7 @@ def town(light: NDArray, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.slow
-def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
+def test_an_image_with_a_town_below_is_solved_by_its_upper_half() -> None:
     image, truth = drawn(replace(SHOT, limit_mag=5.4, spoil=town), 3)
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
     assert not plate_solver.solve_array(image, solver, None)[0].attitude.solved
@@ -48,7 +48,7 @@ def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
 
 
 @pytest.mark.slow
-def test_clouds_are_taken_away_and_stars_stay() -> None:
+def test_removing_clouds_keeps_the_stars() -> None:
     """The clouds change the sky by more than the noise within a tile of the background."""
 
     def clouds(light: NDArray, _: np.random.Generator) -> None:
@@ -66,7 +66,7 @@ def test_clouds_are_taken_away_and_stars_stay() -> None:
     assert len(retries.without_clouds(plain, Settings())) == 0
 
 
-def test_edges_of_trees_are_no_streak_of_the_stars() -> None:
+def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
     """Bars stand before the clouds: what is left of their edges is parallel, and would make every star a track."""
 
     def bars(light: NDArray, _: np.random.Generator) -> None:
@@ -90,7 +90,7 @@ def test_edges_of_trees_are_no_streak_of_the_stars() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [29, 32, 36])
-def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int) -> None:
+def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number: int) -> None:
     """Of trails that the detector sees in pieces, more than twice as many stars are then where they are."""
     rng = np.random.default_rng([25, number])
     shot = photographs.trailed(rng)
@@ -114,7 +114,7 @@ def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
 
 
-def test_round_stars_are_no_trails() -> None:
+def test_round_stars_are_not_taken_for_trails() -> None:
     image, _ = drawn(SHOT, 4)
     assert not list(retries.trails(image, Settings()))
 
@@ -133,7 +133,7 @@ def test_an_upper_half_is_solved_in_its_own_field() -> None:
     assert photographs.is_same(report.attitude.cam_from_ref, truth)
 
 
-def test_halves_are_complete_and_not_tried_with_few_lights() -> None:
+def test_halves_cover_the_image_and_are_not_tried_with_few_lights() -> None:
     rng = np.random.default_rng(5)
     xy_px = np.concatenate(
         [rng.uniform([0, 0], [99, 49], (30, 2)), rng.uniform([0, 51], [99, 99], (9, 2))]

@@ -33,7 +33,7 @@ OTHER_ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.4])
 
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(1024, 768), (600, 900), (3000, 500)])
-def test_every_field_from_two_to_a_hundred_degrees_is_some_tracker_s(
+def test_every_field_from_two_to_a_hundred_degrees_has_a_tracker(
     width_px: int, height_px: int
 ) -> None:
     cameras = plate_solver.FIELD_SEARCH.cameras(width_px, height_px)
@@ -45,7 +45,7 @@ def test_every_field_from_two_to_a_hundred_degrees_is_some_tracker_s(
         ), fov_deg
 
 
-def test_a_field_that_is_told_is_the_only_one_tried() -> None:
+def test_a_given_field_is_the_only_one_tried() -> None:
     ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(640, 480)
     assert np.degrees(camera.fov_rad) == pytest.approx(12.0, abs=1e-9)
     assert 0.05 < uncertainty < 0.06
@@ -114,7 +114,7 @@ def test_answers_are_taken_in_the_order_of_the_trackers(
         assert attitude.cam_from_ref is decisive[0].cam_from_ref
 
 
-def test_as_many_tries_are_allowed_as_much_chance_as_one() -> None:
+def test_the_chance_threshold_is_divided_by_the_number_of_tries() -> None:
     threshold = ACCEPT_LOG10_CHANCE - np.log10(TRIES)
     assert outcome(REFUSED, answer(ATTITUDE, threshold - 0.01), REFUSED)[0].solved
     refused, calls = outcome(REFUSED, answer(ATTITUDE, threshold + 0.01), REFUSED)
@@ -122,7 +122,7 @@ def test_as_many_tries_are_allowed_as_much_chance_as_one() -> None:
     assert calls == [1, 1, 1]
 
 
-def test_of_two_answers_neither_is_taken_unless_it_is_far_better() -> None:
+def test_of_two_answers_one_is_taken_only_if_far_better() -> None:
     for one, other in itertools.permutations(
         [answer(ATTITUDE, -9.0), answer(OTHER_ATTITUDE, -7.0)]
     ):
@@ -135,12 +135,12 @@ def test_of_two_answers_neither_is_taken_unless_it_is_far_better() -> None:
     assert not outcome(answer(ATTITUDE, -6.0), answer(OTHER_ATTITUDE, -4.5))[0].solved
 
 
-def test_neighbors_that_agree_are_no_rivals() -> None:
+def test_agreeing_answers_of_neighboring_trackers_are_not_rivals() -> None:
     near = Rotation.from_rotvec([1e-4, 0, 0]) * ATTITUDE
     assert outcome(answer(ATTITUDE, -7.0), answer(near, -8.0))[0].cam_from_ref is near
 
 
-def test_a_refusal_says_why() -> None:
+def test_a_refusal_states_its_reason() -> None:
     assert outcome(Attitude(NO_STARS), Attitude(NO_STARS))[0].status == NO_STARS
 
 
@@ -163,7 +163,7 @@ def photographed(focal: str) -> tuple[Frame, Truth]:
 @pytest.mark.parametrize(
     ("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)]
 )
-def test_a_rendered_field_is_solved_with_nothing_told(
+def test_a_rendered_field_is_solved_without_any_hint(
     blind: plate_solver.Solver, focal: str, fov_deg: float
 ) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
@@ -177,7 +177,7 @@ def test_a_rendered_field_is_solved_with_nothing_told(
 
 
 @pytest.mark.slow
-def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
+def test_centroids_of_smeared_frames_of_a_known_camera_use_their_streaks() -> None:
     """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}
     flight = simulate_motion(loader.load("scoreboard", fast))
@@ -196,7 +196,7 @@ def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
 
 
 @pytest.mark.long
-def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
+def test_a_mirrored_sky_is_refused_by_the_plate_solver(blind: plate_solver.Solver) -> None:
     """No rotation maps the sky to its mirror image, so every solution would be wrong."""
     frame, _ = photographed("25 mm")
     found, _ = plate_solver.solve_array(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None)
@@ -215,7 +215,7 @@ def test_a_stage_s_wrong_name_is_answered_with_the_allowed_ones(stage: str) -> N
         plate_solver.make_solver(None, None, stages={stage: "magic"})
 
 
-def test_names_stand_above_what_a_camera_tells() -> None:
+def test_explicit_algorithm_names_override_the_camera_s() -> None:
     camera = SCENES / "shefex2.yaml"
     defaults = plate_solver.make_solver(None, camera).settings
     settings = plate_solver.make_solver(

@@ -58,9 +58,9 @@ def steady(value: Any) -> Any:
     return value
 
 
-def values(told: dict[str, Any]) -> Entries:
+def values(document: dict[str, Any]) -> Entries:
     """Each key of a JSON object: a short value as it is, else a digest."""
-    for key, value in steady(told).items():
+    for key, value in steady(document).items():
         text = json.dumps(value, ensure_ascii=False)
         yield key, text if len(text) < 80 else f"{len(value)} items {sha(text)}"
 

@@ -19,7 +19,7 @@ def compared(*names: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
-def test_messages_of_wrong_scenes_are_those_of_the_baseline() -> None:
+def test_messages_of_wrong_scenes_match_the_baseline() -> None:
     done = compared("messages/skysim.load_scene*")
     assert done.returncode == 0, done.stdout
 
@@ -29,6 +29,6 @@ def test_messages_of_wrong_scenes_are_those_of_the_baseline() -> None:
     bool(differences(json.loads((DIGESTS / "scenes.json").read_text(encoding="utf-8"))["machine"])),
     reason="recorded on another machine or with other versions",
 )
-def test_a_run_of_a_sky_is_that_of_the_baseline() -> None:
+def test_a_run_of_a_sky_matches_the_baseline() -> None:
     done = compared("scenes/shefex2")
     assert done.returncode == 0, done.stdout

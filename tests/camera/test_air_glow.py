@@ -31,7 +31,7 @@ def mag_arcsec2(nanolamberts: float) -> float:
     return float(-2.5 * np.log10(nanolamberts / NANOLAMBERT_V0))
 
 
-def test_airglow_grows_as_the_path_through_its_shell() -> None:
+def test_airglow_is_proportional_to_the_path_through_its_shell() -> None:
     """The path through a thin shell 131 km above a sphere, by the geometry of two spheres."""
     zenith = np.radians(np.linspace(0, 85, 50))
     inner = 6371.0
@@ -48,7 +48,7 @@ def test_airglow_grows_as_the_path_through_its_shell() -> None:
     assert airglow_nl(21.7, zenith, 0.3)[-1] < dark[-1] * 10 ** (-0.4 * 0.3 * 2)
 
 
-def test_twilight_at_the_zenith_is_that_of_paranal() -> None:
+def test_twilight_at_the_zenith_matches_paranal() -> None:
     """Patat, Ugolnikov & Postylyakov (2006), A&A 455, 385: V = 11.84 + 1.518 x - 0.057 x^2, x = depression - 5.
 
     Measured over 5 to 12 degrees, before the night's own light matters, where the air takes 0.13 mag. Schaefer's law,
@@ -63,7 +63,7 @@ def test_twilight_at_the_zenith_is_that_of_paranal() -> None:
         assert ours == pytest.approx(measured, abs=tolerance_mag)
 
 
-def test_daylight_is_as_bright_as_the_day() -> None:
+def test_daylight_has_its_published_brightness() -> None:
     """A clear sky has some 5,000 cd m^-2 near the Sun and 2,000 far from it; 10.8e4 cd m^-2 are 0 mag arcsec^-2."""
     day = sunlight_nl(np.array([20.0, 60.0, 90.0]), 45.0, np.full(3, 45.0), 0.172)
     assert (np.diff(day) < 0).all()
@@ -130,11 +130,11 @@ def test_below_the_skyline_there_is_no_glow() -> None:
 
 
 @pytest.mark.slow
-def test_dark_glow_is_that_of_the_told_sky() -> None:
+def test_the_dark_glow_is_that_of_the_declared_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
     lab = lab_of("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
     ours = glow_toward(lab, up_pointing(lab))
-    told = SkyGlowConfig(kind="sky", mag_arcsec2=21)
-    even = glow_map((told,), lab.camera.optics, up_pointing(lab), lab.camera.band)
+    sky_glow = SkyGlowConfig(kind="sky", mag_arcsec2=21)
+    even = glow_map((sky_glow,), lab.camera.optics, up_pointing(lab), lab.camera.band)
     center = tuple(size // 2 for size in ours.shape)
     assert ours[center] == pytest.approx(even[center], rel=2e-3)

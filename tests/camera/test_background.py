@@ -98,7 +98,7 @@ def test_unprojected_pixels_project_to_themselves(camera: dict[str, object]) -> 
     np.testing.assert_allclose(np.linalg.norm(toward, axis=1), 1, rtol=1e-14)
 
 
-def test_an_even_sky_falls_as_the_fourth_power_of_the_cosine() -> None:
+def test_a_uniform_sky_falls_with_the_fourth_power_of_the_cosine() -> None:
     lens = optics()
     xy, shape = nodes_px(lens.camera)
     offset = xy - [400, 300]
@@ -111,7 +111,7 @@ def test_an_even_sky_falls_as_the_fourth_power_of_the_cosine() -> None:
 
 
 @pytest.mark.slow
-def test_a_pixel_gets_the_light_of_a_star_for_every_square_arcsecond() -> None:
+def test_a_pixel_s_sky_light_is_its_solid_angle_times_surface_brightness() -> None:
     lens = optics()
     pixel_arcsec = np.degrees(1 / lens.camera.focal_px) * 3600
     star = star_flux_e_s_m2(21.0, *SUN, BAND) * np.pi / 4 * (8e-3 / 1.4) ** 2 * 0.8
@@ -122,7 +122,7 @@ def test_a_pixel_gets_the_light_of_a_star_for_every_square_arcsecond() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("camera", [{}, BENT])
-def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None:
+def test_the_pixels_solid_angles_sum_to_the_field(camera: dict[str, object]) -> None:
     """Their solid angles add up to that inside of the frame's edge, a polygon of great circles (Girard)."""
     lens = optics(**camera)
     x, y = np.meshgrid(np.arange(801.0), np.arange(601.0))
@@ -148,7 +148,7 @@ def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None
 
 
 @pytest.mark.slow
-def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
+def test_vignetting_dims_the_sky_and_not_a_light_leak() -> None:
     table = {"kind": "table", "angle_deg": (0, 10, 30), "transmission": (1, 0.7, 0.1)}
     clear = optics()
     dim = optics(vignetting=table)
@@ -162,7 +162,7 @@ def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
 
 
 @pytest.mark.slow
-def test_the_sky_s_slope_is_relative_and_a_degree() -> None:
+def test_the_sky_s_gradient_is_relative_per_degree() -> None:
     lens = optics()
     flat, sloped = (
         drawn(glow(**SKY | {"gradient_per_deg": g}), lens) for g in ((0, 0), (0.02, -0.01))
@@ -186,7 +186,7 @@ def test_moonlight_is_as_bright_as_published() -> None:
     assert vmag_arcsec2(float(value)) == pytest.approx(19.855, abs=5e-4)
 
 
-def test_nanolamberts_and_magnitudes_are_one_scale() -> None:
+def test_nanolamberts_convert_to_magnitudes() -> None:
     # 0.92104 = 0.4 ln 10 to five figures, so that a 20th magnitude is 2e-5 off by its rounding.
     assert vmag_arcsec2(NANOLAMBERT_V0 * 10 ** (-0.4 * 20.0)) == pytest.approx(20.0, abs=1e-3)
 
@@ -197,7 +197,7 @@ def test_the_half_moon_is_2_6_magnitudes_below_the_full_moon() -> None:
     assert 2.5 * np.log10(full / half) == pytest.approx(2.602, abs=5e-4)
 
 
-def test_moonlight_falls_off_to_a_right_angle_and_is_none_without_air() -> None:
+def test_scattered_moonlight_decreases_to_90_degrees_and_vanishes_without_air() -> None:
     rho = np.linspace(0.3, 90, 2000)
     assert (np.diff(moonlight_nl(rho, 10.0, 0.172, 45.0, 30.0)) < 0).all()
     assert not moonlight_nl(rho, 10.0, 0.0, 45.0, 30.0).any()
@@ -229,7 +229,7 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
     assert ratio[300, 700] > 1.2 * ratio[300, 100]
 
 
-def test_stray_light_of_the_sun() -> None:
+def test_the_sun_s_stray_light_matches_its_transmittance() -> None:
     """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, half of it made electrons."""
     ra_deg, dec_deg = lab_place(110.0)
     sun = glow(kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12))
@@ -243,7 +243,7 @@ def test_stray_light_of_the_sun() -> None:
     assert levels[0, 0] == pytest.approx(wanted, rel=0.05)  # a black body, and V's zero point
 
 
-def test_transmittance_is_straight_in_decades_and_level_beyond_its_ends() -> None:
+def test_transmittance_is_log_linear_and_constant_beyond_its_ends() -> None:
     angle_deg = (10.0, 30.0, 50.0)
     pst = (1e-2, 1e-6, 0.0)
     assert transmittance(20.0, angle_deg, pst) == pytest.approx(1e-4, rel=1e-9)
@@ -251,7 +251,7 @@ def test_transmittance_is_straight_in_decades_and_level_beyond_its_ends() -> Non
     assert transmittance(120.0, angle_deg, pst) < 1e-29
 
 
-def test_what_glows_adds_up_and_nothing_is_dark() -> None:
+def test_backgrounds_add_and_without_one_the_frame_is_dark() -> None:
     lens = optics()
     parts = (glow(**SKY), glow(**MOON), glow(kind="uniform", e_s=3.0))
     apart = [glow_map((part,), lens, POINTING, BAND) for part in parts]
@@ -291,7 +291,7 @@ def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> Non
 @pytest.mark.parametrize(
     ("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))]
 )
-def test_fill_is_bilinear_interpolation(
+def test_the_fill_between_nodes_is_bilinear(
     kind: type, shape: tuple[int, int], nodes: tuple[int, int]
 ) -> None:
     coarse = np.random.default_rng(1).uniform(1, 2, nodes)
@@ -305,7 +305,7 @@ def test_fill_is_bilinear_interpolation(
     np.testing.assert_allclose(image, wanted, rtol=1e-6 if kind is np.float32 else 1e-12)
 
 
-def test_fill_of_one_level_is_exact() -> None:
+def test_the_fill_of_a_constant_is_exact() -> None:
     image = np.full((30, 40), np.nan, np.float32)
     fill(image, np.full((2, 2), 12.0), 0.5)
     np.testing.assert_array_equal(image, np.full((30, 40), 6.0, np.float32))

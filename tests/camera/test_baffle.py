@@ -80,7 +80,9 @@ def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 70.0, 130.0])
-def test_a_far_earth_lights_the_chip_as_lambert_s_sphere(sphere: None, phase_deg: float) -> None:
+def test_the_stray_light_of_a_distant_earth_is_that_of_a_lambert_sphere(
+    sphere: None, phase_deg: float
+) -> None:
     """E PST (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the airglow is negligible."""
     phase = np.radians(phase_deg)
     far = 1000.0
@@ -96,7 +98,7 @@ def test_a_far_earth_lights_the_chip_as_lambert_s_sphere(sphere: None, phase_deg
 @pytest.mark.parametrize(
     ("sun_deg", "boresight_deg"), [(40.0, 20.0), (90.0, 60.0), (100.0, -30.0), (0.0, -80.0)]
 )
-def test_a_near_earth_lights_the_chip_as_its_ground_does(
+def test_the_stray_light_of_a_near_earth_is_that_of_its_ground(
     sphere: None, sun_deg: float, boresight_deg: float
 ) -> None:
     """From 700 km: the sum over patches dA of the ground, (a E mu0 / pi) cos(e) dA / d^2 PST, in place of directions.
@@ -136,7 +138,7 @@ def steps(count: int) -> Floats:
     return (np.arange(count) + 0.5) * 2 * np.pi / count
 
 
-def test_a_cone_s_rule_is_exact_for_its_solid_angle() -> None:
+def test_the_quadrature_over_a_cone_is_exact_for_its_solid_angle() -> None:
     directions, weights = stray.cone_rule(0.4, 0.3)
     assert weights.sum() == pytest.approx(2 * np.pi * 0.7)
     assert (weights @ directions) == pytest.approx([0, 0, np.pi * (1 - 0.3**2)], abs=1e-12)
@@ -160,7 +162,7 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
 
 
 @pytest.mark.slow
-def test_the_light_follows_the_orbit_and_the_date() -> None:
+def test_stray_light_follows_orbit_and_date() -> None:
     """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
     lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
     around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
@@ -172,7 +174,7 @@ def test_the_light_follows_the_orbit_and_the_date() -> None:
     assert stray_of(summer)["the Sun"] > 100 * stray_of(winter)["the Sun"]
 
 
-def test_a_body_below_the_skyline_gives_no_light() -> None:
+def test_a_body_below_the_skyline_gives_no_stray_light() -> None:
     site = {
         "site": "{latitude_deg: 53, longitude_deg: 9}",
         "light__air": "{}",
@@ -183,6 +185,6 @@ def test_a_body_below_the_skyline_gives_no_light() -> None:
     assert stray_of(lab, 12 * 3600.0)["the Sun"] > 0
 
 
-def test_no_body_gives_no_light() -> None:
+def test_without_a_body_there_is_no_stray_light() -> None:
     assert stray_of_bodies_e_s_m2(STEEP, [], np.array([0.0, 0.0, 1.0])) == {}
     assert stray_of(in_space(90.0, 0.0, light__bodies="{}", camera__baffle="null")) == {}

@@ -94,7 +94,7 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", ["moon", "sun"])
-def test_a_disc_is_its_points(name: str, case: str) -> None:
+def test_a_disc_equals_the_sum_of_its_points(name: str, case: str) -> None:
     """Within a few thousandths of the brightest pixel; the Moon's limb is a cusp, which needs many points."""
     focal_px, psf, rate, row_s = CASES[case]
     optics = Optics.from_camera(camera(focal_px, psf))
@@ -108,7 +108,7 @@ def test_a_disc_is_its_points(name: str, case: str) -> None:
     assert truth.electrons[0] == pytest.approx(wanted.sum(), rel=1e-4)
 
 
-def test_a_small_disc_and_a_point_have_the_light_and_center_of_theirs() -> None:
+def test_small_discs_and_points_keep_their_light_and_center() -> None:
     """Venus of 51" at a phase angle of 146 degrees: 2.5 px, then 0.12 px."""
     body = light("venus", datetime.datetime(2012, 5, 20, 21))
     for focal_px, limit in ((10_000.0, 5e-3), (500.0, 5e-3)):
@@ -123,7 +123,7 @@ def test_a_small_disc_and_a_point_have_the_light_and_center_of_theirs() -> None:
         assert truth.electrons[0] == pytest.approx(wanted.sum(), rel=1e-4)
 
 
-def test_the_electrons_are_those_of_the_magnitude() -> None:
+def test_a_body_s_electrons_follow_from_its_magnitude() -> None:
     """A disc gives what a star of its flux gives through the same lens."""
     optics = Optics.from_camera(camera(2500.0, GAUSS))
     body = light("moon")
@@ -133,7 +133,7 @@ def test_the_electrons_are_those_of_the_magnitude() -> None:
     assert image.sum() == pytest.approx(body.flux_e_s_m2 * optics.collecting_m2 * 0.04, rel=1e-4)
 
 
-def test_a_disc_half_off_the_chip_is_the_part_on_it() -> None:
+def test_a_disc_half_off_the_chip_is_cut_at_the_border() -> None:
     optics = Optics.from_camera(camera(2500.0, GAUSS))
     body = light("sun")
     exposed = exposed_at(optics, body.place.direction, (SIZE / 2, 0.0), np.zeros(3))

@@ -35,7 +35,7 @@ def halve_till_it_fits(column: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
-def test_blooming_ends_where_endless_halving_does(seed: int) -> None:
+def test_blooming_equals_the_limit_of_repeated_halving(seed: int) -> None:
     """Random sky with one to four saturated sources, near each other and near the ends."""
     rng = np.random.default_rng(seed)
     column = rng.uniform(0, 0.9 * WELL, 60)
@@ -105,7 +105,7 @@ def test_anti_blooming_drains_its_share_of_the_excess() -> None:
     np.testing.assert_array_equal(dry[:, 1], np.minimum(column, WELL))
 
 
-def test_what_runs_off_the_column_is_lost() -> None:
+def test_charge_beyond_the_column_s_end_is_lost() -> None:
     column = np.zeros(20)
     column[10] = 1000 * WELL
     image = frame(column)
@@ -116,7 +116,7 @@ def test_what_runs_off_the_column_is_lost() -> None:
     np.testing.assert_array_equal(flooded, np.full((20, 4), WELL, np.float32))
 
 
-def test_columns_that_hold_their_charge_stay_bit_by_bit() -> None:
+def test_columns_below_full_well_are_unchanged_bit_for_bit() -> None:
     image = np.random.default_rng(3).uniform(0, WELL, (50, 70)).astype(np.float32)
     before = image.copy()
     bloom(image, WELL)
@@ -141,7 +141,7 @@ def clocked_out(line_e: np.ndarray, cti: float, clocks: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cti", [1e-5, 1e-3, 1e-2])
-def test_transfer_loss_is_that_of_packets_moved_place_by_place(cti: float) -> None:
+def test_transfer_loss_equals_that_of_packets_moved_pixel_by_pixel(cti: float) -> None:
     rng = np.random.default_rng(4)
     line = rng.uniform(0, 1e4, 150)
     wanted = clocked_out(line, cti, 150)
@@ -174,7 +174,7 @@ def test_deferred_charge_of_a_flat_field_is_transfers_times_inefficiency() -> No
     np.testing.assert_allclose(image.sum(axis=0), 5e4 * rows, rtol=1e-12)
 
 
-def test_no_charge_is_lost_in_late_packets() -> None:
+def test_deferred_charge_conserves_the_total() -> None:
     for cti in (1e-9, 1e-6, 1e-4, 1e-2):
         share = delayed_fractions(2000, cti)
         np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-12)
@@ -199,7 +199,7 @@ def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: flo
 
 
 @pytest.mark.slow
-def test_smear_is_that_of_a_column_clocked_under_light() -> None:
+def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
     exposure_s = 0.05
     row_time_s = 2e-6
     rate = np.random.default_rng(7).uniform(0, 1e5, (90, 130))
@@ -213,7 +213,7 @@ def test_smear_is_that_of_a_column_clocked_under_light() -> None:
 
 
 @pytest.mark.slow
-def test_a_leaking_register_smears_by_its_leak() -> None:
+def test_a_leaking_register_smears_in_proportion_to_its_leak() -> None:
     rate = np.random.default_rng(8).uniform(0, 1e5, (40, 65))
     open_sky = rate * 0.1
     covered = rate * 0.1
@@ -224,7 +224,7 @@ def test_a_leaking_register_smears_by_its_leak() -> None:
     )
 
 
-def test_a_bright_star_smears_its_column_alone() -> None:
+def test_a_bright_star_smears_only_its_column() -> None:
     light = np.zeros((100, 80), np.float32)
     light[30, 40] = 1e6
     frame_transfer_smear(light, 0.1, 1e-6)

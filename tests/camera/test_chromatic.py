@@ -108,7 +108,7 @@ def test_mean_and_spread_of_a_light(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_images_are_those_of_all_rays(case: str) -> None:
+def test_chromatic_images_match_the_integral_over_wavelength(case: str) -> None:
     """Mean position and mean square radius of rays of every wavelength from every part of the pupil.
 
     The LEDs are out of focus by their distance as well, which some colors make up for.
@@ -271,6 +271,6 @@ def test_bodies_and_satellites_have_their_colors() -> None:
         ),
     ],
 )
-def test_what_is_no_aberration_is_refused(value: str, message: str) -> None:
+def test_an_invalid_aberration_is_refused(value: str, message: str) -> None:
     with pytest.raises(InputError, match=rf"^camera\.chromatic: {message}"):
         loader.load("shefex2", {"camera.chromatic": value})

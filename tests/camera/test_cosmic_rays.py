@@ -60,7 +60,7 @@ def test_directions_are_those_of_an_isotropic_flux_through_a_plate() -> None:
     assert stats.kstest((azimuth + np.pi) / (2 * np.pi), "uniform").pvalue > 1e-4
 
 
-def test_mean_way_through_a_plate_is_twice_its_depth() -> None:
+def test_the_mean_path_through_a_plate_is_twice_its_depth() -> None:
     """Cauchy's mean chord 4 V / S of a wide plate. The variance of 1 / cos grows as the logarithm of the cut."""
     length = many()["length_m"] / 1e-9
     sigma = np.sqrt((2 * np.log(MAX_TANGENT) - 4) / len(length))
@@ -76,7 +76,7 @@ def test_an_image_of_a_track_is_as_long_as_its_tangent_says() -> None:
     )  # 45 degrees, 10 um, 10 um
 
 
-def test_most_probable_charge_is_that_of_the_length() -> None:
+def test_the_most_probable_charge_follows_from_the_path_length() -> None:
     """Mode and mean of Moyal's law in units of the most probable charge: 1 and 1 + 0.06 (gamma + ln 2)."""
     tracks = many()
     ratio = tracks["electrons"] / (80.0 * tracks["length_m"] * 1e6)
@@ -136,7 +136,7 @@ def test_diffusion_widens_the_cloud() -> None:
 
 
 @pytest.mark.slow
-def test_tracks_come_in_from_beside_the_frame_and_run_off_it() -> None:
+def test_tracks_enter_from_outside_the_frame_and_leave_it() -> None:
     thick = protons(depth="100 um", per_cm2_s=1e5)
     image = np.zeros((50, 50))
     tracks = add_particles(image, 1.0, PIXEL_M, (thick,), np.random.default_rng(4))
@@ -152,7 +152,7 @@ def test_tracks_come_in_from_beside_the_frame_and_run_off_it() -> None:
 
 
 @pytest.mark.slow
-def test_frames_gain_the_tracks_and_keep_what_they_had() -> None:
+def test_tracks_are_added_to_the_frame_s_electrons() -> None:
     sky = np.random.default_rng(5).uniform(50, 60, SHAPE).astype(np.float32)
     image = sky.copy()
     parts = (protons(), protons(electrons_um=800.0))
@@ -164,7 +164,7 @@ def test_frames_gain_the_tracks_and_keep_what_they_had() -> None:
     assert np.median(image - sky) == 0
 
 
-def test_nothing_flies_nothing_changes() -> None:
+def test_without_particles_the_frame_is_unchanged() -> None:
     image = np.zeros(SHAPE, np.float32)
     assert len(add_particles(image, 1.0, PIXEL_M, (), np.random.default_rng(7))) == 0
     assert (
@@ -184,7 +184,7 @@ def test_the_same_stream_draws_the_same_tracks() -> None:
     assert not np.array_equal(first, other)
 
 
-def test_more_tracks_than_memory_should_hold_are_refused() -> None:
+def test_too_many_tracks_for_memory_are_refused() -> None:
     image = np.zeros((64, 64), np.float32)
     with pytest.raises(
         InputError, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"

@@ -78,7 +78,7 @@ def law(
         (1.0, 30.0, 4.0, 3.0, 12, 40000),  # half of it below zero
     ],
 )
-def test_the_histogram_is_the_law_s(
+def test_the_noise_histogram_matches_the_detector_s_law(
     mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float
 ) -> None:
     settings = {"gain_e_dn": gain, "offset_dn": offset, "bits": bits, "full_well_e": well_e}
@@ -136,7 +136,7 @@ def test_shot_noise_has_the_variance_of_its_mean(mean_e: float) -> None:
     assert made.var() == pytest.approx(mean_e, abs=4 * np.sqrt((2 * mean_e**2 + mean_e) / N))
 
 
-def test_sensitivity_spreads_the_light_by_its_share_and_the_dark_not_at_all() -> None:
+def test_prnu_scales_light_and_not_dark_current() -> None:
     made = detector_with(prnu=0.02, dark_e_s=1e5)
     lit, dark = (
         np.mean([expose(np.full(SHAPE, e), made, n) - 1000 for n in range(30)], axis=0)
@@ -168,7 +168,7 @@ def test_dark_current_is_lognormal_with_its_own_mean_and_spread() -> None:
     assert stats.kstest(np.log(dark.ravel() / 100) / s + s / 2, "norm").pvalue > 1e-4
 
 
-def test_hot_pixels_are_so_many_and_so_hot() -> None:
+def test_hot_pixels_have_their_declared_number_and_strength() -> None:
     dark = (
         detector_with((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(
             float
@@ -180,7 +180,7 @@ def test_hot_pixels_are_so_many_and_so_hot() -> None:
     assert stats.kstest(hot / 3000, "expon").pvalue > 1e-4
 
 
-def test_the_fixed_pattern_is_the_chip_s_own() -> None:
+def test_the_fixed_pattern_depends_on_the_hardware_seed() -> None:
     spread = {
         "prnu": 0.01,
         "dark_e_s": 10,
@@ -198,14 +198,14 @@ def test_the_fixed_pattern_is_the_chip_s_own() -> None:
 # Reading
 
 
-def test_read_and_reset_noise_add_their_variances_and_the_rounding_a_twelfth() -> None:
+def test_read_reset_and_rounding_variances_add() -> None:
     made = frame(0.0, read_noise_e=14.7, reset_noise_e=8.0) - 1000
     assert made.mean() == pytest.approx(0, abs=4 * 17 / np.sqrt(N))
     variance = 14.7**2 + 8**2 + 1 / 12
     assert made.var() == pytest.approx(variance, abs=4 * variance * np.sqrt(2 / N))
 
 
-def test_columns_have_offsets_that_stay() -> None:
+def test_column_offsets_are_fixed() -> None:
     made = detector_with(column_offset_e=6.0, read_noise_e=2.0)
     columns = expose(np.zeros(SHAPE), made).mean(axis=0) - 1000
     np.testing.assert_allclose(
@@ -220,7 +220,7 @@ def test_the_gain_divides_and_the_offset_adds(gain: float) -> None:
     assert made.mean() == pytest.approx(64 + 5000 / gain, abs=4 * np.sqrt(5000 / N) / gain + 1e-3)
 
 
-def test_the_amplifier_bends_by_so_much_at_full_well() -> None:
+def test_the_amplifier_has_its_declared_nonlinearity_at_full_well() -> None:
     bent = {"nonlinearity": 0.05, "full_well_e": 40000.0}
     for mean_e in (4000.0, 20000.0, 36000.0):
         wanted = (
@@ -246,7 +246,7 @@ def test_the_converter_ends_at_zero_and_at_all_ones(bits: int, top: int) -> None
 # Full wells
 
 
-def test_a_full_well_holds_no_more() -> None:
+def test_charge_is_clipped_at_full_well() -> None:
     made = frame(1e5, full_well_e=40000, gain_e_dn=10, offset_dn=64)
     np.testing.assert_array_equal(made, 4064)
 
@@ -270,7 +270,7 @@ def spot(electrons: float) -> np.ndarray:
     return light_e
 
 
-def test_a_well_overflows_along_its_column_and_loses_nothing() -> None:
+def test_an_overflowing_well_spills_along_its_column_without_loss() -> None:
     made = expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column")) - 1000
     assert made[:, 10].max() == 20000
     assert (made[:, 10] == 20000).sum() in (9, 10, 11)
@@ -410,7 +410,7 @@ def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None
     assert np.mean(alone[0] != alone[1]) > 0.8
 
 
-def test_row_by_row_is_the_same_as_step_by_step() -> None:
+def test_row_by_row_simulation_equals_step_by_step_simulation() -> None:
     """A threshold of blooming that nothing reaches sends the frame the longer way."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
     spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
@@ -420,7 +420,7 @@ def test_row_by_row_is_the_same_as_step_by_step() -> None:
     np.testing.assert_array_equal(short, long)
 
 
-def test_pixels_know_nothing_of_their_neighbors() -> None:
+def test_noise_of_neighboring_pixels_is_independent() -> None:
     made = frame(400.0, read_noise_e=10) - 1400
     for shifted in (made[:, 1:] * made[:, :-1], made[1:] * made[:-1]):
         assert shifted.mean() == pytest.approx(0, abs=4 * 500 / np.sqrt(N))
@@ -435,17 +435,17 @@ def seen(electrons: float, area_px: float, peak_e: float) -> SourceTruth:
     )  # fmt: skip
 
 
-def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
+def test_signal_to_noise_matches_repeated_photometry() -> None:
     """A flat image of 25 pixels, 40 e- each on a sky of 30: its sum over them in 400 frames."""
     light_e = np.full((64, 32), 30.0)
     light_e[28:33, 8:13] += 40
     made = detector_with((64, 32), read_noise_e=10.0, gain_e_dn=12.0, offset_dn=20.0)
-    told = detector.add_snr_and_saturation(
+    sources = detector.add_snr_and_saturation(
         seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
     )
     sums = [(expose(light_e, made, n)[28:33, 8:13]).sum() * 12.0 for n in range(400)]
-    assert told.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
-    assert not told.saturated[0]
+    assert sources.snr[0] == pytest.approx(1000 / np.std(sums), rel=4 / np.sqrt(2 * 400))
+    assert not sources.saturated[0]
 
 
 def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
@@ -455,17 +455,19 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
     for name in noise_e:
         one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {name: noise_e[name]}
         made = detector_with((64, 32), offset_dn=20.0, **one)
-        told = detector.add_snr_and_saturation(
+        sources = detector.add_snr_and_saturation(
             seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
         )
         pixel_e2 = one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
-        assert told.snr[0] == pytest.approx(1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6)
+        assert sources.snr[0] == pytest.approx(
+            1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6
+        )
 
 
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
     made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
-    told = detector.add_snr_and_saturation(
+    sources = detector.add_snr_and_saturation(
         seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
     )
-    assert told.saturated[0] == full
+    assert sources.saturated[0] == full

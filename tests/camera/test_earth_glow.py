@@ -25,7 +25,7 @@ def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 120.0])
-def test_the_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: float) -> None:
+def test_the_earth_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: float) -> None:
     """From far away: E (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the air adds 2 H / R or a little more."""
     far_m = 200 * EARTH_RADIUS_M
     phase = np.radians(phase_deg)
@@ -68,7 +68,7 @@ def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> No
 
 
 @pytest.mark.slow
-def test_the_limb_is_where_its_dip_says() -> None:
+def test_the_limb_is_at_its_geometric_dip() -> None:
     """From 500 km above the equator, looking 2 degrees above the horizon ahead: the ground's edge is so far off."""
     dip_deg = np.degrees(np.arccos(EARTH_RADIUS_M / (EARTH_RADIUS_M + 500e3)))
     keys = {

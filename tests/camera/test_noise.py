@@ -71,7 +71,7 @@ def test_the_logarithm_is_that_of_double_precision() -> None:
     np.testing.assert_allclose(found, np.log(u.astype(float)), rtol=3e-7, atol=0)
 
 
-def test_directions_are_all_of_the_circle_once() -> None:
+def test_random_directions_cover_the_circle_once() -> None:
     """Words in equal steps: unit vectors whose angles, in order, are equally far apart."""
     words = np.arange(-(2**31) + 2**20, 2**31, 2**21, dtype=np.int64).astype(np.int32)
     x, y = np.array([noise._direction(word) for word in words]).T
@@ -95,7 +95,7 @@ def test_the_least_uniform_numbers_have_the_law_s_tail() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 8, 9, 31, 33])
-def test_rows_of_any_width_have_the_law(width: int) -> None:
+def test_rows_of_any_width_are_normally_distributed(width: int) -> None:
     """Also the last pixel of an odd row, and where small and large means are side by side."""
     memory = noise.scratch(width)
     seeds = noise.seeds(np.random.default_rng(width), 4000)
@@ -113,7 +113,7 @@ def test_rows_of_any_width_have_the_law(width: int) -> None:
     assert (np.abs(counts.var(axis=0) / means - 1) < 4.5 * np.sqrt(2 + 1 / means) * sigma).all()
 
 
-def test_neighbors_and_rows_know_nothing_of_each_other() -> None:
+def test_noise_of_neighbors_and_rows_is_independent() -> None:
     made = drawn_normals(3)
     for a, b in (
         (made[:, 1:], made[:, :-1]),
@@ -134,7 +134,7 @@ def test_counts_and_the_numbers_that_follow_are_independent() -> None:
         assert abs(r) < 4.5 / np.sqrt(N)
 
 
-def test_a_seed_is_a_stream() -> None:
+def test_a_seed_determines_the_noise() -> None:
     np.testing.assert_array_equal(drawn_normals(5), drawn_normals(5))
     assert np.mean(drawn_normals(5) == drawn_normals(6)) < 1e-3
 
@@ -157,7 +157,7 @@ def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count(
 
 
 @pytest.mark.parametrize("mean", [10.0, 37.4, 1e3, 1e6])
-def test_procedure_f_is_the_poisson_law_and_nearly_its_hat(mean: float) -> None:
+def test_procedure_f_gives_the_poisson_law_below_its_hat_function(mean: float) -> None:
     """py exp(px) to the next term of Stirling's series, 1 / (1680 k^7); by the interpreter."""
     counts = np.unique(np.floor(mean + np.sqrt(mean) * np.linspace(-3, 3, 25)))
     for k in counts[counts >= 0]:

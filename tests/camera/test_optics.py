@@ -50,7 +50,7 @@ small = st.floats(-0.3, 0.3, allow_subnormal=False)
 @pytest.mark.slow
 @settings(max_examples=50, derandomize=True, deadline=None)
 @given(st.tuples(small, small, st.floats(-0.02, 0.02), st.floats(-0.02, 0.02), small))
-def test_distortion_is_opencv_s(distortion: tuple[float, ...]) -> None:
+def test_distortion_matches_opencv(distortion: tuple[float, ...]) -> None:
     lens = optics(distortion=list(distortion), principal_point_px=[300.0, 250.0])
     vectors = rays(100, 25, 1)
     wanted, _ = cv2.projectPoints(
@@ -67,7 +67,7 @@ def test_a_distortion_too_small_to_matter_does_no_harm() -> None:
     np.testing.assert_allclose(lens.project(vectors), optics().project(vectors), rtol=0, atol=1e-9)
 
 
-def test_the_boresight_is_the_middle_of_the_chip_unless_told_otherwise() -> None:
+def test_the_boresight_is_the_chip_s_center_by_default() -> None:
     boresight = np.array([0.0, 0.0, 1.0])
     np.testing.assert_allclose(optics().project(boresight), [329, 246], rtol=0, atol=1e-12)
     moved = optics(principal_point_px=[12.5, 400.0])
@@ -93,7 +93,7 @@ def test_a_vector_s_length_does_not_matter_and_what_is_behind_has_no_pixel() -> 
 # Distortion that turns back
 
 
-def test_strong_barrel_distortion_has_no_image_beyond_its_fold() -> None:
+def test_beyond_the_fold_of_barrel_distortion_there_is_no_image() -> None:
     """r (1 - .3 r^2) grows up to 1 - .9 r^2 = 0, r = 1.0541; beyond, OpenCV's formula would fold the sky back in."""
     lens = optics(distortion=[-0.3, 0, 0, 0, 0])
     assert lens.fold_r == pytest.approx(np.sqrt(1 / 0.9), rel=1e-12)
@@ -131,7 +131,7 @@ def test_the_fold_is_where_the_image_stops_growing(distortion: tuple[float, ...]
 # Sizes
 
 
-def test_reference_field_of_view_and_diagonal() -> None:
+def test_field_of_view_and_diagonal_match_the_reference() -> None:
     # Reference H1: 14.868 x 11.150 degrees over the whole chip, true diagonal 18.51.
     lens = optics()
     assert np.degrees(2 * np.arctan(659 / 2 / lens.camera.focal_px)) == pytest.approx(
@@ -193,7 +193,7 @@ def test_the_field_is_never_too_small(distortion: list[float]) -> None:
 # Focus
 
 
-def test_a_lens_focused_nearby_stands_farther_from_its_chip() -> None:
+def test_a_lens_focused_nearby_is_farther_from_its_chip() -> None:
     """Reference §1.2: 35 mm at 33 in is 36.53 mm, and 6.4 mm of chip see 10.01 deg in place of 10.45."""
     afit = {"width_px": 1600, "height_px": 1200, "pixel": "4 um", "focal_length": "35 mm"}
     near = optics(**afit, focus="33 in")
@@ -223,7 +223,7 @@ def test_the_pupil_collects_its_area_times_the_transmission() -> None:
     assert optics().collecting_m2 == pytest.approx(np.pi / 4 * (0.025 / 1.4) ** 2 * 0.85, rel=1e-14)
 
 
-def test_a_point_s_light_falls_with_the_cosine_of_its_foreshortened_pupil() -> None:
+def test_a_point_s_light_falls_with_the_pupil_s_foreshortening() -> None:
     """And not with cos^4, which is an extended source's."""
     angle = np.radians([0, 30, 60, 89, 90, 91, 180])
     wanted = [1, np.sqrt(0.75), 0.5, np.cos(np.radians(89)), 0, 0, 0]
@@ -253,7 +253,7 @@ def test_two_stops_pass_the_rays_that_fit_through_both(share: float, cutoff_deg:
     assert throughput == pytest.approx(traced(field, np.radians(cutoff_deg)), abs=5e-4)
 
 
-def test_two_stops_by_hand() -> None:
+def test_vignetting_by_two_stops_matches_a_hand_calculation() -> None:
     """Disks a radius apart overlap by 2 / 3 - sqrt(3) / (2 pi) = .3910 of a disk; a whole diameter apart by nothing."""
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 45})
     field = np.array([0, np.arctan(0.5), np.pi / 4, 1.5, np.pi / 2, 3.0])
@@ -278,7 +278,7 @@ def test_a_table_of_transmission_is_linear_between_its_angles_and_level_beyond()
 
 
 @pytest.mark.slow
-def test_a_star_gives_the_light_that_passes() -> None:
+def test_a_star_s_electrons_are_scaled_by_vignetting() -> None:
     """Through the renderer: at the cosine and vignetting of 10 deg off axis, (axis / edge) is their product."""
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 40}, focal_length="15 mm")
     angle = np.radians([0.0, 8.0])

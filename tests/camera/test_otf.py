@@ -74,7 +74,7 @@ def profile(image: Kernel, radii: Floats) -> Floats:
 
 
 @pytest.mark.parametrize(("f_number", "diameter_px"), [(1.4, 249), (2.8, 124), (8, 43), (16, 22)])
-def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(
+def test_the_blur_of_an_led_with_focus_at_infinity_matches_the_reference(
     f_number: float, diameter_px: float
 ) -> None:
     lens = camera(f_number=f_number)
@@ -82,14 +82,14 @@ def test_reference_blur_of_an_led_under_a_lens_focused_at_infinity(
 
 
 @pytest.mark.parametrize(("f_number", "blur_um"), [(1.4, 9.4), (8, 1.6)])
-def test_reference_blur_of_an_led_a_little_farther_than_the_focus(
+def test_the_blur_of_an_led_beyond_the_focus_matches_the_reference(
     f_number: float, blur_um: float
 ) -> None:
     lens = camera(f_number=f_number, focus="33 in")
     assert 2 * blur_radius_px(lens, 33.287 * INCH_M) * 4.2 == pytest.approx(blur_um, abs=0.05)
 
 
-def test_reference_blur_of_a_star_a_tenth_of_a_millimeter_out_of_focus() -> None:
+def test_the_blur_of_a_star_0_1_mm_out_of_focus_matches_the_reference() -> None:
     """Reference H11: chip 0.1 mm behind the focus of 25 mm f/1.4: 71 um, 7.2 px of 9.9 um."""
     focus_m = 1 / (1 / 0.025 - 1 / 0.0251)
     lens = camera(focal_length="25 mm", f_number=1.4, pixel="9.9 um", focus=f"{focus_m} m")
@@ -138,7 +138,7 @@ def density(psf: Psf, r: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "moffat", "airy"])
-def test_a_transfer_function_is_its_profile_s_hankel_transform(kind: str) -> None:
+def test_a_transfer_function_is_the_hankel_transform_of_its_profile(kind: str) -> None:
     """Integrated numerically to 400 px; what Airy's rings hold beyond is 2 / (pi x) = 0.05 %."""
     r: Floats = (np.arange(400_000, dtype=np.float64) + 0.5) * 1e-3
     f = np.array([0.05, 0.2, 0.5, 0.8])
@@ -156,11 +156,11 @@ def test_every_kind_passes_all_light_and_has_an_extent(kind: str) -> None:
     assert radius + 3 * sigma > 1
 
 
-def test_every_kind_of_the_schema_is_here() -> None:
+def test_every_lens_kind_of_the_schema_is_implemented() -> None:
     assert set(PSFS) == set(EXTENT) == {*KINDS, "measured"}
 
 
-def test_diffraction_is_that_of_the_working_f_number() -> None:
+def test_diffraction_uses_the_working_f_number() -> None:
     """Focused near, the cone is slower: v / A = N v / f; a cutoff of 1 / (lambda N) at infinity."""
     psf = AiryPsfConfig(kind="airy")
     assert airy_unit_px(psf, camera()) == pytest.approx(0.55 * 8 / 4.2, rel=1e-12)
@@ -173,7 +173,7 @@ def test_diffraction_is_that_of_the_working_f_number() -> None:
 # --- images ---
 
 
-def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
+def test_airy_s_first_dark_ring_encloses_the_textbook_s_light() -> None:
     """1.22 lambda N, and 83.8 % of the light (Born & Wolf 8.5), on pixels so small that they blur nothing."""
     lens = camera(pixel="0.4 um")
     psf = AiryPsfConfig(kind="airy")
@@ -206,7 +206,7 @@ def test_a_table_has_the_harmonics_above_the_floor() -> None:
         assert pack_table(np.outer([1, *weak], profile_0)).shape == (301, columns)
 
 
-def test_moffat_s_full_width_at_half_maximum() -> None:
+def test_moffat_s_full_width_at_half_maximum_matches_its_formula() -> None:
     image = build_kernel(MoffatPsfConfig(kind="moffat", fwhm_px=24.0, beta=3.0), camera())
     center, half, out = profile(image, np.array([0.0, 12.0, 36.0]))
     # The pixel widens it by 1/12 px^2 of some 100.
@@ -240,7 +240,7 @@ def covered_disk(radius: float, size: int, fine: int) -> Floats:
 @pytest.mark.slow
 @pytest.mark.parametrize("radii", [(4.3, 2.6), (3.0, 0.0), (6.0, 1.37)])
 @pytest.mark.parametrize("sigma_px", [0.25, 0.7])
-def test_disks_against_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
+def test_images_of_disks_match_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
     """Emitter x defocus x Gaussian x pixel, summed on a grid of 1/21 px, within 5e-4 of the peak."""
     # odd: the middle cell is in the middle of the middle pixel
     size = 25
@@ -279,7 +279,7 @@ def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
 
 
 @pytest.mark.long
-def test_a_sharp_point_gets_a_grid_and_a_soft_one_tables() -> None:
+def test_sharp_images_use_a_grid_and_blurred_ones_tables() -> None:
     lens = camera(f_number=1.4, pixel="9.9 um")
     assert round_kernel(AiryPsfConfig(kind="airy"), lens, 0, 0, 0) is None
     assert len(build_kernel(AiryPsfConfig(kind="airy"), lens).grid)
@@ -328,7 +328,7 @@ def test_a_measured_gaussian_is_that_gaussian(
     )
 
 
-def test_a_star_measured_in_whole_pixels_gives_its_image_back(tmp_path: Path) -> None:
+def test_a_star_measured_in_whole_pixels_reproduces_its_image(tmp_path: Path) -> None:
     """Oversampling 1: the image itself where it was measured, centered on its center of gravity."""
     table = np.array(
         [[0, 1, 1, 0, 0], [1, 6, 9, 2, 0], [1, 9, 20, 8, 1], [0, 3, 7, 4, 1], [0, 0, 1, 1, 0.0]]
@@ -374,7 +374,7 @@ def test_mirroring_a_measured_lens_mirrors_its_image(tmp_path: Path) -> None:
         )
 
 
-def test_interpolation_of_cells_is_keys_cubic() -> None:
+def test_interpolation_of_cells_uses_keys_s_cubic() -> None:
     """Its transform, integrated from the cubic pieces; 1 at rest, 0 at whole cycles a cell."""
     t = np.linspace(-2, 2, 40_001)
     s = np.abs(t)
@@ -426,7 +426,7 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
         ("psf.docx", "x", "unknown image suffix"),
     ],
 )
-def test_a_file_that_is_no_psf_is_told_in_one_line(
+def test_a_file_that_is_not_a_psf_is_refused_in_one_line(
     tmp_path: Path, name: str, text: str | None, said: str
 ) -> None:
     path = tmp_path / name

@@ -176,7 +176,7 @@ def test_a_star_on_the_border_leaves_half_of_itself_outside() -> None:
     np.testing.assert_allclose(seen.xy_px, [[-0.5, 20.0]], rtol=0, atol=1e-10)
 
 
-def test_lights_add() -> None:
+def test_images_of_lights_add() -> None:
     near = star_at(20.2, 20.9, 1e3)
     far = star_at(22.0, 21.0, 2e3)
     both = with_sources([near, far])
@@ -194,7 +194,7 @@ def test_lights_add() -> None:
     ],
     ids=["star behind", "led behind", "led turned away", "star outside", "no light at all"],
 )
-def test_what_cannot_be_seen_leaves_no_trace(source: Sources) -> None:
+def test_invisible_lights_add_no_electrons(source: Sources) -> None:
     image, seen = shot(source)
     assert image.shape == (48, 64)
     assert not image.any()
@@ -215,7 +215,7 @@ def test_a_still_star_s_centroid_is_its_projected_pixel(x_px: float) -> None:
 
 
 @pytest.mark.parametrize("sigma_px", [0.2, 0.25, 0.3, 0.4, 0.5, 0.6])
-def test_pixels_bend_the_centroid_by_the_s_curve(sigma_px: float) -> None:
+def test_the_pixel_grid_shifts_the_centroid_by_the_s_curve(sigma_px: float) -> None:
     """First harmonic exp(-2 pi^2 sigma^2) / pi over the wide window (reference §3)."""
     phase = np.arange(16) / 16
     lens = blurred(sigma_px)
@@ -292,7 +292,7 @@ def test_an_led_s_image_has_the_diameter_of_thin_geometry(
 # Smear
 
 
-def test_reference_smear_of_shefex() -> None:
+def test_the_smear_of_shefex_matches_the_reference() -> None:
     # Reference H2: 4.41 px at 2 deg/s in 50 ms, 8.8 px at 4 deg/s.
     lens = lens_of(pixel="9.9 um")
     for rate_deg_s, length_px in ((2, 4.41), (4, 8.81)):
@@ -317,7 +317,7 @@ def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length
     )  # the same of the second moment
 
 
-def test_stars_move_against_the_camera() -> None:
+def test_stars_move_opposite_to_the_camera() -> None:
     """Turning about body y (down) by the right-hand rule swings the boresight to +x: stars go left."""
     _, early = draw(light(), Window(0.0, 0.1), turning([0, 0.004, 0]))
     _, late = draw(light(), Window(0.9, 0.1), turning([0, 0.004, 0]))
@@ -325,7 +325,7 @@ def test_stars_move_against_the_camera() -> None:
     assert early.xy_px[0, 0] > 31.5 > late.xy_px[0, 0]
 
 
-def test_a_roll_leaves_the_boresight_and_swings_the_rest_by_radius_times_angle() -> None:
+def test_a_roll_moves_stars_by_radius_times_angle_and_keeps_the_boresight() -> None:
     _, middle = shot(light(), turning([0, 0, 0.2]))
     _, aside = shot(star_at(31.5 + 20, 23.5), turning([0, 0, 0.2]))
     assert middle.streak_px[0] == pytest.approx(0, abs=1e-9)
@@ -372,7 +372,7 @@ def test_a_streak_is_the_integral_of_its_moments(angle_deg: float) -> None:
 
 @pytest.mark.parametrize("length_px", [0.9, 3.0, 9.0, 21.0])
 @pytest.mark.parametrize("radius_px", [1.0, 2.5, 10.0])
-def test_a_smeared_disk_has_converged(
+def test_a_smeared_disk_s_integration_has_converged(
     monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float
 ) -> None:
     """In pieces of a twentieth the image is no other one."""
@@ -383,7 +383,7 @@ def test_a_smeared_disk_has_converged(
     assert np.abs(usual - true).max() < 5e-4 * true.max()
 
 
-def test_halving_the_pieces_divides_the_error_by_sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_halving_the_steps_divides_the_error_by_sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two Gaussian points a piece are exact to the third power: the error falls with the fourth."""
 
     def streak(step: float) -> Floats:
@@ -409,7 +409,7 @@ def test_a_star_that_sweeps_through_from_outside_the_field_is_not_missed() -> No
 
 
 @pytest.mark.slow
-def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
+def test_stars_that_cross_the_field_between_two_samples_are_not_missed() -> None:
     """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
     around = np.radians(np.arange(0, 360, 7.5))
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
@@ -429,7 +429,7 @@ def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
 # LEDs
 
 
-def test_an_led_s_electrons_are_those_of_the_reference() -> None:
+def test_an_led_s_electrons_match_the_reference() -> None:
     # Reference §2: 0.6 cd, 33 in, 35 mm at f/8, T .85, QE .30: 3.1e7 electrons a millisecond.
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2 * 0.85
     lens = lens_of(pupil_m2, pixel="4.2 um", focal_length="35 mm", focus="33 in")
@@ -470,7 +470,7 @@ def test_duty_scales_the_light_of_whole_periods(duty: float) -> None:
     assert dim / full == pytest.approx(duty, rel=1e-10)
 
 
-def test_an_exposure_within_the_dark_of_a_pulse_sees_nothing() -> None:
+def test_an_exposure_between_pulses_sees_no_light() -> None:
     pulsed = led_at(0, 0, 1.0, period_s=[0.1], on_s=[0.02], start_s=[0.0])
     assert not draw(pulsed, Window(0.13, 0.05))[0].any()
     assert draw(pulsed, Window(0.19, 0.05))[0].sum() == pytest.approx(0.02, rel=1e-3)
@@ -485,7 +485,7 @@ def test_a_pulse_marks_where_the_led_was_while_it_shone() -> None:
 
 
 @pytest.mark.parametrize("tilt_deg", [-0.4, 0.1, 0.35])
-def test_parallax_is_that_computed_by_hand(tilt_deg: float) -> None:
+def test_parallax_matches_a_hand_calculation(tilt_deg: float) -> None:
     """An LED R above the bearing, a camera h above it: after a tilt of a about y the LED stands at
     (-R sin a, 0, R cos a - h) from the camera."""
     radius = 1.2192
@@ -525,7 +525,7 @@ def test_a_moving_led_draws_a_dashed_streak() -> None:
 # Rolling shutter
 
 
-def test_a_rolling_shutter_sees_still_light_as_a_global_one_does() -> None:
+def test_a_rolling_shutter_images_static_light_like_a_global_one() -> None:
     rolling, seen = draw(star_at(30.3, 20.8), Window(0.1, 0.5, 1e-3))
     still, other = draw(star_at(30.3, 20.8), Window(0.1, 0.5))
     np.testing.assert_allclose(rolling, still, rtol=0, atol=1e-12)
@@ -728,7 +728,7 @@ def test_vignetting_dims_a_star_and_an_led_alike() -> None:
         assert ratio == pytest.approx(1 - 0.4 * np.degrees(np.arctan(0.1)) / 20, rel=1e-6)
 
 
-def test_a_lobe_dims_an_led_seen_aslant() -> None:
+def test_a_lobe_dims_an_led_seen_obliquely() -> None:
     source = led_at(0.2, 0, 1.0, 1e-5)
     lens = lens_of(pixel="250 um")
     lambert, narrow = (
@@ -743,13 +743,13 @@ def test_a_lobe_dims_an_led_seen_aslant() -> None:
 # Truth
 
 
-def test_the_noise_equivalent_area_of_a_gaussian() -> None:
+def test_the_noise_equivalent_area_of_a_gaussian_matches_theory() -> None:
     """(sum s)^2 / sum s^2 is 4 pi sigma^2 of a wide Gaussian, the pixel's variance among it."""
     _, seen = shot(star_at(30.2, 22.9), lens=blurred(3.0))
     assert seen.area_px[0] == pytest.approx(4 * np.pi * (9 + 1 / 12), rel=1e-3)
 
 
-def test_the_brightest_pixel_is_where_the_star_is() -> None:
+def test_the_brightest_pixel_is_at_the_star() -> None:
     image, seen = shot(star_at(30.2, 22.9))
     np.testing.assert_array_equal(seen.peak_xy, [[30, 23]])
     assert image[23, 30] == seen.peak_e[0]
@@ -847,12 +847,12 @@ def test_reference_electrons_of_stars_in_the_ec655(v_mag: float, electrons: floa
     assert image.sum() == pytest.approx(electrons, rel=2e-3)
 
 
-def test_light_grows_with_time_and_pupil() -> None:
+def test_electrons_are_proportional_to_time_and_pupil_area() -> None:
     bright = draw(light(), Window(0.0, 1.5), lens=lens_of(2.0))[0]
     np.testing.assert_allclose(bright, 3 * shot(light())[0], rtol=1e-12, atol=0)
 
 
-def test_work_is_shared_in_goes_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_in_batches_equals_rendering_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Patches of many sources do not fit in a frame at once; the outcome does not tell."""
     rng = np.random.default_rng(2)
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]

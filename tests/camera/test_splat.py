@@ -62,7 +62,7 @@ KERNELS = {
 every_kernel = pytest.mark.parametrize("image", KERNELS.values(), ids=KERNELS)
 
 
-def test_the_kernels_are_of_every_kind() -> None:
+def test_the_test_kernels_cover_every_kind() -> None:
     shapes = [
         (k.radial.shape[1] if len(k.radial) else 0, len(k.grid) > 0) for k in KERNELS.values()
     ]
@@ -70,13 +70,13 @@ def test_the_kernels_are_of_every_kind() -> None:
 
 
 @every_kernel
-def test_no_light_is_lost_wherever_the_image_stands(image: Kernel) -> None:
+def test_light_is_conserved_at_any_subpixel_position(image: Kernel) -> None:
     totals = [draw(image, x, y).sum() for x, y in PLACES]
     np.testing.assert_allclose(totals, 1, rtol=0, atol=1e-5)
 
 
 @every_kernel
-def test_the_image_stands_where_it_is_told_to(image: Kernel) -> None:
+def test_the_image_s_centroid_is_at_its_requested_position(image: Kernel) -> None:
     # 2e-3: the S-curve of the sharpest of them, sigma 0.3 px and a disk of 3 px; the others are below 1e-4.
     index = np.arange(SIZE)
     for x, y in PLACES:
@@ -113,7 +113,7 @@ def test_mirrored_places_give_mirrored_images(image: Kernel) -> None:
 @pytest.mark.parametrize(
     "place", [(-3.3, 20.2), (20.2, -3.3), (62.7, 61.4), (0.0, 0.0), (-1e6, 5.0), (5.0, 1e6)]
 )
-def test_what_is_beyond_the_patch_is_left_out(image: Kernel, place: tuple[float, float]) -> None:
+def test_light_beyond_the_patch_is_left_out(image: Kernel, place: tuple[float, float]) -> None:
     x, y = place
     wide = np.zeros((SIZE + 80, SIZE + 80))
     add_kernel(wide, 0, len(wide), x + 40, y + 40, 1.0, image)
@@ -181,7 +181,7 @@ def test_the_weights_between_places_are_exact_for_cubics(t: float) -> None:
         assert weights @ samples**power == pytest.approx(t**power, abs=1e-12)
 
 
-def test_wings_end_without_a_beat() -> None:
+def test_faded_wings_keep_the_total_light_at_any_position() -> None:
     """Power-law wings are faded out, so that the total does not depend on where the image stands."""
     image = build_kernel(MoffatPsfConfig(kind="moffat", fwhm_px=1.5, beta=2.5), CAMERA)
     assert image.reach_px < MIDDLE

@@ -34,7 +34,7 @@ CAMERA = {
 }
 
 
-def test_glow_of_a_uniform_sphere() -> None:
+def test_the_glow_of_a_uniform_sphere_matches_theory() -> None:
     """Radiance rho E / pi with E = P / (A (1 - rho)), and the cos^4 law; wherever the camera is and looks."""
     wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 2.0))
     share = 0.6
@@ -156,7 +156,7 @@ def test_glare_leaves_uniform_light_uniform() -> None:
 @pytest.mark.parametrize(
     "config", [GLARE, GlareConfig(share=0.02, exponent=2.4, core_px=9.0)], ids=["steep", "flat"]
 )
-def test_glare_of_a_point(config: GlareConfig) -> None:
+def test_the_glare_of_a_point_matches_its_profile(config: GlareConfig) -> None:
     """The share left in the image, and the law of the power around it, with the mirrored field beside the chip."""
     side = block_px((256, 320), config.core_px)
     light = np.zeros((256, 320))

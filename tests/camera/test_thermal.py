@@ -53,8 +53,8 @@ def test_temperature_after_an_hour_and_a_half(history: dict[str, Any], expected_
 
 
 def test_table_is_constant_beyond_its_ends() -> None:
-    told = config({"kind": "table", "hours": [1.0, 2.0], "temperature_c": [20.0, 22.0]})
-    assert [temperature_c(told, t_s) for t_s in (0.0, 9000.0)] == [20.0, 22.0]
+    settings = config({"kind": "table", "hours": [1.0, 2.0], "temperature_c": [20.0, 22.0]})
+    assert [temperature_c(settings, t_s) for t_s in (0.0, 9000.0)] == [20.0, 22.0]
 
 
 MOUNTED = Mount(np.array([0.0, 0.0, 0.4]), Rotation.from_euler("x", 0.3))
@@ -72,16 +72,16 @@ def leds_and_stars() -> Sources:
 
 def test_dome_expands_from_its_anchor() -> None:
     """By alpha dT of the distance from it, and creeps; stars stay where they are."""
-    told = config(LINEAR, dome_ppm_k=70.0, anchor_height="0.9 m", creep=["0 m", "0 m", "-1 mm"])
+    settings = config(LINEAR, dome_ppm_k=70.0, anchor_height="0.9 m", creep=["0 m", "0 m", "-1 mm"])
     before = leds_and_stars()
-    after = leds_at(told, before, 2 * 3600.0)
+    after = leds_at(settings, before, 2 * 3600.0)
     anchor = np.array([0.0, 0.0, 0.9])
     strain = 70e-6 * 4.0
     expected = anchor + (1 + strain) * (before.place[:2, :3] - anchor) + [0.0, 0.0, -1e-3]
     np.testing.assert_allclose(after.place[:2, :3], expected, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(after.place[2], before.place[2])
     optics = Optics.from_camera(loader.load("afit_simsat").camera)
-    assert camera_at(told, MOUNTED, optics, 2 * 3600.0)[1] is optics
+    assert camera_at(settings, MOUNTED, optics, 2 * 3600.0)[1] is optics
 
 
 def test_image_grows_with_the_focal_length() -> None:

@@ -13,7 +13,7 @@ from skysim.scene.sections.camera import CameraConfig
     "center_px", [(319.5, 239.5), (-300.0, 239.5), (900.0, 700.0), (-250.0, -200.0)]
 )
 @pytest.mark.parametrize("k1", [-0.1, 0.1])
-def test_the_fit_s_points_cover_the_chip_and_little_else(
+def test_the_fit_s_points_cover_the_chip_and_little_more(
     center_px: tuple[float, float], k1: float
 ) -> None:
     """Also of a chip beside the optical axis: from edge to edge, and few points elsewhere."""

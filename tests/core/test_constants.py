@@ -76,7 +76,7 @@ NOTORIOUS = (
 )
 
 
-def test_each_constant_is_that_of_other_libraries() -> None:
+def test_each_constant_matches_other_libraries() -> None:
     for module in (constants, believed):
         named = numbers_of(module)
         assert set(named) - TIMES <= set(ORACLES) | {"SUN_V_MAG"}
@@ -92,7 +92,7 @@ def test_the_suns_magnitude_follows_from_its_luminosity() -> None:
 
 
 @pytest.mark.parametrize("package", OWN_FILES)
-def test_a_constant_is_defined_once(package: str) -> None:
+def test_no_constant_is_defined_twice(package: str) -> None:
     own = [ROOT / package / name for name in OWN_FILES[package]]
     others = [path for path in sorted((ROOT / package).rglob("*.py")) if path not in own]
     known = (

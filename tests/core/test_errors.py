@@ -73,7 +73,7 @@ def test_every_part_is_printable(quoted: str) -> None:
         (InputError("a.csv", "empty", "a table", Where("a.csv")), "a.csv: empty; allowed: a table"),
     ],
 )
-def test_the_line_says_where_what_and_what_is_allowed(error: InputError, line: str) -> None:
+def test_the_error_line_has_place_problem_and_allowed_values(error: InputError, line: str) -> None:
     assert str(error) == line
 
 
@@ -106,18 +106,18 @@ def refuse() -> None:
 
 
 @pytest.mark.slow
-def test_it_crosses_a_pool_of_processes_with_its_parts() -> None:
+def test_an_error_keeps_its_parts_across_processes() -> None:
     with ProcessPoolExecutor(1) as pool, pytest.raises(InputError) as raised:
         pool.submit(refuse).result()
     assert parts(raised.value) == parts(COUNT)
 
 
-def test_under_a_section_the_key_is_longer() -> None:
+def test_a_section_is_prepended_to_an_error_s_key() -> None:
     assert parts(COUNT.under("heads.0")) == ("heads.0.light.layout.count", *parts(COUNT)[1:])
     assert InputError("", "missing").under("heads.0").key == "heads.0"
 
 
-def test_within_a_key_that_names_it_a_file_begins_the_problem() -> None:
+def test_within_the_key_of_a_file_the_problem_starts_with_the_file_s_name() -> None:
     table = InputError("a.csv", "3 numbers", "4", Where("a.csv", 7))
     assert parts(table.within("light.file")) == (
         "light.file",
@@ -132,12 +132,12 @@ def test_within_a_key_that_names_it_a_file_begins_the_problem() -> None:
     assert InputError("", "not even").within("points").problem == "not even"
 
 
-def test_at_a_place_all_else_is_as_before() -> None:
+def test_setting_an_error_s_place_keeps_its_other_parts() -> None:
     assert parts(COUNT.at(Where("y.yaml"))) == (*parts(COUNT)[:3], Where("y.yaml"))
     assert COUNT.at(None).where is None
 
 
-def test_every_change_leaves_the_error_itself_alone() -> None:
+def test_every_change_of_an_error_returns_a_new_one() -> None:
     before = parts(COUNT)
     COUNT.under("a").within("b").at(None)
     assert parts(COUNT) == before
@@ -163,7 +163,7 @@ def mentions(tree: ast.AST, name: str) -> bool:
     return any(isinstance(node, ast.Name) and node.id == name for node in ast.walk(tree))
 
 
-def test_an_error_has_a_key_and_a_problem() -> None:
+def test_an_error_requires_a_key_and_a_problem() -> None:
     found = [
         f"{path}:{call.lineno}"
         for path, tree, _ in modules("skysim")
@@ -173,7 +173,7 @@ def test_an_error_has_a_key_and_a_problem() -> None:
     assert not found
 
 
-def test_no_error_but_those_of_the_command_line_speaks_of_it() -> None:
+def test_only_errors_of_the_command_line_mention_it() -> None:
     found = [
         f"{path}:{node.lineno}"
         for path, tree, text in modules("skysim")
@@ -242,7 +242,7 @@ def test_no_handler_reads_the_text_of_an_error() -> None:
         'raise InputError(f"heads.0.{error}", "bad")',
     ],
 )
-def test_the_law_knows_a_handler_that_reads_text(statement: str) -> None:
+def test_a_handler_that_reads_an_error_s_text_is_detected(statement: str) -> None:
     tree = ast.parse(f"try:\n    pass\nexcept InputError as error:\n    {statement}\n")
     (handler,) = catchers(tree)
     assert any(reads_text(node, "error") for node in ast.walk(handler))

@@ -67,7 +67,7 @@ def complaint(path: Path) -> str:
 # Roundtrips
 
 
-def test_a_frame_is_three_files_and_nothing_else(written: Path) -> None:
+def test_a_frame_is_written_as_exactly_three_files(written: Path) -> None:
     assert {p.name for p in written.iterdir()} == {
         "frame_0000.fits",
         "frame_0000.png",
@@ -76,7 +76,7 @@ def test_a_frame_is_three_files_and_nothing_else(written: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["fits", "png"])
-def test_a_frame_comes_back_bit_for_bit(sky: Shot, written: Path, suffix: str) -> None:
+def test_a_frame_round_trips_bit_for_bit(sky: Shot, written: Path, suffix: str) -> None:
     back = images.read_image(written / f"frame_0000.{suffix}")
     assert back.dtype == np.uint16
     np.testing.assert_array_equal(back, sky[1].image_dn)
@@ -101,7 +101,7 @@ def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(
     assert np.abs(rounded - frame.image_dn).max() <= 0.5
 
 
-def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) -> None:
+def test_the_header_has_date_exposure_and_scene(sky: Shot, written: Path) -> None:
     header = fits.getheader(written / "frame_0000.fits")
     assert header["EXPTIME"] == 0.040
     # 0.1 s after the start the shutter opens, 20 ms later is the middle.
@@ -117,7 +117,7 @@ def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) 
 
 
 @pytest.mark.parametrize("start", ["2012-06-22T23:00:00+02:00", "2012-06-22T21:00:00Z"])
-def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> None:
+def test_a_scene_s_time_with_a_zone_is_written_as_utc(sky: Shot, start: str) -> None:
     """DATE-OBS takes no zone, and an attitude message would have been two hours off."""
     loaded, frame, _ = sky
     zoned = loader.load("shefex2", {"start_time": start})
@@ -137,7 +137,7 @@ def test_a_fits_file_is_standard(written: Path) -> None:
             hdus.verify("exception")
 
 
-def test_truth_comes_back(sky: Shot, written: Path) -> None:
+def test_a_truth_table_round_trips(sky: Shot, written: Path) -> None:
     truth = sky[2]
     seen = sky[2].sources
     table = Table.read(written / "frame_0000.ecsv", format="ascii.ecsv")
@@ -172,7 +172,7 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
     )
 
 
-def test_bodies_come_back_by_name(sky: Shot, tmp_path: Path) -> None:
+def test_bodies_of_a_truth_table_round_trip_by_name(sky: Shot, tmp_path: Path) -> None:
     loaded, frame, truth = sky
     moon = BodyTruth(9_000_301, "moon", -8.84, 154.86, 4.84, 1868.9, 118.4)
     for bodies in ((), (moon,)):
@@ -181,7 +181,7 @@ def test_bodies_come_back_by_name(sky: Shot, tmp_path: Path) -> None:
         assert meta.get("bodies", []) == [asdict(body) for body in bodies]
 
 
-def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> None:
+def test_saturation_flags_of_a_truth_table_round_trip(sky: Shot, tmp_path: Path) -> None:
     loaded, frame, truth = sky
     every_third = np.arange(len(truth.sources.id)) % 3 == 0
     truth = replace(truth, sources=replace(truth.sources, saturated=every_third))
@@ -248,13 +248,13 @@ def break_off(path: Path, words: str) -> None:
         raise KeyboardInterrupt
 
 
-def test_an_interrupted_file_vanishes(tmp_path: Path) -> None:
+def test_an_interrupted_new_file_is_removed(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         break_off(tmp_path / "new.txt", "half")
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
+def test_an_interrupted_file_keeps_the_old_one(tmp_path: Path) -> None:
     files.write_text(tmp_path / "old.txt", "whole")
     with pytest.raises(KeyboardInterrupt):
         break_off(tmp_path / "old.txt", "half")
@@ -262,7 +262,7 @@ def test_an_interrupted_file_leaves_the_old_one(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_picture_that_cannot_be_encoded_leaves_nothing(tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_encoded_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,
         match=r"x\.png: an image of uint8 and shape \(4, 4, 2\) cannot be encoded in this format",
@@ -304,7 +304,7 @@ with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "fra
 """
 
 
-def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
+def test_only_temporary_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     """Not what a live process writes, ours or another, nor another machine's, nor hidden files of the user's."""
     subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
     left = {path.name for path in tmp_path.iterdir()}
@@ -341,7 +341,7 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.0044, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("suffix", ["fits", "png"])
-def test_a_truncated_frame_is_one_line(
+def test_a_truncated_frame_is_refused_in_one_line(
     written: Path, tmp_path: Path, suffix: str, share: float
 ) -> None:
     data = (written / f"frame_0000.{suffix}").read_bytes()
@@ -351,7 +351,7 @@ def test_a_truncated_frame_is_one_line(
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "tif", "bmp"])
-def test_other_truncated_pictures_are_one_line(tmp_path: Path, suffix: str) -> None:
+def test_other_truncated_images_are_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
     whole = tmp_path / f"whole.{suffix}"
     cv2.imwrite(str(whole), np.random.default_rng(1).integers(0, 255, (200, 300), np.uint8))
     images.read_image(whole)
@@ -360,22 +360,22 @@ def test_other_truncated_pictures_are_one_line(tmp_path: Path, suffix: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("at", "told"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"]
+    ("at", "field_value"), [(33, 200_000_000), (20, 4_000_000)], ids=["chunk", "rows"]
 )
-def test_a_png_that_tells_of_more_than_it_holds_is_not_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, told: int
+def test_a_png_whose_header_exceeds_its_data_is_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, field_value: int
 ) -> None:
     """A chunk's length stands after IHDR, the height in it; OpenCV would take the memory for both."""
     data = bytearray(
         cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8))[1]
     )
-    data[at : at + 4] = told.to_bytes(4, "big")
+    data[at : at + 4] = field_value.to_bytes(4, "big")
     (tmp_path / "much.png").write_bytes(data)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     assert "truncated" in complaint(tmp_path / "much.png")
 
 
-def test_the_libraries_below_do_not_talk_past_us(
+def test_image_libraries_print_nothing_to_stderr(
     written: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     data = (written / "frame_0000.png").read_bytes()
@@ -385,12 +385,12 @@ def test_the_libraries_below_do_not_talk_past_us(
 
 
 @pytest.mark.parametrize("name", ["text.png", "text.fits", "text.jpg", "text.tiff"])
-def test_text_by_an_image_s_name_is_one_line(tmp_path: Path, name: str) -> None:
+def test_text_in_an_image_file_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("once upon a time\n" * 300)
     complaint(tmp_path / name)
 
 
-def test_what_is_not_there_or_no_image_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_file_or_no_image_is_refused_in_one_line(tmp_path: Path) -> None:
     assert "no such file" in complaint(tmp_path / "missing.fits")
     assert "no such file" in complaint(tmp_path)
     (tmp_path / "x.docx").write_text("")
@@ -407,7 +407,7 @@ def test_the_image_of_an_extension_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", [*range(40), 172])
 @pytest.mark.filterwarnings("error")
-def test_a_few_flipped_bytes_give_an_image_or_one_line(
+def test_a_few_flipped_bytes_give_an_image_or_one_error_line(
     written: Path, tmp_path: Path, seed: int
 ) -> None:
     """Whatever the damage to a header: no other exception, no warning. A lie that is valid FITS stays one."""
@@ -428,7 +428,7 @@ def test_a_few_flipped_bytes_give_an_image_or_one_line(
 # Color and JSON
 
 
-def test_color_becomes_luminance_and_monochrome_stays() -> None:
+def test_color_becomes_luminance_and_monochrome_is_unchanged() -> None:
     gray = np.random.default_rng(2).integers(0, 65535, (5, 7), np.uint16)
     np.testing.assert_array_equal(images.monochrome(gray), gray)
     np.testing.assert_array_equal(images.monochrome(gray[:, :, None]), gray)
@@ -442,12 +442,12 @@ def test_color_becomes_luminance_and_monochrome_stays() -> None:
 
 
 @pytest.mark.parametrize("shape", [(5,), (3, 20, 30), (4, 5, 2), (2, 2, 3, 3)])
-def test_a_shape_that_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
+def test_an_array_of_a_wrong_shape_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match=r"an image of shape .*; allowed: \(height, width\)"):
         images.monochrome(np.zeros(shape))
 
 
-def test_json_has_null_for_what_is_no_number() -> None:
+def test_json_writes_nan_and_infinity_as_null() -> None:
     data = {
         "a": float("nan"),
         "b": [np.float64("inf"), np.int64(3)],
@@ -456,7 +456,9 @@ def test_json_has_null_for_what_is_no_number() -> None:
     assert json.loads(files.to_json(data)) == {"a": None, "b": [None, 3], "c": [True, "x", None]}
 
 
-def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path: Path) -> None:
+def test_a_live_camera_s_frame_is_read_by_opencv_and_a_missing_one_is_reported(
+    tmp_path: Path,
+) -> None:
     """A video file stands for the camera: its first frame, to what JPEG leaves of it."""
     frame = np.zeros((48, 64, 3), np.uint8)
     frame[20:30, 30:40] = 200
@@ -473,7 +475,7 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
             images.grab_frame(nowhere)
 
 
-def test_a_yaml_file_is_read_anew_after_a_change_of_the_file_or_of_its_values(
+def test_a_yaml_file_is_read_again_after_a_change_of_file_or_values(
     tmp_path: Path,
 ) -> None:
     """Values are kept by the file's text, and every reader has its own."""

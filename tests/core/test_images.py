@@ -40,7 +40,7 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("key", "value", "told"),
+    ("key", "value", "message"),
     [
         ("ZNAXIS1", 75, "not a complete FITS file: "),  # malloc(): invalid size
         ("ZNAXIS2", 30, "not a complete FITS file: "),
@@ -49,19 +49,19 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
         ("ZNAXIS2", 2**31 - 1, "2147483647x80 pixels by its header"),
     ],
 )
-def test_a_wrong_size_of_a_compressed_image_is_one_line(
-    tmp_path: Path, key: str, value: int, told: str
+def test_a_wrong_size_of_a_compressed_image_is_refused_in_one_line(
+    tmp_path: Path, key: str, value: int, message: str
 ) -> None:
     path = tmp_path / "x.fits"
     path.write_bytes(with_value(compressed(), key, value))
-    with pytest.raises(InputError, match=re.escape(f"{path}: {told}")) as refusal:
+    with pytest.raises(InputError, match=re.escape(f"{path}: {message}")) as refusal:
         images.read_image(path)
     assert len(str(refusal.value).splitlines()) == 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("code", "told"),
+    ("code", "outcome"),
     [
         ("pass", ""),
         ("while True: pass", "it takes more than 1 s"),
@@ -71,9 +71,9 @@ def test_a_wrong_size_of_a_compressed_image_is_one_line(
         ("import os; os._exit(3)", "its reader exits with code 3"),
     ],
 )
-def test_a_guarded_script_has_limits(tmp_path: Path, code: str, told: str) -> None:
+def test_a_guarded_script_has_limits(tmp_path: Path, code: str, outcome: str) -> None:
     (tmp_path / "script.py").write_text(code)
-    assert guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29) == told
+    assert guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29) == outcome
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -95,5 +95,5 @@ def test_a_guarded_script_that_waits_is_ended(
 ) -> None:
     monkeypatch.setattr(guarded, "WALL_S", 0.5)
     (tmp_path / "script.py").write_text("import time; time.sleep(60)")
-    told = guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29)
-    assert told == "it takes longer than 0.5 s"
+    outcome = guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29)
+    assert outcome == "it takes longer than 0.5 s"

@@ -65,7 +65,7 @@ def complaint(path: Path) -> str:
 @pytest.mark.parametrize("orientation", [None, *range(1, 9), 9])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize("color", [False, True], ids=["gray", "color"])
-def test_a_picture_is_seen_as_pillow_shows_it(
+def test_an_image_is_read_upright_like_pillow(
     tmp_path: Path, suffix: str, orientation: int | None, color: bool
 ) -> None:
     """OpenCV leaves JPEG and PNG as stored and turns TIFF; Pillow's `exif_transpose` is another implementation."""
@@ -85,7 +85,7 @@ def test_a_picture_is_seen_as_pillow_shows_it(
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_upright_undoes_what_the_tag_says(orientation: int) -> None:
+def test_upright_undoes_the_orientation_tag(orientation: int) -> None:
     """Exif 2.32, Orientation: where the 0th row and the 0th column of the stored picture are in the seen one."""
     seen = np.arange(6).reshape(2, 3)
     stored = {
@@ -139,13 +139,13 @@ def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) 
         (exif_block("<", first=2**32 - 1), encoded.Exif()),
     ],
 )
-def test_a_damaged_exif_block_tells_nothing(block: bytes, expected: encoded.Exif) -> None:
+def test_a_damaged_exif_block_is_ignored(block: bytes, expected: encoded.Exif) -> None:
     assert encoded.read_exif_block(block) == expected
     for end in range(len(block)):
         encoded.read_exif_block(block[:end])
 
 
-def test_an_exif_block_that_lies_leaves_the_picture(tmp_path: Path) -> None:
+def test_a_wrong_exif_block_does_not_prevent_reading(tmp_path: Path) -> None:
     """65,535 entries that all point to one another take no time and no memory: only two tags are followed."""
     data = bytearray(with_exif(tmp_path / "x.png", GRAY, 6).read_bytes())
     at = data.index(b"eXIf") + 4
@@ -155,7 +155,7 @@ def test_an_exif_block_that_lies_leaves_the_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_pillow_does_not_talk_past_us_of_damaged_exif(tmp_path: Path) -> None:
+def test_pillow_prints_no_warning_about_damaged_exif(tmp_path: Path) -> None:
     """A text of 4,000 characters in a block of a hundred."""
     data = bytearray(with_exif(tmp_path / "x.jpg", GRAY, 6, 26).read_bytes())
     at = (
@@ -180,7 +180,7 @@ def fits_file(path: Path, pixels: NDArray, **cards: Any) -> Path:
     return path
 
 
-def test_the_last_row_is_the_highest_unless_the_header_says_otherwise(tmp_path: Path) -> None:
+def test_the_last_row_is_the_top_by_default(tmp_path: Path) -> None:
     """FITS standard 4.0, section 3.3.1 and the pictures of every viewer; ROWORDER is Siril's and N.I.N.A.'s keyword."""
     for n, (order, highest_first, known) in enumerate(
         [
@@ -223,7 +223,7 @@ def test_a_file_of_tiles_is_read_with_its_header(tmp_path: Path, packed: bool) -
 
 
 @pytest.mark.parametrize("kind", ["i2", "u2", "i4", "f4", "f8", "u1"])
-def test_color_cubes_of_both_kinds_are_one_picture(tmp_path: Path, kind: str) -> None:
+def test_color_cubes_of_both_axis_orders_give_the_same_image(tmp_path: Path, kind: str) -> None:
     """Red first; ITU-R BT.601: .299 R + .587 G + .114 B."""
     rgb = np.random.default_rng(1).integers(0, 250, (6, 9, 3)).astype(kind)
     expected = rgb @ [0.299, 0.587, 0.114]
@@ -237,17 +237,17 @@ def test_color_cubes_of_both_kinds_are_one_picture(tmp_path: Path, kind: str) ->
         )
 
 
-def test_a_cube_of_one_plane_is_a_picture_and_of_many_is_refused_by_its_shape(
+def test_a_cube_of_one_plane_is_an_image_and_one_of_many_is_refused(
     tmp_path: Path,
 ) -> None:
     path = fits_file(tmp_path / "one.fits", FRAME[None, None], ROWORDER="TOP-DOWN")
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
     for shape in ((12, 6, 9), (2, 6, 9), (3, 2, 6, 9), (5,)):
         path = fits_file(tmp_path / f"{len(shape)}_{shape[0]}.fits", np.zeros(shape, np.int16))
-        told = re.escape(
+        message = re.escape(
             f"a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)"
         )
-        assert re.search(told, complaint(path))
+        assert re.search(message, complaint(path))
 
 
 # What hostile files promise
@@ -268,7 +268,7 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
-def test_a_truncated_gzipped_file_is_one_line(tmp_path: Path, share: float) -> None:
+def test_a_truncated_gzipped_file_is_refused_in_one_line(tmp_path: Path, share: float) -> None:
     data = gzip.compress(
         fits_file(tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)).read_bytes()
     )
@@ -280,7 +280,7 @@ def test_a_truncated_gzipped_file_is_one_line(tmp_path: Path, share: float) -> N
 @pytest.mark.parametrize(
     "data", [b"once upon a time", gzip.compress(b"once upon a time", mtime=0), bytes(99)]
 )
-def test_what_is_no_gzipped_fits_file_is_one_line(tmp_path: Path, data: bytes) -> None:
+def test_an_invalid_gzipped_fits_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data)
     assert re.search("not a complete (gzip|FITS) file", complaint(path))
@@ -333,7 +333,7 @@ def test_color_planes_of_a_tiff_are_read_right_or_refused_by_name(
         np.testing.assert_array_equal(images.read_picture(path).pixels, rgb[:, :, ::-1])
 
 
-def test_a_gray_tiff_may_say_what_it_likes_of_planes(tmp_path: Path) -> None:
+def test_a_gray_tiff_is_read_with_any_planar_configuration(tmp_path: Path) -> None:
     Image.fromarray(FRAME).save(tmp_path / "x.tif")
     data = (tmp_path / "x.tif").read_bytes()
     entry = struct.pack("<HHIH", 284, 3, 1, 1)

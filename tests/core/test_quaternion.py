@@ -16,7 +16,7 @@ def wxyz(turn: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_rotation_vectors_go_there_and_back(turn: list[float]) -> None:
+def test_rotation_vectors_round_trip_through_quaternions(turn: list[float]) -> None:
     made = quaternion.from_rotvec(np.array(turn, float))
     same = Rotation.from_rotvec(turn)
     assert (Rotation.from_quat(made, scalar_first=True).inv() * same).magnitude() < 1e-15
@@ -26,7 +26,7 @@ def test_rotation_vectors_go_there_and_back(turn: list[float]) -> None:
 
 @pytest.mark.parametrize("one", TURNS)
 @pytest.mark.parametrize("two", TURNS)
-def test_products_and_turned_vectors_are_scipys(one: list[float], two: list[float]) -> None:
+def test_products_and_rotated_vectors_match_scipy(one: list[float], two: list[float]) -> None:
     a = Rotation.from_rotvec(one)
     b = Rotation.from_rotvec(two)
     product = quaternion.multiply(wxyz(one), quaternion.inverse(wxyz(two)))
@@ -40,7 +40,7 @@ def test_products_and_turned_vectors_are_scipys(one: list[float], two: list[floa
     np.testing.assert_allclose(quaternion.to_matrix(wxyz(one)), a.as_matrix(), rtol=0, atol=1e-15)
 
 
-def test_cross_is_numpys() -> None:
+def test_the_cross_product_matches_numpy() -> None:
     a = np.array([1.0, -2.0, 0.5])
     b = np.array([0.3, 4.0, -7.0])
     np.testing.assert_array_equal(quaternion.cross(a, b), np.cross(a, b))

@@ -37,7 +37,7 @@ UNKNOWN = (
 
 
 @pytest.mark.parametrize("text", DATES + UNKNOWN)
-def test_terrestrial_time_is_astropys(text: str) -> None:
+def test_terrestrial_time_matches_astropy(text: str) -> None:
     date = datetime.datetime.fromisoformat(text)
     theirs = astropy_time(text)
     with warnings.catch_warnings():
@@ -59,7 +59,7 @@ def test_dynamical_time_differs_from_tt_by_less_than_two_milliseconds() -> None:
     assert 1.5e-3 < np.abs(tdb_minus_tt_s).max() < 2e-3
 
 
-def test_leap_seconds_are_those_of_the_iers() -> None:
+def test_leap_seconds_match_the_iers() -> None:
     for date, seconds in {
         "1972-01-01": 10,
         "1999-01-01": 32,
@@ -70,7 +70,7 @@ def test_leap_seconds_are_those_of_the_iers() -> None:
         assert time.tai_minus_utc_s(datetime.datetime.fromisoformat(date)) == seconds
 
 
-def test_the_earths_rotation_is_astropys_within_the_table_of_the_iers() -> None:
+def test_the_earths_rotation_matches_astropy_within_the_iers_table() -> None:
     with iers.earth_orientation_table.set(iers.IERS_B.open()):
         for text in (
             "1972-08-01T06:00:00",
@@ -87,7 +87,7 @@ def test_the_earths_rotation_is_astropys_within_the_table_of_the_iers() -> None:
         assert time.ut1_jd(date) == time.utc_jd(date)
 
 
-def test_epochs_are_erfas() -> None:
+def test_epochs_match_erfa() -> None:
     assert (time.J2000_JD, time.MJD_ZERO_JD) == (erfa.DJ00, erfa.DJM0)
     assert Time(time.J2000, scale="tt").jd == time.J2000_JD
     assert (
@@ -96,7 +96,7 @@ def test_epochs_are_erfas() -> None:
     ) == pytest.approx((time.TT_MINUS_TAI_S, -time.GPS_MINUS_TAI_S), abs=1e-9)
 
 
-def test_the_estimators_epochs_are_erfas_and_its_leap_seconds_todays() -> None:
+def test_the_estimators_epochs_match_erfa_and_its_leap_seconds_are_current() -> None:
     assert (believed.J2000, believed.J2000_JD) == (time.J2000, erfa.DJ00)
     assert (
         pytest.approx(time.tt_minus_utc_s(datetime.datetime(2026, 1, 1)), abs=1e-12)
@@ -104,7 +104,7 @@ def test_the_estimators_epochs_are_erfas_and_its_leap_seconds_todays() -> None:
     )
 
 
-def test_time_zones_and_naive_times_are_one() -> None:
+def test_naive_times_equal_utc_times() -> None:
     naive = datetime.datetime(2024, 2, 29, 12)
     zoned = datetime.datetime(
         2024, 2, 29, 17, 30, tzinfo=datetime.timezone(datetime.timedelta(hours=5.5))

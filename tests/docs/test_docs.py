@@ -27,7 +27,7 @@ def commands(page: str = DOME) -> list[list[str]]:
     ]
 
 
-def test_the_page_s_commands_are_of_this_project() -> None:
+def test_the_page_s_commands_exist_in_this_project() -> None:
     starts = [" ".join(words[:3]) for words in commands()]
     assert len(starts) >= 4
     for words in commands():
@@ -51,7 +51,7 @@ def test_the_page_s_tables_can_be_printed(words: list[str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", TABLES, ids=" ".join)
-def test_a_tenth_of_the_page_s_trials_prints_as_many_rows(words: list[str]) -> None:
+def test_a_tenth_of_the_page_s_trials_prints_the_same_number_of_rows(words: list[str]) -> None:
     """Numbers are the business of the modules' own tests."""
     trials = int(words[words.index(COUNT) + 1]) // 10
     assert len(printed_with(words, trials)) == len(printed_with(words, 2))
@@ -90,7 +90,7 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", [words for words in commands() if words[0] == "skysim"], ids=" ".join
 )
-def test_the_page_s_skysim_commands_are_understood(words: list[str]) -> None:
+def test_the_page_s_skysim_commands_parse(words: list[str]) -> None:
     """Their options are: the run itself is `test_measure.py`'s."""
     done = subprocess.run(
         [sys.executable, "-m", "skysim", words[1], "--help"],
@@ -102,7 +102,7 @@ def test_the_page_s_skysim_commands_are_understood(words: list[str]) -> None:
     assert [word for word in words if word.startswith("--") and word not in done.stdout] == []
 
 
-def test_the_page_s_surveys_are_tests() -> None:
+def test_the_page_s_surveys_are_run_by_tests() -> None:
     for words in commands():
         if words[0] == "pytest":
             assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(encoding="utf-8")
@@ -114,13 +114,13 @@ STUDIES = (ROOT / "docs/findings/studies.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.long
-def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
+def test_every_shipped_study_has_a_page_and_a_command() -> None:
     shipped = {path.stem for path in plan.STUDIES.glob("*.yaml")}
-    told = re.findall(
+    listed = re.findall(
         r"\[(\w+)\]\(studies/(\w+)\.md\) \| `skysim study (run|optimize) (\w+)`", STUDIES
     )
-    assert {name for name, page, _, command in told if name == page == command} == shipped
-    for name, _, verb, _ in told:
+    assert {name for name, page, _, command in listed if name == page == command} == shipped
+    for name, _, verb, _ in listed:
         assert (verb == "optimize") == (study_file.load(name).study.optimize is not None)
 
 
@@ -129,13 +129,13 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
 )
 def test_a_study_s_page_answers_with_one_figure_and_one_table(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    told = study_file.load(path.stem)
-    assert text.startswith(f"# {told.study.title}\n")
-    assert text.endswith(f", seed {told.study.seed}\n")
+    study_plan = study_file.load(path.stem)
+    assert text.startswith(f"# {study_plan.study.title}\n")
+    assert text.endswith(f", seed {study_plan.study.seed}\n")
     counted = re.search(r"N: .*?, ([\d,]+) in all, none failed", text)
     assert counted is not None
-    if told.study.optimize is None:
-        assert int(counted[1].replace(",", "")) == told.trials
+    if study_plan.study.optimize is None:
+        assert int(counted[1].replace(",", "")) == study_plan.trials
     pictures = re.findall(r"!\[[^]]*\]\((\w+\.png)\)", text)
     assert len(pictures) <= 1
     assert all((path.parent / name).is_file() for name in pictures)

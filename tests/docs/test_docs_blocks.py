@@ -111,7 +111,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # a reader sees them too
 @pytest.mark.parametrize("name", walked())
-def test_a_page_s_blocks_run_in_their_order(
+def test_a_page_s_blocks_run_in_order(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in NEEDS:
@@ -136,10 +136,10 @@ def test_a_page_s_blocks_run_in_their_order(
         elif block.language == "sh":
             printed = "".join(ran(line) for line in block.text.splitlines() if line)
         elif block.language == "text" and printed:
-            told = {shape(line) for line in printed.splitlines()}
-            assert [line for line in block.text.splitlines() if shape(line) not in told] == [], (
-                printed
-            )
+            printed_shapes = {shape(line) for line in printed.splitlines()}
+            assert [
+                line for line in block.text.splitlines() if shape(line) not in printed_shapes
+            ] == [], printed
         if block.language != "sh":
             printed = ""
     commands = "\n".join(
@@ -159,7 +159,7 @@ def ran(line: str) -> str:
         done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return ""
-    assert program == "skysim", f"{line}: a command of somebody else's belongs in a `text` block"
+    assert program == "skysim", f"{line}: another program's command belongs in a `text` block"
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         assert not main.app(words, standalone_mode=False), line
@@ -178,18 +178,18 @@ def shape(line: str) -> str:
 
 
 @pytest.mark.parametrize("path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_every_block_says_what_it_is(path: Path) -> None:
+def test_every_block_states_its_language(path: Path) -> None:
     """So that what is not run is seen to be: a `text` block, never an unknown language."""
     assert [block for block in blocks(path) if block.language not in LANGUAGES] == []
     assert path.read_text(encoding="utf-8").count("```") == 2 * len(blocks(path)) + 0
 
 
-def test_a_page_that_is_run_elsewhere_is_read_there() -> None:
+def test_a_page_run_by_another_test_is_read_by_it() -> None:
     for page, test in ELSEWHERE.items():
         assert page in (ROOT / "tests" / test).read_text(encoding="utf-8"), page
 
 
-def test_the_study_pages_show_commands_that_are_there() -> None:
+def test_the_study_pages_show_existing_commands() -> None:
     """Written by `make studies`, one command each."""
     for path in sorted((DOCS / "findings/studies").glob("*.md")):
         (only,) = blocks(path)
@@ -212,7 +212,7 @@ Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda *_: None)
 SITE = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
 
 
-def test_every_page_has_its_place_in_the_site() -> None:
+def test_every_page_is_in_the_site_s_navigation() -> None:
     there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
     there |= {
         path.relative_to(DOCS).with_suffix(".md").as_posix()
@@ -223,7 +223,7 @@ def test_every_page_has_its_place_in_the_site() -> None:
     assert all((ROOT / name.removeprefix("source/")).is_file() for name in outside)
 
 
-def test_what_the_reference_names_is_a_module() -> None:
+def test_every_name_in_the_reference_is_a_module() -> None:
     named = [
         name
         for path in (DOCS / "reference").glob("*.md")
@@ -265,7 +265,7 @@ def test_the_reference_holds_every_module_that_a_page_names() -> None:
     assert sorted(named - set(re.findall(r"^::: (\S+)$", reference, re.M))) == []
 
 
-def test_every_link_of_a_page_leads_somewhere() -> None:
+def test_every_link_of_a_page_has_an_existing_target() -> None:
     for path in DOCS.rglob("*.md"):
         links = re.findall(r"\]\(([^)#\s:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8"))
         assert [link for link in links if not (path.parent / link).exists()] == [], path

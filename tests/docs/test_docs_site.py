@@ -45,11 +45,11 @@ SECTIONS = dict(
 
 def helped(*words: str) -> str:
     """What --help prints, on a terminal wide enough."""
-    told = CliRunner().invoke(
+    result = CliRunner().invoke(
         main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
     )
-    assert told.exit_code == 0, told.output
-    return re.sub(r"\x1b\[[0-9;]*m", "", told.output)
+    assert result.exit_code == 0, result.output
+    return re.sub(r"\x1b\[[0-9;]*m", "", result.output)
 
 
 @pytest.mark.slow
@@ -58,8 +58,10 @@ def test_every_command_that_help_names_has_its_section() -> None:
         name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS
     }
     assert len(shown[""]) >= 15
-    told = {f"{name} {below}".strip() for name, all_below in shown.items() for below in all_below}
-    assert told | {""} == set(SECTIONS)
+    named_commands = {
+        f"{name} {below}".strip() for name, all_below in shown.items() for below in all_below
+    }
+    assert named_commands | {""} == set(SECTIONS)
 
 
 @pytest.mark.slow
@@ -74,7 +76,7 @@ def test_a_section_has_the_options_that_help_shows(name: str) -> None:
     assert [what for what, meaning in rows.items() if not re.match(r"\w", meaning)] == []
 
 
-def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
+def test_a_key_s_row_states_its_type_and_default() -> None:
     exposure = keys.table(ExposureConfig)
     survey = keys.table(SurveyErrorsConfig)
     assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
@@ -173,10 +175,10 @@ def test_the_site_s_search_needs_no_server(tmp_path: Path) -> None:
     assert re.search(r"md-search-result__meta\">[0-9]+ matching documents", done.stdout)
 
 
-def test_what_a_page_tells_to_make_is_a_target() -> None:
+def test_every_make_target_named_by_a_page_exists() -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     pages += (ROOT / ".github").rglob("*.md")
-    told = {
+    named_targets = {
         name
         for path in pages
         for name in re.findall(
@@ -184,22 +186,22 @@ def test_what_a_page_tells_to_make_is_a_target() -> None:
         )
     }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert len(told) >= 10
-    assert told <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+    assert len(named_targets) >= 10
+    assert named_targets <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
 
 
 @pytest.mark.parametrize("name", ["run", "weekly"])
-def test_what_ci_makes_is_a_target(name: str) -> None:
+def test_every_make_target_of_ci_exists(name: str) -> None:
     """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
     script = ROOT / ".ci" / name
     subprocess.run(["bash", "-n", script], check=True)
     assert os.access(script, os.X_OK)
     text = script.read_text(encoding="utf-8")
-    told, parts = (
+    targets, parts = (
         re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ ")
     )
-    assert len(told) + len(parts) >= 4
-    assert {*told, *parts} <= set(
+    assert len(targets) + len(parts) >= 4
+    assert {*targets, *parts} <= set(
         re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     )
     pages = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -208,7 +210,7 @@ def test_what_ci_makes_is_a_target(name: str) -> None:
     ] == []
 
 
-def test_the_weekly_script_runs_every_part_and_tells_of_those_that_failed(tmp_path: Path) -> None:
+def test_the_weekly_script_runs_every_part_and_reports_failures(tmp_path: Path) -> None:
     """With a `make` that fails at the oracles."""
     (tmp_path / ".ci").mkdir()
     weekly = shutil.copy(ROOT / ".ci/weekly", tmp_path / ".ci/weekly")

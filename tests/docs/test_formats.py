@@ -34,10 +34,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
+def test_the_commands_write_the_table_s_files(folder: Path) -> None:
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    told = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
-    assert told <= left
+    expected = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
+    assert expected <= left
     assert {f"frame_000{n}.tif" for n in range(3)} <= left
     assert not [name for name in left if name.startswith(".")]
     named = set(re.findall(r"--to (\w+)", PAGE.partition("|---")[2]))
@@ -65,7 +65,7 @@ def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> No
     assert '"status": "solved"' in answers
 
 
-def test_a_new_run_takes_the_exports_of_the_old_one_away(tmp_path: Path) -> None:
+def test_a_new_run_removes_the_exports_of_the_old_one(tmp_path: Path) -> None:
     """They would speak of other frames."""
     mine = tmp_path / "notes.aem"
     for name in (*recording.EXPORT_FILES, "frame_0003.tif", mine.name):

@@ -19,7 +19,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def test_the_commands_leave_what_the_page_says(folder):
+def test_the_commands_write_the_page_s_files(folder):
     ran = {path.name for path in (folder / "out" / "short").iterdir()}
     frames = {f"frame_000{n}.{suffix}" for n in (0, 1) for suffix in ("fits", "png", "ecsv")}
     assert ran == frames | {"solutions.ecsv", "telemetry.ecsv", "annotated.png", "report.html"}

@@ -33,7 +33,7 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.mark.long
-def test_the_camera_block_is_a_camera_that_sees(folder):
+def test_the_camera_block_gives_solved_frames(folder):
     """The block's lines in a copy of the scene that the text names, flown for two frames by the real command."""
     block = pages.yaml_block(PAGE, "camera")
     tree = yaml.safe_load((ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8"))
@@ -44,17 +44,17 @@ def test_the_camera_block_is_a_camera_that_sees(folder):
     path.write_text(
         yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
     )
-    told = pages.answer(folder, "run", str(path), "--frames", "2")
-    assert (told["frames"], told["solved"], told["wrong"]) == (2, 2, 0)
+    report = pages.answer(folder, "run", str(path), "--frames", "2")
+    assert (report["frames"], report["solved"], report["wrong"]) == (2, 2, 0)
 
 
-def test_every_kind_that_the_camera_block_names_is_one():
+def test_the_camera_block_names_every_existing_kind():
     """`# or ...` beside a kind lists the others, all of them."""
     block = pages.yaml_block(PAGE, "camera")
     rest = re.findall(r"(\w+): \{kind: (\w+)[^#]*# or ([\w, ]+)", block)
-    told = {section: {kind, *others.split(", ")} for section, kind, others in rest}
+    named_kinds = {section: {kind, *others.split(", ")} for section, kind, others in rest}
     shutters = get_args(get_args(camera.Shutter)[0])
-    assert told == {
+    assert named_kinds == {
         "vignetting": set(VIGNETTING),
         "psf": set(PSFS),
         "shutter": {get_args(part.model_fields["kind"].annotation)[0] for part in shutters},
@@ -62,28 +62,28 @@ def test_every_kind_that_the_camera_block_names_is_one():
 
 
 @pytest.mark.long
-def test_the_dome_block_is_a_dome_under_which_the_tracker_finds_itself(folder):
+def test_the_dome_block_gives_solved_frames(folder):
     path = folder / "dome.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\n" + pages.yaml_block(PAGE, "light"))
-    told = pages.answer(folder, "run", str(path), "--frames", "3")
-    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
+    report = pages.answer(folder, "run", str(path), "--frames", "3")
+    assert (report["frames"], report["solved"], report["wrong"]) == (3, 3, 0)
 
 
 @pytest.mark.long
-def test_the_vehicle_block_flies_and_is_told_where_it_is(folder):
+def test_the_vehicle_block_flies_with_a_filtered_attitude(folder):
     """The block as a scene, two seconds of it by the real command: wheels, fans, gyros, filter, all disturbances."""
     path = folder / "flown.yaml"
     path.write_text("schema: 1\n" + pages.yaml_block(PAGE, "base"))
-    told = pages.answer(folder, "run", str(path), "--frames", "3")
-    assert (told["frames"], told["solved"], told["wrong"]) == (3, 3, 0)
-    assert told["flight"]["filter_arcsec_end"] < 30
-    assert [row["filter"] for row in told["rows"]] == ["used"] * 3
+    report = pages.answer(folder, "run", str(path), "--frames", "3")
+    assert (report["frames"], report["solved"], report["wrong"]) == (3, 3, 0)
+    assert report["flight"]["filter_arcsec_end"] < 30
+    assert [row["filter"] for row in report["rows"]] == ["used"] * 3
 
 
-def test_every_choice_that_the_vehicle_block_names_is_one():
+def test_the_vehicle_block_names_every_existing_choice():
     """`# or ...` beside a choice lists the others, all of them; and every kind of maneuver is shown."""
     block = pages.yaml_block(PAGE, "base")
-    told = {
+    named_choices = {
         key: {one, *others.split(", ")}
         for key, one, others in re.findall(r"(\w+): (\w+) +# or ([\w, ]+)", block)
     }
@@ -96,7 +96,7 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
         for key in keys
     }
     choices["law"] = {*motion.BUILT_IN_LAWS, motion.PRESCRIBED}
-    assert told == choices
+    assert named_choices == choices
     shown = {element["kind"] for element in yaml.safe_load(block)["motion"]["maneuver"]}
     kinds = {
         get_args(part.model_fields["kind"].annotation)[0]
@@ -106,7 +106,7 @@ def test_every_choice_that_the_vehicle_block_names_is_one():
 
 
 @pytest.mark.long
-def test_the_controller_of_the_page_damps(folder):
+def test_the_page_s_controller_damps_the_motion(folder):
     """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometers adds 0.1 deg or so."""
     (block,) = pages.blocks(PAGE, "python")
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
@@ -142,8 +142,8 @@ def test_every_kind_of_dome_is_in_the_reference():
 
 def test_every_section_of_a_scene_is_in_the_reference():
     section = pages.text(REFERENCE).partition("## Sections\n")[2].partition("\n## ")[0]
-    told = set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
-    assert told == set(Scene.model_fields) - {
+    named_sections = set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
+    assert named_sections == set(Scene.model_fields) - {
         "schema_version",
         "name",
         "title",

@@ -23,11 +23,11 @@ def test_the_commands_leave_a_report_and_a_table(folder):
     assert (folder / "out" / "led_count.csv").is_file()
 
 
-def test_the_study_block_is_a_study(folder):
+def test_the_study_block_loads_as_a_study(folder):
     path = folder / "lens.yaml"
     path.write_text(pages.yaml_block(PAGE, "trial"))
-    told = pages.answer(
+    report = pages.answer(
         folder, "study", "run", str(path), "--engine", "serial", "--set", "replicates=2"
     )
-    assert (told["done"], told["failed"], told["wrong"]) == (4 * 2 * 2 * 2, 0, 0)
+    assert (report["done"], report["failed"], report["wrong"]) == (4 * 2 * 2 * 2, 0, 0)
     assert (folder / "out" / "lens" / "report.html").is_file()

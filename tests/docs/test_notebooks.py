@@ -18,13 +18,13 @@ def cells(path) -> list[dict]:
     ]
 
 
-def test_there_are_two() -> None:
+def test_two_notebooks_are_shipped() -> None:
     assert [path.stem for path in NOTEBOOKS] == ["error_budget", "own_tracker"]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_every_cell_runs(path, monkeypatch) -> None:
+def test_every_cell_of_a_notebook_runs(path, monkeypatch) -> None:
     monkeypatch.setattr(matplotlib, "rcParams", matplotlib.rcParams.copy())
     matplotlib.use("agg")
     names: dict = {}

@@ -39,7 +39,7 @@ def lowest(failures: int, runs: int) -> float:
         ("AFIT, conclusion | below 1", 0, 5, "**54.9 %**"),
     ],
 )
-def test_bounds_of_success(begin, failures, runs, text):
+def test_bounds_of_success_in_papers_follow_from_their_trials(begin, failures, runs, text):
     assert text in row(begin)
     digits = len(text.strip("*% ").split(".")[1])
     assert float(text.strip("*% ")) == pytest.approx(
@@ -47,19 +47,19 @@ def test_bounds_of_success(begin, failures, runs, text):
     )
 
 
-def test_no_false_attitude_in_ten_thousand():
+def test_no_false_attitude_in_ten_thousand_bounds_its_probability():
     assert "(3.0e-4)" in row("PTASE, text")
     assert 1 - lowest(0, 10_000) == pytest.approx(3.0e-4, abs=0.05e-4)
 
 
-def test_runs_for_97_percent():
+def test_the_number_of_runs_for_97_percent_matches_the_papers():
     assert "99 runs without" in row("SHEFEX-2, conclusion")
     assert lowest(0, 99) >= 0.97 > lowest(0, 98)
     needed = next(n for n in range(1000, 3000) if scipy.stats.binom.cdf(30, n, 0.03) <= 0.05)
     assert f"{needed:,} with 30" in row("SHEFEX-2, conclusion")
 
 
-def test_means_of_gaussian_errors():
+def test_means_of_gaussian_errors_in_papers_follow_from_their_sigma():
     """The mean length of two Gaussian axes is sigma sqrt(pi / 2), the mean size of one is sigma sqrt(2 / pi)."""
     axis = 0.962 / math.sqrt(math.pi / 2)
     roll = 4.69 / math.sqrt(2 / math.pi)
@@ -72,5 +72,5 @@ def test_means_of_gaussian_errors():
     )
 
 
-def test_a_mapping_error_as_an_angle():
+def test_a_mapping_error_converts_to_an_angle():
     assert f"{math.degrees(2e-3 / (33 * 0.0254)):.2f}°" in row("AFIT, calibration")

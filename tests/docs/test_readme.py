@@ -52,7 +52,7 @@ def test_every_public_name_is_on_the_page_of_the_python_api():
 
 
 @pytest.mark.parametrize("page", [README, ARCHITECTURE])
-def test_every_link_leads_somewhere(page):
+def test_every_link_has_an_existing_target(page):
     assert pages.missing_links(page) == []
 
 

@@ -135,7 +135,7 @@ def test_wheels_turn_the_body_and_take_its_momentum(n):
     )
 
 
-def test_with_the_gyroscopic_torque_fed_forward_spinning_wheels_do_what_is_asked():
+def test_with_gyroscopic_feed_forward_spinning_wheels_give_the_commanded_torque():
     """The convention: ask for T + rate x (all momentum), and BUS d(rate)/dt = T; without it, not."""
     set_ = wheels(4, torque_limit_nm=5.0)
     speed = np.array([200.0, -50, 120, 10])
@@ -151,7 +151,7 @@ def test_with_the_gyroscopic_torque_fed_forward_spinning_wheels_do_what_is_asked
     assert np.linalg.norm(gyroscopic) > 0.5
 
 
-def test_four_wheels_share_a_torque_as_evenly_as_they_can():
+def test_four_wheels_share_a_torque_with_the_least_norm():
     """Of all motor torques that do it, the pseudo-inverse's are the smallest: none of the null vector in them."""
     set_ = wheels(4)
     motor = set_.drive(np.array([0.1, -0.05, 0.2]), np.zeros(4), 0.01)
@@ -182,7 +182,7 @@ def test_a_wheel_is_not_driven_beyond_its_speed(speed, wanted, motor):
 
 
 @pytest.mark.parametrize("angles_deg", [[0, 90], [0, 120, 240]])
-def test_what_level_wheels_cannot_do_is_left_out(angles_deg):
+def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
     """All axes in the plane of x and y: least squares gives the torque's part in the plane, and none about z."""
     a = np.radians(angles_deg)
     tilted = Rotation.from_rotvec([0.3, -0.2, 0.9])  # so that rounding has its say
@@ -211,7 +211,7 @@ def test_a_fan_pair_is_a_couple():
         np.testing.assert_array_equal(fans().torque(thrust), np.eye(3)[axis])
 
 
-def test_fans_make_the_torque_with_the_least_thrust():
+def test_fans_give_the_torque_with_the_least_thrust():
     set_ = fans()
     torque = np.array([0.1, -0.2, 0.05])
     thrust = set_.drive(torque)
@@ -234,7 +234,7 @@ SPEEDS = np.array([100.0, 80, -120, 95])
 
 
 @pytest.mark.slow
-def test_the_momentum_is_the_turned_rotors():
+def test_the_momentum_is_that_of_the_gimballed_rotors():
     set_ = pyramid_set()
     axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
     np.testing.assert_allclose(
@@ -273,7 +273,7 @@ def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [[0, 0, 0], [0.3, -0.2, 0.4]])
-def test_gyros_push_with_gimbal_rate_times_momentum(rate):
+def test_a_cmg_s_torque_is_gimbal_rate_times_momentum(rate):
     """On a body of its own: ask for T + rate x (all momentum), and BUS d(rate)/dt = T to 1e-6."""
     set_ = pyramid_set("pseudo_inverse")
     rate = np.array(rate)
@@ -292,7 +292,7 @@ def test_gyros_push_with_gimbal_rate_times_momentum(rate):
 
 
 @pytest.mark.slow
-def test_away_from_singularities_both_ways_of_steering_agree():
+def test_away_from_singularities_both_steering_laws_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
     plain, robust = (
@@ -302,7 +302,7 @@ def test_away_from_singularities_both_ways_of_steering_agree():
     assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()
 
 
-def test_the_robust_inverse_is_wie_s_at_any_time():
+def test_the_robust_inverse_matches_wie_s_formula_at_any_time():
     """A^T (A A^T + lambda E)^-1: E is 1 on the diagonal, e_i = 0.01 sin(pi t / 2 + phase_i) off it."""
     plain = interpreted("skysim.dynamics.multibody.cmgs")
     rng = np.random.default_rng(4)
@@ -337,7 +337,7 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
     assert np.linalg.norm(given) < 0.5 * np.linalg.norm(torque)
 
 
-def test_a_gyro_may_lie_at_any_angle():
+def test_a_cmg_may_have_any_skew_angle():
     """Gimbal and rotor at 45 deg between x and y: at right angles, though no product of their components is zero."""
     one = CmgSet(
         np.sqrt([[0.5], [0.5], [0.0]]),
@@ -361,7 +361,7 @@ def test_resting_rotors_are_not_gimballed(steering):
 # ---- the pyramid's singularities -------------------------------------------------------------------------------
 
 
-def test_the_pyramid_saturates_where_every_rotor_points_its_best():
+def test_the_pyramid_saturates_with_every_rotor_at_its_largest_projection():
     """A rotor's axle reaches within g's plane: at most sqrt(1 - g_x^2) along x. c, 1, c, 1: 2 + 2 c = 3.155."""
     set_ = pyramid_set()
     best = np.sqrt(1 - set_.gimbal_axes[0] ** 2).sum()
@@ -372,7 +372,7 @@ def test_the_pyramid_saturates_where_every_rotor_points_its_best():
 
 
 @pytest.mark.slow
-def test_in_a_singularity_the_pseudo_inverse_still_does_the_rest():
+def test_in_a_singularity_the_pseudo_inverse_gives_the_other_components():
     set_ = pyramid_set("pseudo_inverse")
     angles = np.radians([-90, 0, 90, 0])
     rate, _ = set_.drive(np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
@@ -394,7 +394,7 @@ def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.mark.slow
-def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
+def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
     """It keeps rotors 2 and 4 opposed; at (-90, 0, 90, 0) deg the others are spent: h_x = 2 c = 1.155 and no more."""
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
     reached = 2 * SLANT
@@ -412,7 +412,7 @@ def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
 
 
 @pytest.mark.slow
-def test_the_robust_inverse_passes_it_and_comes_to_saturation():
+def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturation():
     """The whole 2 + 2 c = 3.155 instead of 1.155, at bounded rates, for a stray momentum of a few per cent."""
     momentum, rates, angles = pushed_along_x(pyramid_set("singularity_robust"), 60)
     full = 2 + 2 * SLANT
@@ -470,7 +470,7 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
 
 
 @pytest.mark.slow
-def test_rotors_idle_where_gimbals_can():
+def test_rotors_keep_their_speed_where_gimbals_suffice():
     """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
     set_ = variable()
     torque = np.array([0.3, -0.2, 0.1])
@@ -483,7 +483,7 @@ def test_rotors_idle_where_gimbals_can():
 
 
 @pytest.mark.slow
-def test_variable_speed_gyros_do_as_asked_at_any_angle():
+def test_variable_speed_cmgs_give_the_commanded_torque_at_any_angle():
     """800 random attitudes of the gimbals: exact to rounding wherever nothing is at its limit."""
     set_ = variable(rotor_torque_limit_nm=5.0)
     rng = np.random.default_rng(4)
@@ -524,14 +524,14 @@ def test_rotors_at_rest_work_as_wheels():
 PART = DesaturationConfig.model_validate({"start": "1 N m s", "stop": "0.2 N m s", "time": "8 s"})
 
 
-def test_desaturation_has_its_hysteresis():
+def test_desaturation_starts_and_stops_at_different_thresholds():
     fan = Desaturator(PART)
     size = [0.5, 0.99, 1.01, 0.8, 0.21, 0.19, 0.5, 0.99, 1.5]
     running = [bool(fan.torque(np.array([0, -h, 0])).any()) for h in size]
     assert running == [False, False, True, True, True, False, False, False, True]
 
 
-def test_the_torque_is_the_momentum_over_the_time_against_it():
+def test_the_desaturation_torque_opposes_the_momentum_over_its_time():
     np.testing.assert_allclose(
         Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
     )
@@ -602,7 +602,7 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
         ),
     ],
 )
-def test_bad_sets_are_refused_in_one_line(make: Callable[[], object], says: str) -> None:
+def test_bad_actuator_sets_are_refused_in_one_line(make: Callable[[], object], says: str) -> None:
     with pytest.raises(InputError, match=says) as caught:
         make()
     assert "\n" not in str(caught.value)

@@ -29,13 +29,13 @@ SLEW = {"kind": "slew", "roll_deg": 20, "pitch_deg": -12, "yaw_deg": 90}
 SLEW |= {"rate_deg_s": 20, "acceleration_deg_s2": 15}
 
 
-def told(*elements: object) -> Reference:
+def planned(*elements: object) -> Reference:
     return plan(MotionConfig.model_validate({"control": "pid", "maneuver": elements}))
 
 
 def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
     """A controller that is to keep the attitude (0, 0, 0)."""
-    return build_controller(told(), inertia, ControlConfig.model_validate(part))
+    return build_controller(planned(), inertia, ControlConfig.model_validate(part))
 
 
 def closed(
@@ -74,7 +74,7 @@ def closed(
 # --- the law ------------------------------------------------------------------------------------------------
 
 
-def test_error_decays_by_the_placed_poles() -> None:
+def test_the_error_decays_with_the_placed_poles() -> None:
     """e''' + a2 e'' + a1 e' + a0 e = 0 from e, e' and no integral, by the exponential of its companion matrix.
 
     The feed-forward takes the gyroscopic torque away, so that about any axis of an uneven vehicle with spinning
@@ -89,7 +89,7 @@ def test_error_decays_by_the_placed_poles() -> None:
     np.testing.assert_allclose(rate, np.outer(expected[:, 1], axis), rtol=0, atol=1e-8)
 
 
-def test_poles_are_the_roots_of_what_the_gains_make() -> None:
+def test_the_poles_are_the_roots_of_the_characteristic_polynomial() -> None:
     """s^3 + kd s^2 + kp s + ki, of which pd has no last one and s^2 + 2 z b s + b^2 left."""
     pid = holding(**PLACED)
     pd = holding(**PLACED, law="pd")
@@ -97,7 +97,7 @@ def test_poles_are_the_roots_of_what_the_gains_make() -> None:
     np.testing.assert_allclose([1, pd.kd, pd.kp, pd.ki], [1, 2.8, 4.0, 0.0], rtol=1e-15, atol=0)
 
 
-def test_error_is_counted_by_the_shorter_way() -> None:
+def test_the_attitude_error_takes_the_shorter_way() -> None:
     """At 200 deg of yaw it is wrong by -160: the torque goes on in the positive sense."""
     law = holding(law="pd", **PLACED)
     torque = law.torque_nm(
@@ -133,7 +133,7 @@ def test_a_held_torque_is_late_by_half_a_period() -> None:
 
 
 @pytest.mark.parametrize("law", ["pd", "pid"])
-def test_what_a_constant_torque_leaves(law: str) -> None:
+def test_a_constant_torque_leaves_its_static_error(law: str) -> None:
     """pd: J^-1 T / b^2, at which the spring holds against it; pid: nothing."""
     push = np.array([0.3, -0.2, 0.1])
     there, rate = closed(
@@ -144,9 +144,9 @@ def test_what_a_constant_torque_leaves(law: str) -> None:
     np.testing.assert_allclose(rate[0], NONE, rtol=0, atol=1e-8)
 
 
-def test_feed_forward_is_eulers_equation() -> None:
+def test_the_feed_forward_torque_satisfies_eulers_equation() -> None:
     """On the reference itself the torque is J a + w x (J w + h), of a full inertia tensor and of stored momentum."""
-    tour = told(SLEW)
+    tour = planned(SLEW)
     lab_from_ref, rate, acceleration = tour.state_at(1.3)
     torque = build_controller(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
     expected = TENSOR @ acceleration + np.cross(rate, TENSOR @ rate + STORED)
@@ -155,9 +155,9 @@ def test_feed_forward_is_eulers_equation() -> None:
 
 
 @pytest.mark.slow
-def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
+def test_a_rigid_body_follows_the_reference_throughout_a_slew() -> None:
     """By the feed-forward alone: the error that feedback might amend never comes to be."""
-    tour = told(SLEW)
+    tour = planned(SLEW)
     t_s = np.linspace(0.5, tour.duration_s + 1, 15)
     there, _ = closed(build_controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
     error = (tour.attitudes(t_s).inv() * there).as_rotvec()
@@ -167,7 +167,7 @@ def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
 # --- anti-windup --------------------------------------------------------------------------------------------
 
 
-def test_integral_does_not_wind_up() -> None:
+def test_the_integral_does_not_wind_up_at_the_torque_limit() -> None:
     """Held off its target for a minute at full torque, it lets go at once when the target is crossed."""
     law = holding()
     away = quaternion.from_rotation(Rotation.from_rotvec([0.2, 0, 0]))
@@ -178,7 +178,7 @@ def test_integral_does_not_wind_up() -> None:
     assert np.abs(at_target).max() < 1e-9
 
 
-def test_integral_counts_on_every_axis_that_gets_what_it_wants() -> None:
+def test_the_integral_grows_on_every_axis_below_its_limit() -> None:
     """Half of what is wanted about x; all about y; about z a little less than all, as a steering law's rounding."""
     law = holding()
     wanted = law.torque_nm(
@@ -188,7 +188,7 @@ def test_integral_counts_on_every_axis_that_gets_what_it_wants() -> None:
     np.testing.assert_allclose(law.error_sum_rad_s, [0, 2e-3, 2e-3], rtol=1e-12, atol=0)
 
 
-def test_integral_lets_go_of_a_limit() -> None:
+def test_the_integral_leaves_the_limit_again() -> None:
     """Stuck at the positive limit for what it has summed up, with a positive error, which asks for less: it counts."""
     law = holding()
     law.error_sum_rad_s = np.array([-5.0, 0, 0])
@@ -204,12 +204,12 @@ def test_integral_lets_go_of_a_limit() -> None:
 
 
 @pytest.mark.parametrize(("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)])
-def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(
+def test_a_large_error_commands_at_most_a_rate_that_can_be_braked(
     fastest: float, expected: float
 ) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
     config = ControlConfig.model_validate(PLACED)
-    law = build_controller(told(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
+    law = build_controller(planned(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
     here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
     np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)
@@ -220,7 +220,7 @@ def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(
 
 
 @pytest.mark.slow
-def test_a_great_step_is_taken_without_swinging() -> None:
+def test_a_large_step_has_no_overshoot() -> None:
     """60 deg of yaw all at once with 1 N m on 9 kg m2: there in little more than the quickest, 2 sqrt(e J / T) = 6.1 s.
 
     It overshoots by less than half a degree, and comes to rest.

@@ -76,7 +76,7 @@ def test_gusts_have_their_rms_and_no_mean(gusts: Floats) -> None:
 
 
 @pytest.mark.parametrize("lag", [1, 3, 10, 30])
-def test_gusts_forget_themselves_with_their_correlation_time(gusts: Floats, lag: int) -> None:
+def test_gusts_decorrelate_with_their_correlation_time(gusts: Floats, lag: int) -> None:
     """exp(-lag / time) about each axis, nothing between axes; four sigma of Bartlett's formula for such a process."""
     a = math.exp(-PERIOD_S / 0.05)
     n = len(gusts)
@@ -89,7 +89,7 @@ def test_gusts_forget_themselves_with_their_correlation_time(gusts: Floats, lag:
     assert (np.abs(found - a**lag * np.eye(3)) < spread).all()
 
 
-def test_gusts_begin_as_they_go_on() -> None:
+def test_gusts_are_stationary_from_the_start() -> None:
     """The first torque of 4,000 flights has the rms already: 4 sigma of a variance, sqrt(2 / 4000)."""
     first = np.array(
         [AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample() for k in range(4000)]
@@ -100,7 +100,7 @@ def test_gusts_begin_as_they_go_on() -> None:
 
 
 @pytest.mark.slow
-def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
+def test_steady_wind_and_turbine_torques_are_along_the_lab_s_axes() -> None:
     """Turned by 90 deg of yaw, what twists about lab x twists about body -y."""
     config = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})
     times = np.arange(11) * 1e-3
@@ -145,7 +145,7 @@ def integrated(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stored", [NONE, np.array([1.5, -2.0, 3.0])])
-def test_a_free_vehicle_in_a_turning_lab(stored: Floats) -> None:
+def test_motion_in_a_rotating_lab_equals_inertial_motion_seen_from_it(stored: Floats) -> None:
     """Integrated among the stars, where no torque acts, and seen from the lab; and in the lab with the extra torque.
 
     A vehicle with rotors at constant speed, on an Earth that turns in two minutes: the law knows no small numbers,
@@ -244,7 +244,7 @@ def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
+def test_a_knock_gives_the_declared_rate_about_each_axis(axis: int) -> None:
     rate = (5.0 * np.eye(3)[axis]).tolist()
     motion = flown(
         0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]'
@@ -252,7 +252,7 @@ def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
     np.testing.assert_allclose(np.degrees(motion.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
 
 
-def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
+def test_a_caught_vehicle_is_at_rest_at_another_attitude() -> None:
     """Turned by rate times the time between the knocks: 14.5 deg/s for 0.2 s, 2.9 deg."""
     motion = flown(
         0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE
@@ -265,7 +265,7 @@ def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
 # --- quiet --------------------------------------------------------------------------------------------------
 
 
-def test_a_room_is_quiet_where_nothing_is_switched_on() -> None:
+def test_a_room_is_quiet_if_nothing_is_switched_on() -> None:
     earth = np.array([0.0, 0.0, 7e-5])
     knock = Impulse(1.0, 0.1, np.array([0.1, 0, 0]))
     assert room().inactive
@@ -282,7 +282,7 @@ def test_a_room_is_quiet_where_nothing_is_switched_on() -> None:
     ).inactive  # it is MuJoCo's
 
 
-def test_a_quiet_room_gives_nothing() -> None:
+def test_a_room_without_disturbances_gives_no_torque() -> None:
     torque = room().torque_nm(
         np.arange(11) * 1e-3, quaternion.from_rotation(Rotation.identity()), np.ones(3), np.ones(3)
     )

@@ -69,7 +69,7 @@ def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Simulation
     )
 
 
-def told(flight_computer: FlightComputer, flight: multibody.Simulation) -> Floats:
+def present_controls(flight_computer: FlightComputer, flight: multibody.Simulation) -> Floats:
     """(nu,) controls of the present tick."""
     stored = flight_computer.momentum_nms(flight.angles_rad, flight.speeds_rad_s)
     now = ControlInput(
@@ -101,7 +101,7 @@ def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
         ("cmgs of variable speed", 1e-2),
     ],
 )
-def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> None:
+def test_the_body_gets_the_commanded_torque(name: str, within: float) -> None:
     """The body's momentum over twenty ticks, once fans and gimbals have followed: it changes by the wanted T t.
 
     In axes that stand still. Fans and the servos of gimbals are late, by less and less; and a servo gives way to what
@@ -115,7 +115,7 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
     for _ in range(40):
         turn = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True)
         held.append(turn.apply(inertia @ flight.rate_body_rad_s))
-        flight.advance(np.tile(told(flight_computer, flight), (10, 1)))
+        flight.advance(np.tile(present_controls(flight_computer, flight), (10, 1)))
     torque = (held[-1] - held[-21]) / 0.2
     turned_by = Rotation.from_quat(flight.lab_from_body_wxyz, scalar_first=True).magnitude()
     assert np.linalg.norm(torque - wanted) < (within + turned_by) * np.linalg.norm(wanted)
@@ -123,19 +123,19 @@ def test_the_body_gets_the_torque_that_was_wanted(name: str, within: float) -> N
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_what_it_says_is_given_is_given(name: str) -> None:
+def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
     """With all that is wanted within the limits, the controller hears that it got it."""
     flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
     flight_computer.law = law  # type: ignore[assignment]
-    told(flight_computer, flight)
+    present_controls(flight_computer, flight)
     ((wanted, given),) = law.given
     np.testing.assert_array_equal(wanted, flight_computer.control_torque_nm)
     np.testing.assert_allclose(given, wanted, rtol=0, atol=1e-3 * np.linalg.norm(wanted))
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_limits_are_known_to_the_anti_windup(name: str) -> None:
+def test_the_anti_windup_uses_the_actuator_limits(name: str) -> None:
     """Turning at 0.5 rad/s: far more is wanted about x than any set can give, and the integral stands still.
 
     Ideal torques have a limit for each axis, the other sets one for all, beyond which the direction is kept.
@@ -143,7 +143,7 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
     flight_computer, flight = manned(name)
     flight.states[0, 1:5] = quaternion.from_rotation(Rotation.from_rotvec([1e-4, 1e-4, 0.0]))
     flight.rate_body_rad_s[:] = [0.5, 0, 0]
-    control = told(flight_computer, flight)
+    control = present_controls(flight_computer, flight)
     vehicle = flight.vehicle
     motors = {
         "ideal": vehicle.torques,
@@ -161,13 +161,15 @@ def test_limits_are_known_to_the_anti_windup(name: str) -> None:
     )
 
 
-def test_controls_of_nobody_are_zeros() -> None:
+def test_without_a_controller_the_controls_are_zero() -> None:
     flight_computer, flight = manned("wheels", **{"motion.control": "none"})
-    np.testing.assert_array_equal(told(flight_computer, flight), np.zeros(flight.model.nu))
+    np.testing.assert_array_equal(
+        present_controls(flight_computer, flight), np.zeros(flight.model.nu)
+    )
     np.testing.assert_array_equal(flight_computer.control_torque_nm, np.zeros(3))
 
 
-def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
+def test_a_constant_torque_leaves_no_error_with_cmgs() -> None:
     """The steering law damps singularities and gives a little less than is wanted: no reason to stop the integral.
 
     0.05 mm out of balance; a PD controller of 3 rad/s would be left 0.042 deg off. Gimbals at 75 deg are half-way to a
@@ -191,7 +193,7 @@ def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
 
 
 @pytest.mark.parametrize("name", ["wheels", "cmgs", "cmgs of variable speed"])
-def test_momentum_is_mujocos_own(name: str) -> None:
+def test_stored_momentum_matches_mujoco(name: str) -> None:
     """`mj_subtreeVel` of a body at rest in any attitude, its gimbals at any angle, its rotors at any speed."""
     flight_computer, flight = manned(name)
     vehicle = flight.vehicle
@@ -212,7 +214,7 @@ def test_momentum_is_mujocos_own(name: str) -> None:
 
 
 @pytest.mark.parametrize("control", ["none", "{law: pid, actuators: ideal}"])
-def test_momentum_is_in_the_telemetry_whether_somebody_flies_or_not(control: str) -> None:
+def test_momentum_is_in_the_telemetry_with_and_without_a_controller(control: str) -> None:
     """Wheels without friction keep what they had, 0.010125 kg m2 at 300, -500 and 800 rpm."""
     changes = (
         FREE
@@ -243,7 +245,7 @@ def relieved() -> Telemetry:
     return simulate_motion(loader.load("simsat_slew", changes)).telemetry()
 
 
-def test_desaturation_follows_the_fans_lag(relieved: Telemetry) -> None:
+def test_desaturation_compensates_the_lag_of_the_fans(relieved: Telemetry) -> None:
     """dh/dt = T, dT/dt = (-h / time - T) / lag: the wheels hold against the fans' torque, and slow down."""
     h0 = 0.010125 * 1800 * math.pi / 30
     run = solve_ivp(
@@ -254,11 +256,11 @@ def test_desaturation_follows_the_fans_lag(relieved: Telemetry) -> None:
     np.testing.assert_allclose(held, run.sol(t_s)[0], rtol=2e-3, atol=0)
 
 
-def test_desaturation_ends_below_its_stop_and_the_vehicle_stays_where_it_is(
+def test_desaturation_ends_below_its_threshold_and_keeps_the_attitude(
     relieved: Telemetry,
 ) -> None:
     size = np.linalg.norm(relieved.momentum_nms, axis=1)
     assert size[0] > 1.7
     assert 0.7 < size[-1] < 0.8
-    assert np.ptp(size[relieved.t_s > 7]) < 1e-3  # nobody takes any more
+    assert np.ptp(size[relieved.t_s > 7]) < 1e-3  # no stored momentum left to remove
     assert np.degrees(relieved.lab_from_body.magnitude()).max() < 0.02

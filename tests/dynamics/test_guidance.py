@@ -50,14 +50,14 @@ def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str,
     return {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
 
 
-def told(*maneuver: object, **motion: object) -> MotionConfig:
+def motion_config(*maneuver: object, **motion: object) -> MotionConfig:
     return MotionConfig.model_validate(
         {"control": "pid", "maneuver": maneuver, "start": START} | motion
     )
 
 
 def reference(*maneuver: object, **motion: object) -> Reference:
-    return plan(told(*maneuver, **motion))
+    return plan(motion_config(*maneuver, **motion))
 
 
 EVERY = {
@@ -185,13 +185,13 @@ def test_slew_goes_the_shorter_way_round() -> None:
     )
 
 
-def test_slew_to_where_it_stands_takes_no_time() -> None:
+def test_a_slew_to_the_present_attitude_takes_no_time() -> None:
     ref = reference(turn_to(0, 0, 0), HOLD, turn_to(0, 0, 0), start={})
     assert ref.duration_s == 2
     assert between(there(ref, 1.0), Rotation.identity()) == 0
 
 
-def test_step_jumps_and_asks_for_no_rate() -> None:
+def test_a_step_changes_attitude_at_once_with_zero_rate() -> None:
     ref = reference(HOLD, STEP, HOLD)
     assert between(there(ref, 2.0 - 1e-9), euler(3, -4, 170)) < 1e-15
     for t in (2.0, 3.0, 4.0, 1e3):
@@ -200,7 +200,7 @@ def test_step_jumps_and_asks_for_no_rate() -> None:
         np.testing.assert_array_equal(ref.state_at(t)[1:], np.zeros((2, 3)))
 
 
-def test_rate_is_the_exponential_of_the_time() -> None:
+def test_a_rate_element_rotates_by_the_exponential_of_rate_times_time() -> None:
     """lab_from_ref = start exp(w t) with the matrix exponential's series; from the first moment to long after."""
     ref = reference(RATE)
     w = np.radians([3, -5, 20])
@@ -306,7 +306,7 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
     )
 
 
-def test_envelope_has_the_derivatives_it_says() -> None:
+def test_the_envelope_has_its_stated_derivatives() -> None:
     t = np.random.default_rng(3).uniform(-0.5, 3.5, 300)
     h = 1e-5
     e, before, after = (np.array([envelope(s, 3.0, 0.7, 0.7) for s in t + d]) for d in (0, -h, h))
@@ -323,7 +323,7 @@ def test_envelope_has_the_derivatives_it_says() -> None:
 
 
 @pytest.mark.parametrize("element", [HOLD, SHAKE, BUMP, BUMP | {"caught_after": "1 s"}])
-def test_a_vehicle_that_is_shaken_or_knocked_is_told_to_hold(element: dict[str, object]) -> None:
+def test_during_jitter_and_bumps_the_reference_holds(element: dict[str, object]) -> None:
     ref = reference(turn_to(1, 2, 3), element)
     t = np.linspace(*ref.start_s[1:], 20)
     assert between(ref.attitudes(t), euler(1, 2, 3)).max() < 1e-14
@@ -339,7 +339,7 @@ def test_there_is_a_law_for_every_kind_of_element() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), list(itertools.product(EVERY, repeat=2)))
-def test_attitude_is_continuous_over_every_joint_but_a_steps(first: str, second: str) -> None:
+def test_attitude_is_continuous_between_all_elements_but_steps(first: str, second: str) -> None:
     later = [el for el in EVERY[second] if el["kind"] != "step"] or [HOLD]
     ref = reference(*EVERY[first], *later, HOLD)
     joints = ref.start_s[1:]
@@ -385,7 +385,7 @@ def test_a_vehicle_that_was_spun_up_keeps_spinning(kind: str) -> None:
         np.testing.assert_array_equal(ref.state_at(end + later)[2], np.zeros(3))
 
 
-def test_a_hold_after_a_rate_stops_it_at_once() -> None:
+def test_a_hold_after_a_rate_stops_at_once() -> None:
     ref = reference(RATE, HOLD)
     np.testing.assert_allclose(ref.state_at(4.0 - 1e-9)[1], np.radians([3, -5, 20]), rtol=1e-14)
     stopped = euler(*START.values()) * Rotation.from_rotvec(np.radians([12, -20, 80]))
@@ -406,7 +406,7 @@ def test_reference_holds_after_its_end_and_without_a_maneuver(tour: Reference) -
 
 def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
     """Whatever those are called: with the ICRS for lab, the angles are still counted from the start."""
-    motion = told(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
+    motion = motion_config(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
     lab_from_start = Rotation.from_rotvec([0.4, -1.0, 2.0])
     own = plan(motion)
     icrs = plan(motion, lab_from_start)
@@ -417,14 +417,14 @@ def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
     assert between(lab_from_start * own.attitudes(t), icrs.attitudes(t)).max() < 1e-14
 
 
-def test_a_given_start_of_a_vehicle_in_the_lab_moves_no_target() -> None:
-    ref = plan(told(turn_to(3, -5, 30)), euler(0, 0, 20))
+def test_the_start_of_a_vehicle_in_the_lab_does_not_move_its_targets() -> None:
+    ref = plan(motion_config(turn_to(3, -5, 30)), euler(0, 0, 20))
     assert between(there(ref, 0.0), euler(0, 0, 20)) < 1e-15
     assert between(there(ref, ref.duration_s), euler(3, -5, 30)) < 1e-14
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_reference_gives_unit_quaternions_of_its_own(name: str) -> None:
+def test_the_reference_returns_new_unit_quaternions(name: str) -> None:
     """A caller that writes into what it was given does not change what the next one is given."""
     ref = reference(*EVERY[name])
     for t in np.linspace(0, ref.duration_s + 1, 9):
@@ -438,7 +438,7 @@ def test_reference_gives_unit_quaternions_of_its_own(name: str) -> None:
             np.testing.assert_array_equal(again, first)
 
 
-def test_reference_is_quick_enough_for_every_control_tick() -> None:
+def test_the_reference_is_fast_enough_for_every_control_tick() -> None:
     """12 us; the best of some, for the machine has other things to do."""
     for name in EVERY:
         ref = reference(*EVERY[name])
@@ -470,7 +470,7 @@ def test_a_knock_is_a_half_sine_of_torque() -> None:
 
 
 def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None:
-    motion = told(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
+    motion = motion_config(HOLD, BUMP, SPIN, BUMP | {"caught_after": "80 ms"}, HOLD)
     first, second, third = impulses(motion, plan(motion))
     assert [k.begin_s for k in (first, second, third)] == pytest.approx(
         [2.0, 5.05, 5.13], abs=1e-12
@@ -481,15 +481,15 @@ def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None
     left = sum(k.fraction(5.0, 9.0) * k.rate_rad_s for k in (second, third))
     np.testing.assert_allclose(left, np.zeros(3), rtol=0, atol=1e-15)
     assert plan(motion).start_s[4] == pytest.approx(5.18, abs=1e-12)  # caught_after + duration
-    assert impulses(told(HOLD, SPIN), reference(HOLD, SPIN)) == ()
+    assert impulses(motion_config(HOLD, SPIN), reference(HOLD, SPIN)) == ()
 
 
-def test_vibration_sounds_while_its_element_lasts() -> None:
-    motion = told(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
+def test_vibration_lasts_as_long_as_its_element() -> None:
+    motion = motion_config(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
     (begin, end, parts), (later, last, _) = vibration_intervals(motion, plan(motion))
     assert (begin, end) == (2.0, 5.0)
     assert parts[0].frequency_hz == 30
     assert (later, last) == pytest.approx(
         (plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12
     )
-    assert vibration_intervals(told(HOLD, BUMP), reference(HOLD, BUMP)) == ()
+    assert vibration_intervals(motion_config(HOLD, BUMP), reference(HOLD, BUMP)) == ()

@@ -161,7 +161,7 @@ CONE = Cone()
 # --- the Earth
 
 
-def test_earth_rate_by_hand() -> None:
+def test_the_earth_rate_matches_a_hand_calculation() -> None:
     """sin and cos of 39.8 deg of 15.041 deg/h: 9.63 up, 11.56 north."""
     up_north_of = {
         90.0: (2, 1, 0),
@@ -177,7 +177,7 @@ def test_earth_rate_by_hand() -> None:
 
 @pytest.mark.parametrize("latitude", [-90.0, -33.0, 0.0, 39.8])
 @pytest.mark.parametrize("azimuth", [0.0, 37.0, 90.0, -120.0])
-def test_earth_turns_about_its_pole(latitude: float, azimuth: float) -> None:
+def test_the_earth_rate_is_along_the_pole(latitude: float, azimuth: float) -> None:
     """Lab axes made in the Earth's own frame, z to the pole: x, up and their product, at longitude 0."""
     phi = np.radians(latitude)
     a = np.radians(azimuth)
@@ -195,7 +195,7 @@ ATTITUDES = [Rotation.identity(), TILTED, Rotation.from_rotvec([1.0, 2.0, -0.5])
 
 @pytest.mark.slow
 @pytest.mark.parametrize("attitude", ATTITUDES)
-def test_uncompensated_earth_turns_a_still_vehicles_navigator(attitude: Rotation) -> None:
+def test_uncompensated_earth_rate_rotates_a_still_vehicle_s_navigator(attitude: Rotation) -> None:
     """An hour: 15.04 deg about the Earth's own axis, whatever the vehicle's attitude."""
     navigator = Navigator(wxyz(attitude))
     navigator.add(still(attitude, 3600.0, 0.1, EARTH))
@@ -207,7 +207,7 @@ def test_uncompensated_earth_turns_a_still_vehicles_navigator(attitude: Rotation
 
 @pytest.mark.slow
 @pytest.mark.parametrize("attitude", ATTITUDES)
-def test_compensated_earth_leaves_a_still_vehicle_where_it_is(attitude: Rotation) -> None:
+def test_compensated_earth_rate_keeps_a_still_vehicle_s_attitude(attitude: Rotation) -> None:
     navigator = Navigator(wxyz(attitude), EARTH)
     navigator.add(still(attitude, 3600.0, 0.1, EARTH))
     believed = Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True)
@@ -245,7 +245,7 @@ def test_the_thesiss_error_takes_minutes_of_uncompensated_earth() -> None:
 # --- what is felt
 
 
-def test_an_even_turn_is_counted_off_the_knots() -> None:
+def test_a_constant_rate_is_integrated_between_the_knots() -> None:
     rate = np.array([0.3, -0.2, 0.5])
     knots = np.arange(0, 0.101, 1e-3)
     attitude = TILTED * Rotation.from_rotvec(knots[:, None] * rate)
@@ -262,7 +262,7 @@ def test_an_even_turn_is_counted_off_the_knots() -> None:
     assert not got.saturated.any()
 
 
-def test_a_cone_is_counted_as_its_closed_form() -> None:
+def test_coning_motion_has_its_closed_form_increments() -> None:
     """Off by what a cubic leaves: 11/720 (w h)^4 of the rate, 6e-9, and less as the errors alternate."""
     knots = np.arange(0, 1.0005, 1e-3)
     ends = np.arange(1, 400) * STEP + 0.0004
@@ -296,7 +296,7 @@ def cone_by_quadrature(ends: Floats, earth: Floats) -> tuple[Floats, Floats]:
 @pytest.mark.parametrize(
     "earth", [np.zeros(3), EARTH, 1e4 * EARTH], ids=["space", "Earth", "a faster Earth"]
 )
-def test_a_cone_is_felt_as_by_quadrature(earth: Floats) -> None:
+def test_coning_increments_match_quadrature(earth: Floats) -> None:
     """An Earth ten thousand times faster shows what the lab's turning does to the force.
 
     The last end is in the last cell, whose one-sided cubic is off by 0.04 (w h)^4 = 1e-9 of the rate.
@@ -308,7 +308,7 @@ def test_a_cone_is_felt_as_by_quadrature(earth: Floats) -> None:
     np.testing.assert_allclose(got.velocity_m_s, velocity, rtol=0, atol=5e-9)
 
 
-def test_it_is_of_fourth_order_in_the_knots() -> None:
+def test_the_increments_are_of_fourth_order_in_the_knot_spacing() -> None:
     """Half the spacing, a sixteenth of the error; half a power is left to chance."""
     ends = np.array([0.0671, 0.12, 0.1333, 0.1499])
     errors = []
@@ -323,7 +323,7 @@ def test_it_is_of_fourth_order_in_the_knots() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 7])
-def test_few_knots_or_uneven_ones_serve(count: int) -> None:
+def test_few_or_uneven_knots_give_exact_increments(count: int) -> None:
     """A rate that is a polynomial of one degree less than the knots, three at most, is integrated exactly."""
     knots = np.array([0.0, 0.3, 0.45, 1.1, 1.2, 1.9, 2.0])[:count]
     degree = min(count, 4) - 1
@@ -340,7 +340,7 @@ def test_few_knots_or_uneven_ones_serve(count: int) -> None:
     )
 
 
-def test_a_flight_in_ticks_is_the_flight_at_once() -> None:
+def test_sampling_a_flight_tick_by_tick_equals_sampling_it_at_once() -> None:
     """Cells at the ends of a tick have one-sided cubics, 30/720 (w h)^4 of 7 rad/s apart: 1e-7 rad/s for 1 ms."""
     knots = np.arange(0, 501) * 1e-3
     ends = np.arange(1, 201) * STEP
@@ -353,7 +353,7 @@ def test_a_flight_in_ticks_is_the_flight_at_once() -> None:
         np.testing.assert_allclose(joined, getattr(whole, name), rtol=0, atol=bar)
 
 
-def test_a_jump_of_the_torque_costs_what_is_said() -> None:
+def test_a_jump_of_the_torque_has_the_stated_error() -> None:
     """Acceleration 2 rad/s2 sets in at a knot: the two cubics over the corner give h^2 / 12 of it too little."""
     knots = np.arange(0, 21) * 1e-3
     h = 1e-3
@@ -363,7 +363,7 @@ def test_a_jump_of_the_torque_costs_what_is_said() -> None:
     np.testing.assert_allclose(got.angle_rad[0, 2] - 2.0 * 0.01**2 / 2, -2.0 * h**2 / 12, rtol=1e-6)
 
 
-def test_at_rest_the_force_is_g_upwards() -> None:
+def test_at_rest_the_specific_force_is_g_upwards() -> None:
     for attitude in ATTITUDES:
         got = still(attitude, 2.0, 0.1, np.zeros(3))
         up_body = attitude.inv().apply([0, 0, 1])
@@ -373,7 +373,7 @@ def test_at_rest_the_force_is_g_upwards() -> None:
         np.testing.assert_array_equal(got.angle_rad, 0)
 
 
-def test_the_lever_feels_the_centripetal_force() -> None:
+def test_an_accelerometer_on_a_lever_measures_the_centripetal_force() -> None:
     """60 deg/s about z, 0.2 m off it: w^2 r = 0.219 m/s2 inwards, by hand."""
     knots = np.arange(0, 1.001, 1e-3)
     spin = np.tile([0, 0, np.radians(60)], (len(knots), 1))
@@ -382,7 +382,7 @@ def test_the_lever_feels_the_centripetal_force() -> None:
     np.testing.assert_allclose(got.velocity_m_s[0] / STEP, [-0.219325, 0, G], rtol=0, atol=1e-6)
 
 
-def test_the_lever_feels_the_angular_acceleration() -> None:
+def test_an_accelerometer_on_a_lever_measures_the_angular_acceleration() -> None:
     """1 rad/s2 about z from rest, 0.2 m out on x: 0.2 m/s2 along y."""
     knots = np.arange(0, 0.0105, 1e-3)
     spin = knots[:, None] * np.array([0.0, 0.0, 1.0])
@@ -402,7 +402,7 @@ def test_samples_outside_the_flight_are_refused(ends: list[float]) -> None:
         CONE.felt(np.arange(11) * 1e-3, np.array(ends), np.zeros(3))
 
 
-def test_one_knot_is_refused_and_no_sample_is_none() -> None:
+def test_one_knot_is_refused_and_no_samples_give_an_empty_result() -> None:
     with pytest.raises(InputError, match=r"^imu: 1 samples .* allowed: two or more$"):
         CONE.felt(np.zeros(1), np.array([0.0]), np.zeros(3))
     assert CONE.felt(np.arange(11) * 1e-3, np.zeros(0), np.zeros(3)).angle_rad.shape == (0, 3)
@@ -412,7 +412,7 @@ def test_one_knot_is_refused_and_no_sample_is_none() -> None:
 
 
 @pytest.mark.slow
-def test_all_off_is_exact() -> None:
+def test_without_errors_the_imu_is_exact() -> None:
     """Zero parameters leave every bit."""
     ideal = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
     got = Imu.from_config(part(), np.random.default_rng(1)).measure(ideal)
@@ -423,7 +423,7 @@ def test_all_off_is_exact() -> None:
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 400])
-def test_a_run_in_pieces_is_the_run_at_once(pieces: int) -> None:
+def test_measuring_in_pieces_equals_measuring_at_once(pieces: int) -> None:
     ideal = CONE.felt(np.arange(0, 3.0005, 1e-3), np.arange(1, 1201) * STEP, EARTH)
     whole = Imu.from_config(ImuConfig(), np.random.default_rng(5)).measure(ideal)
     again = Imu.from_config(ImuConfig(), np.random.default_rng(5))
@@ -444,7 +444,7 @@ def test_a_run_in_pieces_is_the_run_at_once(pieces: int) -> None:
         )
 
 
-def test_generator_and_hardware_are_two_things() -> None:
+def test_noise_and_hardware_errors_have_separate_seeds() -> None:
     """The same unit with other noise keeps its axes and turn-on bias; another unit with the same noise does not."""
     first = unit(scale_etc(), 200, 1)
     noisy = unit(scale_etc(), 200, 2)
@@ -470,7 +470,7 @@ def scale_etc() -> dict[str, Any]:
     }
 
 
-def test_one_error_more_leaves_the_noise_as_it_was() -> None:
+def test_a_further_error_does_not_change_the_noise() -> None:
     quiet = unit({"arw_deg_sqrt_h": 0.07}).measure(steady([0, 0, 0], 50)).angle_rad
     biased = unit({"arw_deg_sqrt_h": 0.07, "bias_deg_h": 1.0, "bias_time": "1e15 s"})
     got = biased.measure(steady([0, 0, 0], 50)).angle_rad - STEP * biased.gyro_bias_rad_s
@@ -478,7 +478,7 @@ def test_one_error_more_leaves_the_noise_as_it_was() -> None:
 
 
 @pytest.mark.slow
-def test_units_off_the_line_scatter_as_declared() -> None:
+def test_turn_on_errors_of_units_scatter_as_declared() -> None:
     """2000 units: a standard deviation is sure to 1/sqrt(2 n), a mean to sigma/sqrt(n); 4 sigma of each."""
     many = [
         Imu.from_config(ImuConfig(hardware_seed=seed), np.random.default_rng(0))
@@ -507,7 +507,7 @@ def test_scale_errors_are_on_the_diagonal_and_misalignments_off_it() -> None:
     np.testing.assert_allclose(errors[off], 30 * ARCSEC * normal[off], rtol=1e-12)
 
 
-def test_scale_and_misalignment_on_a_known_turn() -> None:
+def test_scale_and_misalignment_change_a_known_rotation_as_declared() -> None:
     """A whole turn about body y: sensor y counts 360 deg (1 + scale), x and z their tilt towards y times 360 deg."""
     one = unit({"scale_ppm": 500, "misalignment_arcsec": 100})
     turn = np.radians([0, 36, 0])
@@ -522,7 +522,7 @@ def test_scale_and_misalignment_on_a_known_turn() -> None:
 
 
 @pytest.mark.slow
-def test_bias_is_the_rate_at_rest() -> None:
+def test_the_measured_rate_at_rest_is_the_bias() -> None:
     one = unit({"turn_on_bias_deg_h": 5.0, "bias_deg_h": 2.0})
     count = one.measure(steady([0, 0, 0], 1))
     np.testing.assert_allclose(count.angle_rad[0] / STEP, one.gyro_bias_rad_s, rtol=1e-14)
@@ -531,7 +531,7 @@ def test_bias_is_the_rate_at_rest() -> None:
     )
 
 
-def test_accelerometers_have_their_own_errors() -> None:
+def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     """At rest on the table: bias of a whole minute's mean is turn-on + wandering; gyros stay exact."""
     settings = {"turn_on_bias_ug": 300, "bias_ug": 50, "bias_time": "1e15 s", "scale_ppm": 300}
     one = Imu.from_config(part(None, settings), np.random.default_rng(3))
@@ -569,7 +569,7 @@ def test_a_turn_beyond_the_limit_reads_the_limit_and_the_attitude_stays_wrong() 
     ).all()
 
 
-def test_a_limit_is_of_the_rate_and_of_either_kind() -> None:
+def test_gyros_and_accelerometers_have_separate_limits() -> None:
     below = unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([9.99, -9.99, 0]), 5))
     assert not below.saturated.any()
     push = np.array([[0, 0, 0.5 * G], [0, 0, 3 * G], [0, -3 * G, 0]]) * STEP
@@ -583,7 +583,7 @@ def test_a_limit_is_of_the_rate_and_of_either_kind() -> None:
     )
 
 
-def test_the_counter_loses_no_angle() -> None:
+def test_quantization_loses_no_angle() -> None:
     """Whole quanta come out, and their sum is the angle to half a quantum at all times."""
     quantum = 0.4 * ARCSEC
     one = unit({"quantum_arcsec": 0.4})
@@ -598,7 +598,7 @@ def test_the_counter_loses_no_angle() -> None:
     )  # evenly spread, of 12,000
 
 
-def test_a_turn_slower_than_the_counter_is_counted_in_the_end() -> None:
+def test_a_rotation_below_one_count_is_counted_eventually() -> None:
     """1 deg/h is 0.0025 arcsec a sample, a count is 0.4 arcsec: one in 160 samples, 25 in 4000."""
     counted = unit({"quantum_arcsec": 0.4}).measure(steady([DEG_H, 0, 0], 4000)).angle_rad[:, 0] / (
         0.4 * ARCSEC
@@ -607,12 +607,12 @@ def test_a_turn_slower_than_the_counter_is_counted_in_the_end() -> None:
     np.testing.assert_allclose(np.diff(np.flatnonzero(counted)), 160, rtol=0, atol=1)
 
 
-def test_white_noise_of_the_rate() -> None:
+def test_white_noise_has_the_declared_random_walk() -> None:
     """ARW^2 / dt, of both kinds of sensor, whatever the step; one in sqrt(2 n) is 0.2 % of 300,000 draws."""
     for step_s in (2.5e-3, 0.1):
-        told = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
+        settings = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
         run = steady([0, 0, 0], 100_000, step_s)
-        got = Imu.from_config(told, np.random.default_rng(7)).measure(run)
+        got = Imu.from_config(settings, np.random.default_rng(7)).measure(run)
         rate_deg_h = got.angle_rad / step_s / DEG_H
         force_ug = got.velocity_m_s / step_s / G * 1e6
         np.testing.assert_allclose(rate_deg_h.std(), 0.07 * 60 / np.sqrt(step_s), rtol=6e-3)
@@ -622,7 +622,7 @@ def test_white_noise_of_the_rate() -> None:
 
 
 @pytest.mark.long
-def test_the_wandering_bias_starts_as_it_goes_on() -> None:
+def test_the_bias_instability_is_stationary_from_the_start() -> None:
     """Over 4000 starts: variance sigma^2 at once and 300 s later, and exp(-1) of it between the two."""
     sigma = DEG_H
     first = []
@@ -670,7 +670,7 @@ def declared(gyro: Any, tau_s: float) -> float:
     )
 
 
-def test_theory_of_the_wandering_bias_peaks_at_0617() -> None:
+def test_the_theoretical_allan_deviation_of_the_bias_peaks_at_0617() -> None:
     """reference.md: 1 deg/h and 300 s peak at 0.617; and a mean over tau drawn from the exact covariance agrees."""
     tau = np.linspace(300, 900, 6001)
     peak = markov_allan(tau, 1.0, 300.0)
@@ -702,7 +702,7 @@ def test_allan_deviation_of_an_ln200_is_its_random_walk_at_one_second() -> None:
 
 
 @pytest.mark.long
-def test_allan_deviation_of_the_wandering_bias_peaks_as_theory() -> None:
+def test_the_allan_deviation_of_the_bias_peaks_as_theory_predicts() -> None:
     """Bias alone, 23 days in steps of 1 s: 0.617 sigma at 567 s (bar: 5 %).
 
     The process is exact at any step, and its mean over 1 s that of its ends to (1/300)^2 / 12. The scatter at
@@ -719,7 +719,7 @@ def test_allan_deviation_of_the_wandering_bias_peaks_as_theory() -> None:
 
 
 @pytest.mark.long
-def test_allan_deviation_of_a_long_run_at_400_hz() -> None:
+def test_the_allan_deviation_of_a_long_run_at_400_hz_follows_theory() -> None:
     """An LN-200 with all its errors, a week at 400 Hz: random walk and bias at once, to 5 % at 1 s and at its peak.
 
     The scatter at 567 s is 1 / sqrt(2 * 3 * 1066) = 1.25 %.
@@ -739,7 +739,7 @@ def test_allan_deviation_of_a_long_run_at_400_hz() -> None:
 # --- the navigator
 
 
-def test_a_navigator_follows_an_even_turn_exactly() -> None:
+def test_a_navigator_follows_a_constant_rate_exactly() -> None:
     rate = np.array([0.3, -0.2, 0.5])
     navigator = Navigator(wxyz(TILTED))
     navigator.add(steady(rate, 4000))
@@ -753,7 +753,7 @@ def test_a_navigator_follows_an_even_turn_exactly() -> None:
     assert np.linalg.norm(navigator.lab_from_body_wxyz) == pytest.approx(1, abs=1e-14)
 
 
-def test_in_pieces_or_at_once_a_navigator_is_the_same() -> None:
+def test_a_navigator_gives_the_same_attitude_in_pieces_and_at_once() -> None:
     whole = Navigator(wxyz(TILTED), EARTH)
     pieces = Navigator(wxyz(TILTED), EARTH)
     run = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
@@ -767,7 +767,7 @@ def test_in_pieces_or_at_once_a_navigator_is_the_same() -> None:
     np.testing.assert_array_equal(whole.lab_from_body_wxyz, pieces.lab_from_body_wxyz)
 
 
-def test_a_cone_makes_the_navigator_drift_as_theory() -> None:
+def test_coning_makes_the_navigator_drift_as_theory_predicts() -> None:
     """Increments taken for rotation vectors miss half the integral of angle x rate: sin^2(a) (w h - sin(w h)) / 2
     about the cone's axis in each sample, here 1.8e-6 rad, so 7e-3 rad in 10 s; and they miss nothing else."""
     knots = np.arange(0, 10.0005, 1e-3)
@@ -782,12 +782,12 @@ def test_a_cone_makes_the_navigator_drift_as_theory() -> None:
 
 
 @pytest.mark.parametrize("euler", [(10.0, 20.0, 30.0), (-170.0, -85.0, 179.0), (0.0, 0.0, -90.0)])
-def test_euler_angles_are_scipys(euler: tuple[float, float, float]) -> None:
+def test_euler_angles_match_scipy(euler: tuple[float, float, float]) -> None:
     start = Rotation.from_euler("ZYX", euler[::-1], degrees=True)
     np.testing.assert_allclose(euler_deg(Navigator(3 * wxyz(start))), euler, rtol=0, atol=1e-10)
 
 
-def test_an_error_at_home_stays_in_the_lab() -> None:
+def test_an_initial_attitude_error_is_constant_in_the_lab() -> None:
     """Home believed level while the vehicle stands 0.5 deg wrong: the error stays with it, in the lab's axes."""
     home_error = Rotation.from_euler("x", 0.5, degrees=True)
     truth = home_error
@@ -804,7 +804,7 @@ def test_an_error_at_home_stays_in_the_lab() -> None:
 @pytest.mark.parametrize(
     ("roll", "pitch", "yaw"), [(0, 0, 40), (25, -20, 70), (-29, 12, -110), (120, 80, 5)]
 )
-def test_tilt_from_gravity(roll: float, pitch: float, yaw: float) -> None:
+def test_the_tilt_is_found_from_gravity(roll: float, pitch: float, yaw: float) -> None:
     attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
     got = np.degrees(tilt_rad(still(attitude, 2.0, 0.1, np.zeros(3)).velocity_m_s))
     np.testing.assert_allclose(got, [roll, pitch], rtol=0, atol=1e-10)

@@ -51,14 +51,14 @@ def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarr
     return (calm.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec() / ARCSEC
 
 
-def test_nothing_that_shakes_is_the_same_history() -> None:
+def test_without_jitter_the_history_is_unchanged() -> None:
     calm = turning(1.0)
     rng = np.random.default_rng(1)
     assert shake(calm, (), rng) is calm
     assert shake(calm, (line(rms=(0.0, 0.0, 0.0)),), rng) is calm
 
 
-def test_a_line_is_a_sine_of_its_rms_about_each_axis() -> None:
+def test_a_spectral_line_is_a_sine_of_its_rms_about_each_axis() -> None:
     calm = turning(1.0)
     t = np.arange(1000) / 1000  # forty whole periods
     phi = shaken_by(calm, shake(calm, (line(),), np.random.default_rng(2)), t)
@@ -67,7 +67,7 @@ def test_a_line_is_a_sine_of_its_rms_about_each_axis() -> None:
     np.testing.assert_allclose(power[40] / power.sum(axis=0), 1, rtol=1e-5)
 
 
-def test_phases_are_at_random() -> None:
+def test_phases_are_random() -> None:
     """The mean of exp(i phase) over n draws is 0 within 1/sqrt(n)."""
     rng = np.random.default_rng(3)
     drawn = [SPECTRA["line"](line(), rng) for _ in range(400)]
@@ -122,7 +122,7 @@ def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
     assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
 
 
-def test_many_sines_look_like_noise() -> None:
+def test_many_sines_are_normally_distributed() -> None:
     """The sum of so many sines is nearly normal: kurtosis 3 less 1.5 over the number of equal sines."""
     sines = SPECTRA["band"](band(1.0, 100.0), np.random.default_rng(6))
     t = np.sort(np.random.default_rng(7).uniform(0, 5000, 40_000))
@@ -145,7 +145,7 @@ def test_between_the_samples_the_history_follows_the_sum() -> None:
     assert np.diff(shaken.t_s).max() <= 1 / (16 * highest_hz) * (1 + 1e-9)
 
 
-def test_the_samples_of_the_calm_history_stay() -> None:
+def test_the_samples_of_the_history_without_jitter_are_kept() -> None:
     calm = turning(1.0, rate=(0.1, 0.2, 0.3), samples=7)
     shaken = shake(calm, (line(11.0),), np.random.default_rng(10))
     assert np.isin(calm.t_s, shaken.t_s).all()
@@ -174,7 +174,7 @@ def test_rates_are_the_derivative_of_the_attitude() -> None:
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 0.9e-4, 1.1e-4, 1e-2, 1.0, 3.0])
-def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None:
+def test_the_jitter_s_rate_is_the_derivative_of_its_rotation_at_any_angle(angle_rad: float) -> None:
     """Rotations by complex numbers about one axis cannot see the cross terms: central differences of scipy's can."""
     phi = angle_rad * np.array([[0.6, 0.0, 0.8]])
     phi_rate = np.array([[0.3, -1.0, 0.2]])
@@ -184,7 +184,7 @@ def test_own_rate_is_that_of_the_rotation_at_any_angle(angle_rad: float) -> None
     np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate), turned, rtol=0, atol=1e-9)
 
 
-def test_cross_term_of_the_rate_is_needed() -> None:
+def test_without_its_cross_term_the_rate_is_wrong() -> None:
     """Coning: two axes a quarter period apart turn the body steadily at (1 - cos a) dphi/dt / a about the third."""
     phi = np.array([[0.01, 0.0, 0.0]])
     phi_rate = np.array([[0.0, 0.01, 0.0]])
@@ -194,13 +194,13 @@ def test_cross_term_of_the_rate_is_needed() -> None:
 
 
 @pytest.mark.parametrize("angle", [1e-6, 3e-5, 0.99e-4, 1.01e-4, 1e-3])
-def test_the_rate_across_a_small_rotation_is_its_sine_s(angle: float) -> None:
+def test_the_rate_across_a_small_rotation_has_the_sine_term(angle: float) -> None:
     """Across phi the rate's own part is sin a / a of it; the terms add up to it within rounding, below 1e-4 rad too."""
     across = rotvec_body_rate(np.array([[angle, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))[0, 1]
     assert 1 - across == pytest.approx(angle**2 / 6 - angle**4 / 120, rel=0, abs=3e-16)
 
 
-def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
+def test_jitter_does_not_change_the_mean_attitude() -> None:
     calm = turning(10.0, rate=(0.0, 0.05, 0.0))
     shaken = shake(calm, (line(20.0), band(5.0, 50.0)), np.random.default_rng(12))
     mean = shaken_by(calm, shaken, np.arange(10_000) / 1000).mean(axis=0)
@@ -208,7 +208,7 @@ def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
     assert (np.abs(mean) < 4 * np.array(RMS) / (np.pi * 5.0 * 10.0)).all()
 
 
-def test_the_same_stream_shakes_alike() -> None:
+def test_the_same_random_stream_gives_the_same_jitter() -> None:
     calm = turning(0.2)
     first, again, other = (
         shake(calm, (band(1.0, 30.0),), np.random.default_rng(s)) for s in (1, 1, 2)
@@ -231,17 +231,17 @@ def shaking(*while_s: float, parts: object = None, always: object = ()) -> Motio
     """Holds of a second, and between them the vibration for each of the given whiles."""
     hold = {"kind": "hold", "duration": "1 s"}
     parts = parts or [{"kind": "line", "frequency_hz": 40, "rms_arcsec": RMS}]
-    told: list[object] = [hold]
+    maneuver: list[object] = [hold]
     for one_s in while_s:
-        told += [{"kind": "jitter", "duration": f"{one_s} s", "components": parts}, hold]
-    return MotionConfig.model_validate({"maneuver": told, "jitter": always})
+        maneuver += [{"kind": "jitter", "duration": f"{one_s} s", "components": parts}, hold]
+    return MotionConfig.model_validate({"maneuver": maneuver, "jitter": always})
 
 
 LOUD = [{"kind": "line", "frequency_hz": 7, "rms_arcsec": [3600, 1800, 900]}]
 NOISE = [{"kind": "band", "from_hz": 5, "to_hz": 60, "rms_arcsec": RMS}]
 
 
-def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
+def test_a_vibration_interval_has_its_rms_between_rise_and_fall() -> None:
     """Four seconds from 1 s: a rise of 0.4 s, then 128 whole periods of 40 Hz."""
     calm = turning(6.0, samples=601)
     shaken = Vibration.draw(shaking(4.0), np.random.default_rng(13)).add_to(calm)
@@ -256,7 +256,7 @@ def test_a_while_of_vibration_has_its_rms_between_rise_and_fall() -> None:
         )
 
 
-def test_a_long_while_rises_within_a_second() -> None:
+def test_a_long_vibration_interval_rises_within_a_second() -> None:
     calm = turning(32.0, samples=3201)
     shaken = Vibration.draw(shaking(30.0), np.random.default_rng(14)).add_to(calm)
     for begin in (2.0, 29.0):
@@ -264,7 +264,7 @@ def test_a_long_while_rises_within_a_second() -> None:
         np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
 
 
-def test_nothing_shakes_outside_of_its_while() -> None:
+def test_there_is_no_vibration_outside_its_interval() -> None:
     calm = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801)
     rng = np.random.default_rng(15)
     vibration = Vibration.draw(shaking(2.0, 3.0), rng)
@@ -286,7 +286,7 @@ def test_nothing_shakes_outside_of_its_while() -> None:
     )  # no finer where it is calm
 
 
-def test_two_whiles_of_the_same_vibration_have_their_own_phases() -> None:
+def test_two_intervals_of_the_same_vibration_have_independent_phases() -> None:
     vibration = Vibration.draw(shaking(2.0, 2.0), np.random.default_rng(17))
     t = np.linspace(1.5, 2.5, 1000, endpoint=False)
     # 120 periods later
@@ -296,7 +296,7 @@ def test_two_whiles_of_the_same_vibration_have_their_own_phases() -> None:
 
 
 @pytest.mark.parametrize("always", [(), LOUD])
-def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -> None:
+def test_the_vibration_within_its_interval_has_its_stated_derivative(always: list[object]) -> None:
     """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
     vibration = Vibration.draw(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18))
     h = 1e-6
@@ -309,7 +309,7 @@ def test_swing_within_a_while_has_the_derivative_it_says(always: list[object]) -
     assert np.abs(rate).max() > 0.5
 
 
-def test_the_shaken_rate_is_the_derivative_of_the_attitude_through_a_while() -> None:
+def test_the_rate_with_vibration_is_the_derivative_of_the_attitude() -> None:
     """At its samples by central differences of lab_from_body exp(phi); between them it follows that too."""
     calm = turning(4.0, rate=(0.2, -0.1, 0.25), samples=4001)
     vibration = Vibration.draw(shaking(2.0, parts=LOUD), np.random.default_rng(20))
@@ -328,7 +328,7 @@ def test_the_shaken_rate_is_the_derivative_of_the_attitude_through_a_while() -> 
     assert error.max() < 1e-4 * np.radians(1.0) * np.sqrt(2)
 
 
-def test_a_short_while_is_sampled_for_its_envelope_too() -> None:
+def test_a_short_vibration_interval_is_sampled_for_its_envelope() -> None:
     """A tenth of a period of 0.5 Hz: only the rise and fall, 10 ms each, set the samples."""
     calm = turning(2.2, samples=3)
     slow = [{"kind": "line", "frequency_hz": 0.5, "rms_arcsec": RMS}]
@@ -340,7 +340,7 @@ def test_a_short_while_is_sampled_for_its_envelope_too() -> None:
     assert (np.abs(wanted).max(axis=0) > 0).all()
 
 
-def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
+def test_a_flight_in_pieces_has_the_jitter_of_the_whole() -> None:
     """A history that turns and speeds up, cut at samples into uneven pieces, inside and outside of the while."""
     t = np.arange(0, 3.0 + 5e-4, 1e-3)
     rate = np.outer(1 + t, [0.1, 0.0, 0.2])
@@ -364,14 +364,14 @@ def test_a_flight_in_pieces_shakes_like_the_whole() -> None:
         )
 
 
-def test_a_piece_in_which_nothing_sounds_is_the_same_history() -> None:
+def test_a_piece_without_vibration_is_unchanged() -> None:
     vibration = Vibration.draw(shaking(1.0), np.random.default_rng(25))
     piece = turning(0.9)
     assert vibration.add_to(piece) is piece
     assert Vibration.draw(MotionConfig(), np.random.default_rng(25)).components == ()
 
 
-def test_too_many_samples_of_a_while_are_refused_with_its_time() -> None:
+def test_too_many_samples_of_a_vibration_are_refused_with_its_time() -> None:
     fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
     vibration = Vibration.draw(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
     flight = turning(3.0, samples=3001)

@@ -28,7 +28,7 @@ def test_a_body_s_moments_are_sums_of_two_positive_second_moments(
     assert is_possible(moments) == possible
 
 
-def test_a_plate_in_any_axes_is_possible() -> None:
+def test_a_flat_plate_in_any_axes_is_a_valid_inertia() -> None:
     """Its largest moment is the sum of the others; eigenvalues of the turned tensor are so but for rounding."""
     axes = Rotation.random(200, rng=np.random.default_rng(1)).as_matrix()
     moments = np.linalg.eigvalsh(axes @ np.diag([1.0, 2.0, 3.0]) @ axes.swapaxes(1, 2))

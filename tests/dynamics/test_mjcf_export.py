@@ -108,7 +108,7 @@ def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> Non
     np.testing.assert_allclose(data.qvel, flight.speeds_rad_s, rtol=1e-8, atol=1e-8)
 
 
-def test_the_second_start_does_reach_the_stop() -> None:
+def test_the_second_initial_attitude_reaches_the_tilt_stop() -> None:
     """The flight above compares the tendon's limit only if that is felt."""
     angles_deg, rate = STARTS["against the stop"]
     scene, vehicle, _ = dome_lab(EVERYTHING | {"motion.rate_deg_s": rate})
@@ -130,7 +130,7 @@ def test_a_free_vehicle_flies_like_the_stepped_model_under_the_stars() -> None:
     assert not [k for k in range(model.ngeom) if "floor" in model.geom(k).name]
 
 
-def test_export_leaves_the_stepped_model_alone_and_weighs_nothing() -> None:
+def test_export_adds_no_mass_and_does_not_change_the_stepped_model() -> None:
     scene, vehicle, sources = dome_lab(EVERYTHING)
     before = vehicle.spec.to_xml()
     geoms = vehicle.model.ngeom
@@ -145,7 +145,7 @@ def test_export_leaves_the_stepped_model_alone_and_weighs_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_a_vehicle_of_mesh_files_stands_alone(tmp_path: Path) -> None:
+def test_an_exported_vehicle_contains_its_mesh_files(tmp_path: Path) -> None:
     """The tetrahedron is off its origin, turned, scaled and mirrored; it stays where it was, without its file."""
     points = np.array([[0.1, 0.2, 0.0], [0.6, 0.2, 0.1], [0.1, 0.5, 0.0], [0.2, 0.2, 0.7]])
     faces = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -186,7 +186,7 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_dome_and_leds_stand_where_the_scene_has_them() -> None:
+def test_exported_dome_and_leds_have_the_scene_s_positions() -> None:
     scene, vehicle, sources = dome_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     inside = surface.build_surface(scene.light.surface)
@@ -210,7 +210,7 @@ def test_a_flat_panel_is_a_disk_at_its_height_that_covers_its_leds() -> None:
     assert np.hypot(*shell[:, :2].T).max() > np.hypot(*sources.place[:, :2].T).max()
 
 
-def test_the_sheets_look_inwards_and_outwards() -> None:
+def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
     """OpenGL draws a triangle whose corners go against the clock's hands as seen by the eye."""
     scene, vehicle, sources = dome_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
@@ -243,7 +243,7 @@ def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None
     assert {tuple(np.round(2 * one) / 2) for one in seen_px} == wanted
 
 
-def test_the_brightest_stars_stand_on_a_sphere_where_the_sky_has_them() -> None:
+def test_the_brightest_stars_are_on_a_sphere_in_their_true_directions() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
     grains = vertices_m(
         *loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_"
@@ -267,7 +267,7 @@ SURFACES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", SURFACES)
-def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface: str) -> None:
+def test_the_lab_camera_sees_the_whole_dome_and_vehicle(surface: str) -> None:
     scene, vehicle, sources = dome_lab(SURFACES[surface])
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
     hardware = data.geom_xpos[model.body_rootid[model.geom_bodyid] == model.body("bus").id]
@@ -300,7 +300,7 @@ def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
         np.testing.assert_allclose(sight / np.linalg.norm(sight), forward, rtol=0, atol=1e-6)
 
 
-def test_the_edges_of_the_camera_s_field_are_thin_lines_along_it() -> None:
+def test_the_edges_of_the_camera_s_field_are_thin_capsules_along_it() -> None:
     """Each ray from the camera to a corner, and each edge between corners: under a hundredth of its length thick."""
     scene, vehicle, sources = dome_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
@@ -418,7 +418,7 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("opengl_name", ["disable", "nonsense"])
-def test_without_opengl_one_line_says_what_to_do(
+def test_without_opengl_one_line_names_the_remedy(
     opengl_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", opengl_name)
@@ -428,7 +428,7 @@ def test_without_opengl_one_line_says_what_to_do(
     assert "MUJOCO_GL=osmesa" in str(refused.value)
 
 
-def test_a_driver_that_takes_the_painter_with_it_is_named(tmp_path: Path) -> None:
+def test_a_driver_that_crashes_the_renderer_is_named(tmp_path: Path) -> None:
     with (tmp_path / "stderr").open("w+b") as complaints:
         assert "SIGSEGV" in scene_picture.failure_reason(-11, complaints)
         complaints.write(b"warning\nImportError: no libEGL\n")
@@ -441,7 +441,7 @@ RED_TO_GREEN = [np.full((48, 64, 3), (250 - 20 * k, 20 * k, 0), np.uint8) for k 
 
 
 @pytest.mark.parametrize("suffix", scene_picture.ANIMATED)
-def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Path) -> None:
+def test_a_film_keeps_its_colors_and_duration(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
     scene_picture.write_film(iter(RED_TO_GREEN), path, fps=10.0)
     assert os.listdir(tmp_path) == [path.name]
@@ -464,7 +464,7 @@ def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) ->
     assert (tmp_path / "film.gif").stat().st_size < 2.5e6
 
 
-def test_a_film_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+def test_a_film_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         scene_picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
     with pytest.raises(

@@ -99,7 +99,7 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> None:
+def test_a_path_out_of_the_folder_that_mujoco_follows_is_refused(tmp_path: Path, way: str) -> None:
     """MuJoCo compiles each, and could not without the file outside."""
     files, links = WAYS[way]
     folder = tmp_path / "theirs"
@@ -138,7 +138,7 @@ def test_a_way_out_that_mujoco_takes_is_refused(tmp_path: Path, way: str) -> Non
         '<worldbody><INCLUDE file="part.xml"/></worldbody>',
     ],
 )
-def test_any_name_that_leaves_the_folder_is_refused(tmp_path: Path, names: str) -> None:
+def test_any_file_name_outside_the_folder_is_refused(tmp_path: Path, names: str) -> None:
     (tmp_path / "v.xml").write_text(whole(names))
     (tmp_path / "part.xml").write_text(CHILD)
     (tmp_path / "round.xml").symlink_to(tmp_path / "round.xml")
@@ -186,7 +186,7 @@ def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
         mjcf.load(path)
 
 
-def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
+def test_files_within_the_folder_are_read(tmp_path: Path) -> None:
     """Includes of includes from a folder beneath, meshes, an attached model; `..` that stays inside."""
     for name, text in {
         "v.xml": whole(
@@ -199,10 +199,10 @@ def test_the_parts_of_a_folder_are_let_in(tmp_path: Path) -> None:
     }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    told = mjcf.load(tmp_path / "v.xml")
-    assert told.compile().nmesh == 1
-    assert told.site("in") is not None
-    assert told.body("psecret") is not None
+    model = mjcf.load(tmp_path / "v.xml")
+    assert model.compile().nmesh == 1
+    assert model.site("in") is not None
+    assert model.body("psecret") is not None
 
 
 def nested(count: int) -> str:
@@ -218,7 +218,7 @@ def flexcomp(count: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             whole(ATTACHED.replace("c.xml", "v.xml").replace("secret", "bus")),
@@ -236,13 +236,13 @@ def flexcomp(count: str) -> str:
     ids=["contains itself", "flexcomp", "joints", "replicate", "height field", "nuser_body"],
 )
 def test_a_model_that_would_crash_or_never_end_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
 ) -> None:
-    if "1 s" in told:
+    if "1 s" in message:
         monkeypatch.setattr(mjcf, "TRIAL_CPU_S", 1)
     (tmp_path / "v.xml").write_text(text)
     with pytest.raises(
-        InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{told}$"
+        InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{message}$"
     ):
         mjcf.load(tmp_path / "v.xml")
 
@@ -256,7 +256,7 @@ def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, va
         mjcf.load(tmp_path / "v.xml")
 
 
-def test_a_shipped_vehicle_needs_no_child_and_another_file_one(
+def test_a_shipped_vehicle_is_loaded_in_process_and_any_other_in_a_child(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second import of MuJoCo would lengthen the start of every run."""

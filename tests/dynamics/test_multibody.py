@@ -51,7 +51,7 @@ def yaw_deg(flight: Trajectory) -> np.ndarray:
 # --- the laws -----------------------------------------------------------------------------------------------
 
 
-def test_sphere_keeps_its_rate() -> None:
+def test_a_free_sphere_keeps_its_rate() -> None:
     """The SHEFEX-2 scene's law of motion: lab_from_body = start * exp(w t)."""
     given = yaml.safe_load((SCENES / "shefex2.yaml").read_text(encoding="utf-8"))["vehicle"]
     flown = multibody.build(VehicleConfig.model_validate(given))
@@ -75,7 +75,7 @@ def test_motor_turns_its_axis_and_stops_at_its_limit(axis: int) -> None:
 # --- mass properties ----------------------------------------------------------------------------------------
 
 
-def test_vehicle_weighs_what_the_scene_declares() -> None:
+def test_the_vehicle_has_the_declared_mass() -> None:
     """MuJoCo's own totals: mass of the tree, its center in the lab, its joint-space inertia."""
     center = np.array([20e-6, -10e-6, -50e-6])
     flown = multibody.build(vehicle_config(center_of_mass=["20 um", "-10 um", "-50 um"]))
@@ -96,7 +96,7 @@ def test_balance_masses_do_not_move_the_camera() -> None:
     )
 
 
-def test_undeclared_mass_is_the_files_own() -> None:
+def test_an_undeclared_mass_is_taken_from_the_file() -> None:
     """The sum of the geoms in simsat.xml, read as text."""
     text = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
     spec = mujoco.MjSpec.from_string(text)
@@ -132,7 +132,7 @@ def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
         (("wheels", "cmgs", "fans"), 11, 13),
     ],
 )
-def test_what_the_scene_does_not_switch_on_is_locked(
+def test_actuators_that_the_scene_does_not_use_are_locked(
     parts: tuple[str, ...], joints: int, motors: int
 ) -> None:
     """Beside the bearing's three freedoms and the three ideal torques; the whole weighs the same."""
@@ -149,7 +149,7 @@ def test_what_the_scene_does_not_switch_on_is_locked(
     np.testing.assert_allclose(full[:3, :3], np.diag(INERTIA), rtol=0, atol=1e-10)
 
 
-def test_wheels_are_found_where_the_file_has_them() -> None:
+def test_wheels_have_the_axes_and_inertia_of_the_file() -> None:
     """Cylinders of 2.5 kg and 9 cm: m r^2 / 2 = 0.010125 kg m2 about the axle."""
     wheels = multibody.build(vehicle_config(wheels={})).wheels
     assert wheels.names == ("wheel_x", "wheel_y", "wheel_z")
@@ -157,7 +157,7 @@ def test_wheels_are_found_where_the_file_has_them() -> None:
     np.testing.assert_allclose(wheels.inertia_kg_m2, 0.010125, rtol=1e-12)
 
 
-def test_cmgs_are_found_where_the_file_has_them() -> None:
+def test_cmgs_have_the_axes_of_the_file() -> None:
     """A pyramid of four: gimbal axes lean outwards by 54.74 deg, rotors lie along the base's edges.
 
     About the gimbal a box of 1.2 kg, 0.14 x 0.04 m across, and a cylinder of 1.8 kg, 5 cm and 4 cm long on its side:
@@ -178,7 +178,7 @@ def test_cmgs_are_found_where_the_file_has_them() -> None:
     np.testing.assert_allclose(vehicle.rotors.inertia_kg_m2, 1.8 * 0.05**2 / 2, rtol=1e-12)
 
 
-def test_fans_are_found_where_the_file_has_them() -> None:
+def test_fans_have_the_places_of_the_file() -> None:
     """Pairs that push opposite ways on opposite sides: place x direction is about x, y, z in turn."""
     fans = multibody.build(vehicle_config(fans={})).fans
     assert fans.names == ("fan_x_1", "fan_x_2", "fan_y_1", "fan_y_2", "fan_z_1", "fan_z_2")
@@ -220,7 +220,7 @@ def test_accelerometers_sit_at_the_site_imu_or_at_the_bearing() -> None:
 # --- camera -------------------------------------------------------------------------------------------------
 
 
-def test_mount_is_mujocos_own_camera() -> None:
+def test_the_mount_is_mujoco_s_camera_pose() -> None:
     """At a rotated pose: place of the camera, and the columns of xmat (right, up, backwards)."""
     flown = multibody.build(vehicle_config())
     seat = multibody.camera_mount(flown)
@@ -237,7 +237,7 @@ def test_mount_is_mujocos_own_camera() -> None:
     np.testing.assert_allclose(lab_from_cam.T, [right, -up, -back], rtol=0, atol=1e-14)
 
 
-def test_camera_leans_the_way_the_vehicle_rolls() -> None:
+def test_the_camera_tilts_with_the_vehicle_s_roll() -> None:
     """By hand: rolled by +30 deg about lab x, body +z, and so the boresight, leans towards lab -y."""
     seat = multibody.camera_mount(multibody.build(vehicle_config()))
     lab_from_body = Rotation.from_euler("x", 30, degrees=True)
@@ -301,7 +301,7 @@ def test_start_beyond_the_stop_is_refused() -> None:
 # --- trajectory ---------------------------------------------------------------------------------------------
 
 
-def test_flight_starts_and_ends_where_and_when_it_was_told() -> None:
+def test_a_flight_has_the_requested_start_and_duration() -> None:
     begin = Rotation.from_rotvec([0.1, 0.2, 0.3])
     rate = np.array([0.01, 0.02, 0.03])
     flight = multibody.simulate(multibody.build(vehicle_config()), begin, rate, 0.25)
@@ -310,8 +310,8 @@ def test_flight_starts_and_ends_where_and_when_it_was_told() -> None:
     np.testing.assert_array_equal(flight.rate_body_rad_s[0], rate)
 
 
-def test_controller_is_asked_every_period_about_the_present() -> None:
-    """The state it is shown is the trajectory's at the very time it is told, not a step old."""
+def test_the_controller_is_called_every_period_with_the_present_state() -> None:
+    """The state passed to the controller is the trajectory's at the time passed with it, not a step older."""
     asked: list[tuple[float, Rotation, np.ndarray]] = []
 
     def listen(*now: object) -> np.ndarray:
@@ -334,7 +334,7 @@ def test_same_flight_twice_is_the_same_to_the_last_bit() -> None:
     np.testing.assert_array_equal(one.lab_from_body.as_quat(), two.lab_from_body.as_quat())
 
 
-def test_mujocos_warning_is_an_error_and_leaves_no_file(
+def test_a_mujoco_warning_is_an_error_and_leaves_no_log_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -351,9 +351,9 @@ def test_mujocos_warning_is_an_error_and_leaves_no_file(
 def test_pid_flies_the_afit_maneuver() -> None:
     """80 kg, tens of micrometers out of balance: below 0.02 deg throughout, below 0.001 deg when settled."""
     given = yaml.safe_load((SCENES / "afit_simsat.yaml").read_text(encoding="utf-8"))
-    told = MotionConfig.model_validate(given["motion"])
+    motion = MotionConfig.model_validate(given["motion"])
     flown = multibody.build(VehicleConfig.model_validate(given["vehicle"]))
-    reference = plan(told)
+    reference = plan(motion)
     law = build_controller(reference, flown.inertia_kg_m2)
 
     def steer(t_s: float, here: Rotation, rate_rad_s: Floats) -> Floats:
@@ -361,7 +361,7 @@ def test_pid_flies_the_afit_maneuver() -> None:
         law.integrate(wanted, wanted, 0.01)
         return wanted
 
-    flight = multibody.simulate(flown, start_attitude(told), STILL, reference.duration_s, steer)
+    flight = multibody.simulate(flown, start_attitude(motion), STILL, reference.duration_s, steer)
     t = np.append(np.arange(0, reference.duration_s, 0.2), reference.duration_s)
     error_deg = np.degrees((reference.attitudes(t).inv() * flight.attitude_at(t)).magnitude())
     assert error_deg.max() < 0.02
@@ -412,7 +412,7 @@ def built(folder: Path, bodies: str, more: str = "", **changes: object) -> multi
         ),
     ],
 )
-def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, message: str) -> None:
+def test_a_bad_vehicle_is_refused_in_one_line(tmp_path: Path, bodies: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         built(tmp_path, bodies)
     assert "mine.xml" in str(caught.value)
@@ -450,7 +450,7 @@ def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, messag
         ),
     ],
 )
-def test_actuators_that_a_file_lacks_are_answered_in_one_line(
+def test_actuators_missing_in_the_file_are_refused_in_one_line(
     tmp_path: Path, part: str, bodies: str, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:
@@ -469,7 +469,7 @@ def test_actuator_of_a_reserved_name_is_refused(tmp_path: Path, name: str) -> No
         built(tmp_path, BUS, motor)
 
 
-def test_files_other_actuators_stay_and_are_left_alone(tmp_path: Path) -> None:
+def test_other_actuators_of_the_file_stay_and_get_no_control(tmp_path: Path) -> None:
     """They come first in the model, and the torques are still those about x, y, z."""
     motor = '<actuator><motor name="mine" site="center" gear="0 0 0 1 0 0"/></actuator>'
     own = built(tmp_path, BUS, motor)
@@ -530,7 +530,7 @@ def test_vehicle_may_carry_wheels_that_turn(tmp_path: Path) -> None:
         '<asset><texture name="t" type="cube" fileright="../../t.png"/></asset>',
     ],
 )
-def test_a_stranger_s_vehicle_reads_no_file_outside_of_its_folder(
+def test_an_untrusted_vehicle_reads_no_file_outside_of_its_folder(
     tmp_path: Path, names: str
 ) -> None:
     folder = tmp_path / "theirs"
@@ -543,7 +543,7 @@ def test_a_stranger_s_vehicle_reads_no_file_outside_of_its_folder(
         built(folder, BUS, names)
 
 
-def test_a_vehicle_in_parts_is_put_together(tmp_path: Path) -> None:
+def test_a_vehicle_of_several_files_is_assembled(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "bus.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
     assert built(tmp_path, "", '<include file="deep/bus.xml"/>').spec.body("bus") is not None
@@ -578,7 +578,9 @@ def test_free_vehicle_turns_about_its_center_of_mass() -> None:
 # --- what a file must not say, or says in another way -------------------------------------------------------
 
 
-def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody.VehicleModel:
+def changed_model(
+    folder: Path, right: str, wrong: str, **changes: object
+) -> multibody.VehicleModel:
     """simsat.xml with one thing changed."""
     text = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
     assert right in text
@@ -610,19 +612,19 @@ def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody
         ),
     ],
 )
-def test_what_the_scene_declares_is_not_the_file_s_to_say(
+def test_the_scene_s_declared_values_replace_the_file_s(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
     with pytest.raises(InputError, match=re.escape(says)):
-        spoilt(tmp_path, right, wrong, wheels={}, fans={})
+        changed_model(tmp_path, right, wrong, wheels={}, fans={})
 
 
 @pytest.mark.slow
-def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
+def test_a_reference_to_a_locked_joint_is_refused_with_the_reason(tmp_path: Path) -> None:
     sensor = '<sensor><jointvel joint="wheel_x"/></sensor></mujoco>'
     with pytest.raises(InputError, match=r"vehicle\.wheels is off, which locks joint wheel_x"):
-        spoilt(tmp_path, "</mujoco>", sensor)
-    assert len(spoilt(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
+        changed_model(tmp_path, "</mujoco>", sensor)
+    assert len(changed_model(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
 
 
 @pytest.mark.slow
@@ -633,17 +635,15 @@ def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
         'fullinertia="0.0101 0.006 0.006 0 0 0"',
     ],
 )
-def test_a_wheel_s_inertia_is_the_file_s_however_it_is_written(
-    tmp_path: Path, inertial: str
-) -> None:
+def test_a_wheel_s_inertia_is_read_in_any_notation(tmp_path: Path, inertial: str) -> None:
     given = f'<inertial pos="0 0 0" mass="2.5" {inertial}/><joint name="wheel_x" axis'
-    made = spoilt(
+    made = changed_model(
         tmp_path, '<joint name="wheel_x" axis', given, wheels={"dynamic_imbalance": "1 g cm2"}
     )
     assert made.wheels.inertia_kg_m2[0] == pytest.approx(0.0101, rel=1e-6)
 
 
-def test_an_unstable_flight_is_an_error_though_it_calms_down() -> None:
+def test_an_unstable_flight_is_an_error_even_if_it_settles() -> None:
     """MuJoCo puts the vehicle back to its start and forgets its warning with the next call."""
     flight = multibody.Simulation(multibody.build(vehicle_config()), LEVEL, STILL, 0.1)
     bad = np.full((10, 3), np.nan)

@@ -126,7 +126,7 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path: Path) -> None:
+def test_an_unobstructed_frame_is_unchanged_bit_for_bit(tmp_path: Path) -> None:
     """With the switch on and off; and switched off a mast is as good as none."""
     on, off = (
         picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false")
@@ -141,7 +141,7 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
     assert masted["true"][1] < off[1]
 
 
-def test_it_is_on_unless_the_scene_says_otherwise() -> None:
+def test_occlusion_is_on_by_default() -> None:
     hides = [
         any(
             isinstance(light, Obstacle)
@@ -158,7 +158,7 @@ LENS = (
 
 
 @pytest.mark.slow
-def test_the_camera_s_own_housing_does_not_blind_it(tmp_path: Path) -> None:
+def test_the_camera_s_own_housing_does_not_occlude_it(tmp_path: Path) -> None:
     """Neither a cap before the lens on the camera's own body, nor a box on bus that it sits in; a cap on bus does."""
     assert SIMSAT.count(LENS) == 1
     cap = LENS.replace("0.065", "{}")
@@ -173,14 +173,14 @@ def test_the_camera_s_own_housing_does_not_blind_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_geom_that_cannot_be_seen_hides_nothing(tmp_path: Path) -> None:
+def test_an_invisible_geom_hides_nothing(tmp_path: Path) -> None:
     clear = on_bus(mast(MAST_M).replace("/>", ' rgba="1 1 1 0"/>'))
     assert len(picture(furnished(tmp_path, clear))[1]) == len(
         picture(furnished(tmp_path, SIMSAT))[1]
     )
 
 
-def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
+def test_stars_behind_the_body_are_hidden() -> None:
     """SHEFEX-2 looks out of its payload's cylinder, and its forebody, an ellipsoid behind, hides what it covers.
 
     A ray u from the origin meets it where the discriminant of |(s u - c) / a|^2 = 1 is not negative, ahead.
@@ -232,7 +232,7 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
         np.testing.assert_array_equal(found, [hidden, hidden, False])
 
 
-def test_gimbals_stand_where_they_are_at_the_start() -> None:
+def test_occlusion_uses_the_gimbals_initial_angles() -> None:
     """Every geom, by its place, as in the model that is flown."""
     given = loader.load("simsat_cmg", {"vehicle.cmgs.start_deg": "[10, 25, -30, 70]"})
     vehicle = multibody.build(given.vehicle)
@@ -248,7 +248,7 @@ def test_gimbals_stand_where_they_are_at_the_start() -> None:
     assert np.abs(placed(things.data) - placed(level.data)).max() > 0.1
 
 
-def test_no_source_is_no_question() -> None:
+def test_without_sources_occlusion_returns_nothing() -> None:
     lab = build_lab(loader.load("afit_simsat"))
     no_sources = lab.camera.sources.take(np.zeros(0, np.int64))
     assert multibody.occluded(obstacles_of(lab), Rotation.identity(), no_sources.place).shape == (
@@ -317,7 +317,7 @@ def test_a_panel_hides_its_leds_from_above_as_far_as_it_reaches() -> None:
 
 
 @pytest.mark.slow
-def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
+def test_a_wall_occludes_only_if_its_scene_says_so(tmp_path: Path) -> None:
     """Through `furnish`: a camera beside a narrow drum looks at the wall's outside, and at LEDs beneath its edge."""
     beside = SIMSAT.replace(
         'name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"'

@@ -39,7 +39,7 @@ def flown(vehicle: multibody.VehicleModel, rate: Floats, control: Floats) -> mul
 
 
 def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
-    """Nobody at the controls: (K, nu) zeros."""
+    """(K, nu) zero controls."""
     return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
@@ -141,7 +141,7 @@ def test_unbalanced_wheel_shakes_the_body(
     """At 3000 rpm: amplitudes U_s arm / J and U_d / J about each axis, as a run of ten times finer steps has them.
 
     J dw/dt + w x h = T, the wheel's own momentum h coupling the axes by I_wheel / J, one in 600. J is without the
-    wheels, for about its own axle none of the three turns along. So told it is right to 2e-5.
+    wheels, for about its own axle none of the three turns along. This holds to 2e-5.
     """
     turned_by: dict[str, object] = {"static_imbalance": f"{static_g_cm} g cm"}
     turned_by |= {
@@ -164,7 +164,7 @@ def test_unbalanced_wheel_shakes_the_body(
     np.testing.assert_allclose(fine, coarse, rtol=0, atol=2e-5 * largest)
 
 
-def test_shaking_by_hand() -> None:
+def test_the_force_of_an_imbalance_matches_a_hand_calculation() -> None:
     """Wheel z, dynamic 10 g cm2: 1e-6 / 6 rad about x and 1e-6 / 6.5 rad about y, whatever its speed; none about z."""
     wheels = {"dynamic_imbalance": "10 g cm2", "start_rpm": [0, 0, 3000]}
     found = shaking_rad(multibody.build(vehicle_config(mount="free", wheels=wheels)), 3000 * RPM)
@@ -222,7 +222,7 @@ def test_gimbal_keeps_its_rate_while_the_vehicle_turns() -> None:
     """A vehicle that turns at w presses the gimbal of a rotor of momentum h with up to w h = 0.6 N m.
 
     The servo's spring, I / tau^2 = 35 N m/rad, gives way by w h / spring, and no further: the rate in the mean is
-    what was asked for. A damper alone would slip by w h tau / 2 I = 50 deg/s.
+    what was commanded. A damper alone would lag by w h tau / 2 I = 50 deg/s.
     """
     cmgs = {"rotor_rpm": 2600, "gimbal_time_constant": "10 ms"}
     vehicle = multibody.build(vehicle_config(mount="free", cmgs=cmgs, **HEAVY))
@@ -273,7 +273,7 @@ def test_gimbals_start_where_the_scene_has_them() -> None:
 def test_fans_thrust_follows_with_a_lag_and_stops_at_its_limit() -> None:
     """J dw/dt = T (1 - exp(-t / tau)): w = T / J (t - tau (1 - exp(-t / tau))), then all of it decays.
 
-    A pair at 0.46 m, told 5 N each of which it has 0.3, for a second.
+    A pair at 0.46 m is commanded 5 N each for a second; its limit is 0.3 N.
     """
     vehicle = multibody.build(
         vehicle_config(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"})

@@ -50,7 +50,7 @@ def flown(
 
 
 def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
-    """Nobody at the controls: (K, nu) zeros."""
+    """(K, nu) zero controls."""
     return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
@@ -82,7 +82,7 @@ def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
 
 
 @pytest.mark.long
-def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driven() -> None:
+def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
     """The issue's bar, 1e-8 N m s. Whatever the motors do between the vehicle's parts, the whole keeps its own.
 
     For 40 s of the 60 random rates of up to 1 rad/s at the gimbals and 0.3 N m at the wheels, another each 0.1 s.
@@ -105,7 +105,7 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
 
 
 @pytest.mark.slow
-def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None:
+def test_energy_and_momentum_are_conserved_without_control() -> None:
     """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
     vehicle.model.opt.disableflags |= int(
@@ -124,7 +124,7 @@ def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None
 
 
 @pytest.mark.slow
-def test_torque_free_motion_keeps_momentum_and_energy() -> None:
+def test_torque_free_motion_conserves_momentum_and_energy() -> None:
     """A tumble about the middle axis, a minute long: L in the lab and w.Jw/2 stay to 1e-11 of themselves."""
     vehicle = multibody.build(vehicle_config(mount="free"))
     flight = multibody.simulate(
@@ -236,7 +236,7 @@ def test_asymmetric_top_turns_as_jacobi_solved_it(
     assert apart.magnitude().max() < 1e-11
 
 
-def test_heavy_top_against_an_integrator_of_its_own() -> None:
+def test_a_heavy_top_agrees_with_an_independent_integrator() -> None:
     """Euler's equation with gravity's torque, c x m g, by scipy's DOP853: a fast, unbalanced tumble."""
     center = np.array([3e-3, -2e-3, 5e-3])
     vehicle = multibody.build(
@@ -296,7 +296,7 @@ def test_torque_of_a_cmg_is_gimbal_rate_times_momentum(k: int) -> None:
     assert np.linalg.norm(expected) == pytest.approx(h * rate_rad_s, rel=1e-12)
 
 
-def test_gimbals_give_a_free_vehicle_what_the_rotors_momentum_lost() -> None:
+def test_a_free_vehicle_gains_the_momentum_that_gimballed_rotors_lose() -> None:
     """At rest, then all four gimbals turn by half a radian and stop: J w = h(before) - h(after), turned along.
 
     Each rotor keeps I (its own spin + the body's about its axle), for it has no motor and no friction; by hand all
@@ -342,7 +342,7 @@ def apart_from_a_finer_run_rad(
     return (fine.lab_from_body[inside].inv() * coarse.attitude_at(fine.t_s[inside])).magnitude()
 
 
-def test_pose_inside_an_exposure_of_a_tumbling_vehicle() -> None:
+def test_the_pose_within_an_exposure_is_exact_for_a_tumbling_vehicle() -> None:
     """2 rad/s under torques of up to 1 N m that change each 10 ms: within 1e-11 rad of the finer run."""
     vehicle = multibody.build(vehicle_config(mount="free"))
     control = still(vehicle, 2.0)
@@ -351,7 +351,7 @@ def test_pose_inside_an_exposure_of_a_tumbling_vehicle() -> None:
     assert apart_from_a_finer_run_rad(vehicle, np.array([1.0, 1.5, -1.0]), control).max() < 1e-11
 
 
-def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
+def test_the_pose_within_an_exposure_is_exact_with_unbalanced_wheels() -> None:
     """3000 rpm, 1 g cm and 1 g cm2 out of balance, on the bearing: within 3e-9 rad, 0.6 milliarcseconds.
 
     The shaking is 200 times that. A step is a twentieth of a wheel's turn; what Runge and Kutta lose in the rate of
@@ -367,8 +367,8 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
 
 
 @pytest.mark.slow
-def test_pose_inside_an_exposure_while_gimbals_are_driven() -> None:
-    """CMGs at 2600 rpm whose gimbals are told another rate each 10 ms: within 1e-9 rad."""
+def test_the_pose_within_an_exposure_is_exact_with_driven_gimbals() -> None:
+    """CMGs at 2600 rpm whose gimbal rates change every 10 ms: within 1e-9 rad."""
     vehicle = multibody.build(vehicle_config(cmgs={}))
     rng = np.random.default_rng(6)
     control = still(vehicle, 2.0)

@@ -103,7 +103,7 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
     assert errors[0][0] < 0.05 * ARCSEC_RAD
 
 
-def test_it_is_better_at_the_ends_than_the_spline_of_rotation_vectors() -> None:
+def test_the_spline_beats_that_of_rotation_vectors_at_the_ends() -> None:
     """Which the module says: SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
     t = np.linspace(0, 6, 4001)
     ours = angle(attitudes(fit_spline(sampled()), t), tumble(t)).max()
@@ -120,7 +120,7 @@ def test_it_is_better_at_the_ends_than_the_spline_of_rotation_vectors() -> None:
     )
 
 
-def test_a_quaternion_and_its_negative_are_one_attitude() -> None:
+def test_a_quaternion_and_its_negative_are_the_same_attitude() -> None:
     """The file may change the sign at any sample."""
     flipped = tumble(TIMES).as_quat() * np.where(np.arange(len(TIMES)) % 3, 1, -1)[:, None]
     columns = {"t_s": TIMES} | {
@@ -180,14 +180,14 @@ TABLES = {
     "scalar last": (quaternion_columns("lab_from_body_q", MOTION, "xyzw"), None),
     "any order": (quaternion_columns("lab_from_body_q", MOTION, "zwyx"), None),
     "inverse": (quaternion_columns("body_from_lab_q", MOTION.inv()), None),
-    "told": (quaternion_columns("q_", MOTION, "xyzw"), "lab_from_body"),
-    "told inverse": (quaternion_columns("q_", MOTION.inv(), "wxyz"), "body_from_lab"),
+    "frames given": (quaternion_columns("q_", MOTION, "xyzw"), "lab_from_body"),
+    "frames given, inverse": (quaternion_columns("q_", MOTION.inv(), "wxyz"), "body_from_lab"),
     "angles": (angles_columns(), None),
 }
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_columns_mean_what_their_names_say(name: str, tmp_path: Path) -> None:
+def test_column_names_give_order_and_direction(name: str, tmp_path: Path) -> None:
     columns, rotation = TABLES[name]
     for source in (csv(tmp_path / "p.csv", columns), columns):
         read = read_profile(source, START, rotation)
@@ -251,7 +251,7 @@ def test_tables_of_astropy_and_pandas_are_read_with_their_dates(tmp_path: Path) 
 
 
 GOOD = "t_s,roll_deg,pitch_deg,yaw_deg\n0,0,0,0\n1,1,0,0\n2,2,0,0\n3,3,0,0\n"
-SLIPS = [
+FAULTY_TABLES = [
     (
         GOOD.replace("roll_deg", "roll"),
         r"line 1: unknown column 'roll'; allowed: t_s or utc, with A_from_B_qx",
@@ -300,18 +300,20 @@ SLIPS = [
 ]
 
 
-@pytest.mark.parametrize(("content", "told"), SLIPS)
-def test_a_slip_in_a_table_is_told_with_its_line(content: str, told: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("content", "message"), FAULTY_TABLES)
+def test_an_error_in_a_table_is_reported_with_its_line(
+    content: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "p.csv"
     path.write_text(content)
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         check_samples(read_profile(path, START))
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
 
 
-def test_the_good_table_is_read(tmp_path: Path) -> None:
-    """So that each of the slips above is what is refused."""
+def test_the_table_without_faults_is_read(tmp_path: Path) -> None:
+    """Without a fault the same table is read, so each fault above is the cause of its refusal."""
     (tmp_path / "p.csv").write_text(GOOD)
     assert len(check_samples(read_profile(tmp_path / "p.csv", START)).t_s) == 4
 
@@ -338,7 +340,7 @@ def test_a_file_too_large_or_no_text_is_refused(
 @pytest.mark.parametrize(
     "table", [3, "text", [1, 2], {"t_s": [0, 1], "roll_deg": ["a", "b"]}, {"t_s": [[1], [2]]}]
 )
-def test_what_is_no_table_is_refused(table: object) -> None:
+def test_an_object_that_is_not_a_table_is_refused(table: object) -> None:
     with pytest.raises(InputError, match=r"^profile"):
         read_profile(table, START)
 
@@ -404,7 +406,7 @@ def read_text(content: str, tmp_path: Path, name: str = "p.aem") -> Samples:
 
 
 @pytest.mark.parametrize("frames", [("ICRF", "STARTRACKER_1"), ("LAB", "SC_BODY_1")])
-def test_what_we_write_is_read_as_it_was(frames: tuple[str, str], tmp_path: Path) -> None:
+def test_a_written_profile_is_read_unchanged(frames: tuple[str, str], tmp_path: Path) -> None:
     utc = [START + datetime.timedelta(seconds=float(t)) for t in TIMES + 1.5]
     read = read_text(run_export.message("x", ["COMMENT"], frames, utc, MOTION), tmp_path)
     assert read.direction == {"ICRF": "icrs_from_cam", "LAB": "lab_from_body"}[frames[0]]
@@ -505,7 +507,7 @@ def test_epochs_of_every_time_system_are_turned_into_utc(
     np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=2e-3 if system == "TDB" else 1e-6)
 
 
-def test_epochs_may_count_the_days_of_the_year(tmp_path: Path) -> None:
+def test_epochs_may_use_the_day_of_the_year(tmp_path: Path) -> None:
     content = aem(segment(MOTION, TIMES))
     read = read_text(content.replace("\n2016-12-31T", "\n2016-366T"), tmp_path)
     np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=1e-9)
@@ -528,7 +530,7 @@ def test_segments_are_joined(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (aem(version="3.0"), "CCSDS_AEM_VERS is '3.0'; allowed: 1.0, 2.0"),
         (aem(), "no segment"),
@@ -578,8 +580,10 @@ def test_segments_are_joined(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_slip_in_an_aem_is_told_with_its_line(content: str, told: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=told) as raised:
+def test_an_error_in_an_aem_is_reported_with_its_line(
+    content: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message) as raised:
         read_text(content, tmp_path)
     assert str(raised.value).startswith(str(tmp_path / "p.aem"))
     assert "\n" not in str(raised.value)
@@ -592,9 +596,9 @@ def stk(
     rotations: Rotation, section: str = "AttitudeTimeQuaternions", more: str = "", **keywords: str
 ) -> str:
     rows = rotations.as_quat(scalar_first="First" in section)
-    told = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
-    told |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
-    lines = [f"  {key}\t{value}" for key, value in (told | keywords).items() if value]
+    defaults = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
+    defaults |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
+    lines = [f"  {key}\t{value}" for key, value in (defaults | keywords).items() if value]
     data = [
         f"{t!r} {' '.join(map(repr, row))}{more}"
         for t, row in zip(TIMES.tolist(), rows.tolist(), strict=True)
@@ -633,7 +637,7 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (
             stk(MOTION, CoordinateAxes="Fixed"),
@@ -680,10 +684,10 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
         ),
     ],
 )
-def test_a_slip_in_an_stk_file_is_told_with_its_line(
-    content: str, told: str, tmp_path: Path
+def test_an_error_in_an_stk_file_is_reported_with_its_line(
+    content: str, message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         read_text(content, tmp_path, "p.a")
     assert "\n" not in str(raised.value)
 
@@ -724,7 +728,7 @@ def test_a_profile_counts_from_its_maneuver_or_from_the_scene() -> None:
         assert angle(reference.attitudes(t), attitudes(spline, t - zero_s)).max() < 1e-13
 
 
-def test_it_goes_on_at_the_rate_at_which_it_ended() -> None:
+def test_after_its_end_a_profile_continues_at_its_last_rate() -> None:
     spline = fit_spline(sampled())
     motion = following().model_copy(update={"start": "profile"})
     reference = plan(motion, None, (spline,))
@@ -738,7 +742,7 @@ def test_it_goes_on_at_the_rate_at_which_it_ended() -> None:
     )
 
 
-def test_a_profile_that_does_not_join_on_is_refused() -> None:
+def test_a_profile_that_does_not_start_where_the_previous_element_ends_is_refused() -> None:
     spline = fit_spline(sampled())
     with pytest.raises(
         InputError,
@@ -767,7 +771,7 @@ def test_the_vehicle_starts_where_the_first_of_two_profiles_does() -> None:
     )
 
 
-def test_the_spline_is_scipys(tmp_path: Path) -> None:
+def test_the_spline_matches_scipy(tmp_path: Path) -> None:
     """Sample by sample against CubicSpline, whose coefficients it evaluates."""
     cubic = CubicSpline(TIMES, MOTION.as_quat(scalar_first=True))
     t = np.linspace(0, 6, 700)

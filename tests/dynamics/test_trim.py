@@ -27,7 +27,7 @@ def trimmed(*position_mm: float, step: str = "1 um") -> multibody.VehicleModel:
     return vehicle(trim={"position": [f"{one} mm" for one in position_mm], "step": step})
 
 
-def test_moved_masses_change_center_and_inertia_as_mujoco_weighs_them() -> None:
+def test_moved_masses_change_center_and_inertia_as_in_mujoco() -> None:
     """In MuJoCo's own sum over bodies: the center moves by mass times travel over the total, the axes' inertia too."""
     moved = trimmed(3, -5, 12)
     still = vehicle()
@@ -61,7 +61,7 @@ def test_a_trimmed_vehicle_swings_with_its_new_period() -> None:
     )  # products of inertia couple a little
 
 
-def test_masses_are_held_at_whole_steps_and_locked_without_the_section() -> None:
+def test_trim_masses_move_in_whole_steps_and_are_locked_without_their_section() -> None:
     np.testing.assert_allclose(
         trimmed(1.0031, 0, 0, step="2 um").trims.position_m, [1.004e-3, 0, 0], atol=1e-12
     )
@@ -70,7 +70,7 @@ def test_masses_are_held_at_whole_steps_and_locked_without_the_section() -> None
     assert trimmed(1, 2, 3).trims.names == ("trim_x", "trim_y", "trim_z")
 
 
-def test_what_a_motor_cannot_hold_is_refused() -> None:
+def test_a_mass_that_a_motor_cannot_hold_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"^vehicle.trim.position: 2 values; allowed: 3, one for each of trim_x, "
     ):

@@ -58,7 +58,7 @@ assert len(StarCatalog.read(CATALOG)) > 7000
 """
 
 
-def test_what_is_blocked_cannot_be_imported() -> None:
+def test_a_blocked_module_cannot_be_imported() -> None:
     for name in ("skysim", "astropy", "erfa", "lazy_loader"):
         done = subprocess.run(
             [sys.executable, "-c", f"{BLOCK}import {name}"], capture_output=True, text=True
@@ -67,7 +67,7 @@ def test_what_is_blocked_cannot_be_imported() -> None:
 
 
 @pytest.mark.slow
-def test_it_solves_where_nothing_else_can_be_imported() -> None:
+def test_estimator_solves_without_any_other_package() -> None:
     catalog = f"CATALOG = {str(ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv')!r}"
     done = subprocess.run(
         [sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"], cwd=ROOT, capture_output=True, text=True
@@ -79,7 +79,7 @@ def test_it_solves_where_nothing_else_can_be_imported() -> None:
 
 
 @pytest.mark.long
-def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
+def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     """With what pip brings along, and nothing of this environment; then with the extra for dates."""
     wheels = tmp_path / "wheels"
     bare = tmp_path / "bare"
@@ -96,13 +96,13 @@ def test_its_own_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
     catalog += "CATALOG = ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv'"
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
-    def told() -> str:
+    def printed() -> str:
         done = subprocess.run(
             [python, "-c", f"{catalog}{WORK}"], cwd=here, env=clean, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
 
-    assert told().startswith("a date needs pyerfa")
+    assert printed().startswith("a date needs pyerfa")
     subprocess.run([python, *quiet, "install", f"{wheel}[sky]"], check=True)
-    assert told() == "with a date"
+    assert printed() == "with a date"

@@ -382,7 +382,7 @@ OTHERS: list[Case] = [
         for name, call, message in cases
     ],
 )
-def test_it_is_refused_in_one_line(call: Callable[[], object], message: str) -> None:
+def test_invalid_input_is_refused_in_one_line(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message) as refused:
         call()
     assert len(str(refused.value).splitlines()) == 1

@@ -76,7 +76,7 @@ def test_table_is_balanced_below_the_published_torque(
 
 
 @pytest.mark.slow
-def test_simsat_is_weighed_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simsat_is_measured_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
     """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
     monkeypatch.setattr(balance_flight, "measured_attitudes", noisy_truth)
     scene = scene_of("simsat_slew")
@@ -113,7 +113,7 @@ def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
     assert np.degrees(np.abs(turned[:, 2]).max()) > 115
 
 
-def test_masses_go_where_the_moment_vanishes() -> None:
+def test_trim_masses_move_to_cancel_the_moment() -> None:
     scene = scene_of(
         "cubesat_table", vehicle__trim="{position: [1 mm, 2 mm, -3 mm], step: 0.001 um}"
     )
@@ -145,7 +145,7 @@ def test_masses_go_where_the_moment_vanishes() -> None:
         ),
     ],
 )
-def test_what_cannot_be_balanced_is_refused(
+def test_a_vehicle_that_cannot_be_balanced_is_refused(
     name: str, overrides: dict[str, str], message: str
 ) -> None:
     with pytest.raises(InputError) as refused:
@@ -163,7 +163,7 @@ def record_of(rate_deg_s: float) -> BearingRecord:
     )
 
 
-def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
+def test_an_undetermined_quantity_is_named_with_a_sufficient_maneuver() -> None:
     """Information beyond the assumed grows with time and with the square of the motion."""
     sigma = np.array([*[0.1] * 3, *[0.05] * 3, *[1e-3] * 3, *[1.0] * 11])
     prior = Prior(np.array([1.0] * 3 + [0.0] * 17), sigma)
@@ -226,7 +226,7 @@ def test_wrong_uncertainties_are_refused(
     assert str(refused.value).startswith(message)
 
 
-def test_wrong_bars_are_refused() -> None:
+def test_wrong_accuracy_limits_are_refused() -> None:
     for torque, offset, message in (
         ("5 m", None, "balance.torque: '5 m' is not a torque"),
         ("0 N m", None, "balance.torque: 0 N m; allowed: above 0"),

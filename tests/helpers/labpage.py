@@ -43,7 +43,7 @@ NARROW = {"width": 1280, "height": 800}
 class Server:
     """A process that serves the page, with a folder of its own."""
 
-    def __init__(self, folder: Path, *told: str, host: str = "127.0.0.1") -> None:
+    def __init__(self, folder: Path, *options: str, host: str = "127.0.0.1") -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -65,7 +65,7 @@ class Server:
             name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
         }
         self.process = subprocess.Popen(
-            [*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True
+            [*command, *place, *options], cwd=ROOT, env=environment, start_new_session=True
         )
         self.url = f"http://127.0.0.1:{self.port}/"
         self.login = f"{self.url}?token={TOKEN}"
@@ -277,8 +277,8 @@ def exported(page: Any, kind: str, folder: Path) -> Path:
 
 def brightness(page: Any) -> float:
     """Of the canvas, 0 to 255."""
-    told = page.locator(".lab-frame canvas").screenshot()
-    return float(cv2.imdecode(np.frombuffer(told, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
+    screenshot = page.locator(".lab-frame canvas").screenshot()
+    return float(cv2.imdecode(np.frombuffer(screenshot, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
 
 
 def screen(page: Any, x: float, y: float) -> tuple[float, float]:
@@ -305,8 +305,8 @@ def picture(page: Any, **how: Any) -> np.ndarray:
 
 def pixels(page: Any) -> list[tuple[int, int, int]]:
     """(x, y, DN) of the pixels that are enlarged."""
-    told = page.locator(".lab-loupe[aria-label^=pixels]").get_attribute("aria-label")
-    x, y, across, down, *values = map(int, re.findall(r"\d+", told))
+    label = page.locator(".lab-loupe[aria-label^=pixels]").get_attribute("aria-label")
+    x, y, across, down, *values = map(int, re.findall(r"\d+", label))
     assert len(values) == across * down
     return [(x + n % across, y + n // across, dn) for n, dn in enumerate(values)]
 

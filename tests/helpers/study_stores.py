@@ -33,7 +33,7 @@ def contents(path: Path) -> str:
 
 
 def done(
-    told: plan.Plan,
+    study_plan: plan.Plan,
     path: Path,
     engine: engines.Engine | None = None,
     resume: bool = False,
@@ -41,5 +41,5 @@ def done(
 ) -> runner.Progress:
     """Do a study's missing trials, in this process if no engine is named."""
     with store.writing(path) as kept:
-        runner.prepare_store(told, kept, resume)
-        return runner.run(told, kept, engine or engines.Serial(), watch)
+        runner.prepare_store(study_plan, kept, resume)
+        return runner.run(study_plan, kept, engine or engines.Serial(), watch)

@@ -29,7 +29,7 @@ def utc(count: int) -> list[datetime.datetime]:
     "frames", [(run_export.ICRF, run_export.CAMERA), (run_export.LAB, run_export.BODY)]
 )
 @pytest.mark.parametrize("count", [1, 2, 200])
-def test_it_is_valid_and_says_what_was_meant(
+def test_our_aem_is_valid_and_has_the_intended_metadata(
     tmp_path: Path, frames: tuple[str, str], count: int
 ) -> None:
     """Version, frames, span and every digit of every quaternion; and it survives being written by them as XML."""
@@ -43,9 +43,9 @@ def test_it_is_valid_and_says_what_was_meant(
     assert (read.version, read.header.originator) == ("2.0", "SKYSIM")
     for message in (read, ndm.Aem.from_str(read.to_str("xml"))):
         (segment,) = message.segments
-        told = segment.metadata
-        assert (told.ref_frame_a, told.ref_frame_b) == frames
-        assert (told.time_system, told.attitude_type, told.object_name) == (
+        metadata = segment.metadata
+        assert (metadata.ref_frame_a, metadata.ref_frame_b) == frames
+        assert (metadata.time_system, metadata.attitude_type, metadata.object_name) == (
             "UTC",
             "QUATERNION",
             "AFIT_SIMSAT",
@@ -54,7 +54,7 @@ def test_it_is_valid_and_says_what_was_meant(
             datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs
         ]
         assert epochs == utc(count)
-        assert (told.start_time, told.stop_time) == (
+        assert (metadata.start_time, metadata.stop_time) == (
             run_export.epoch(epochs[0]),
             run_export.epoch(epochs[-1]),
         )
@@ -62,7 +62,7 @@ def test_it_is_valid_and_says_what_was_meant(
         assert off.max() < 1e-14
 
 
-def test_their_reader_refuses_what_ours_never_writes() -> None:
+def test_ccsds_ndm_refuses_a_malformed_aem() -> None:
     """So that the tests above can fail."""
     good = run_export.message(
         "x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2)
@@ -81,7 +81,7 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
         )
 
 
-def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
+def test_an_aem_written_by_ccsds_ndm_is_read_by_skysim(tmp_path: Path) -> None:
     """Both readers take the same numbers for the same epochs. Theirs does not know the keywords of version 1.0."""
     meant = Rotation.from_rotvec(np.outer(np.arange(9.0), [0.01, -0.02, 0.005]))
     text = run_export.message("x", ["of ours"], (run_export.ICRF, run_export.BODY), utc(9), meant)
@@ -92,12 +92,12 @@ def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
     assert read.direction == "icrs_from_body"
     np.testing.assert_allclose(read.t_s, np.arange(9) / 10, rtol=0, atol=1e-9)
     (segment,) = theirs.segments
-    told = Rotation.from_quat(segment.data.attitude_states_numpy)
-    assert (read.a_from_b * told.inv()).magnitude().max() < 1e-14
+    their_attitudes = Rotation.from_quat(segment.data.attitude_states_numpy)
+    assert (read.a_from_b * their_attitudes.inv()).magnitude().max() < 1e-14
     assert (read.a_from_b * meant.inv()).magnitude().max() < 1e-14
 
 
-def test_the_page_s_code_reads_it(
+def test_the_page_s_code_reads_our_aem(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")

@@ -28,7 +28,7 @@ def pairs(name: str, who: str, frames: int, seed: int) -> list[oracles.Pair]:
 
 
 @pytest.mark.parametrize("who", oracles.ORACLES)
-def test_its_coordinates_agree_with_our_truth(who: str) -> None:
+def test_a_solver_s_coordinates_agree_with_our_truth(who: str) -> None:
     held = pairs(SHEFEX, who, 8, 5)
     assert len(held) >= 7
     for coordinates, stars in held:
@@ -38,8 +38,8 @@ def test_its_coordinates_agree_with_our_truth(who: str) -> None:
 
 
 @pytest.mark.parametrize("who", oracles.ORACLES)
-def test_it_finds_our_stars_where_a_bent_lens_has_them(who: str) -> None:
-    """Corners 12.5 px from where a straight lens has them, told by the SIP polynomials of our header."""
+def test_a_solver_finds_our_stars_through_a_distorted_lens(who: str) -> None:
+    """Distortion moves the corners by 12.5 px; the solver knows it from the SIP polynomials of our header."""
     held = pairs(WIDE, who, 4, 5)
     assert len(held) >= 3
     assert all(stars.within for _, stars in held)
@@ -47,9 +47,9 @@ def test_it_finds_our_stars_where_a_bent_lens_has_them(who: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("who", oracles.ORACLES)
-def test_two_hundred_frames_agree(who: str) -> None:
+def test_two_hundred_frames_are_solved_with_the_predicted_error(who: str) -> None:
     """Nearly all solved, none wrong, and the prediction is right: mean squares of the errors over it are 1, which
-    196 frames scatter by 0.07 (two axes) and 0.10 (one). A frame whose scatter is its own is told to be worse."""
+    196 frames scatter by 0.07 (two axes) and 0.10 (one). A frame with its own scatter predicts more."""
     held = pairs(SHEFEX, who, 200, 1)
     assert len(held) >= 200 * SOLVED[who]
     for part in zip(*held, strict=True):
@@ -60,7 +60,7 @@ def test_two_hundred_frames_agree(who: str) -> None:
         assert 0.6 < roll < 1.4
 
 
-def test_the_law_catches_a_header_that_is_off() -> None:
+def test_a_wrong_header_is_detected() -> None:
     """A sixth of a pixel between truth and header, or the Earth's motion left out (20 arcsec): not within."""
     ray = np.column_stack([np.random.default_rng(1).uniform(-0.1, 0.1, (25, 2)), np.ones(25)])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -96,6 +96,6 @@ def test_the_predicted_errors_are_those_of_least_squares() -> None:
         arms = pixels - middle
         spin = np.sum(arms[:, 0] * moved[:, 1] - arms[:, 1] * moved[:, 0]) / np.sum(arms**2)
         shifts.append([*moved.mean(axis=0) / believed.focal_px, spin])
-    for drawn, told in ((turns, attitude), (shifts, plate)):
+    for drawn, predicted in ((turns, attitude), (shifts, plate)):
         x, y, z = np.std(drawn, axis=0)
-        np.testing.assert_allclose(told, (np.hypot(x, y), z), rtol=0.06, atol=0)
+        np.testing.assert_allclose(predicted, (np.hypot(x, y), z), rtol=0.06, atol=0)

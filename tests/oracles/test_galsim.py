@@ -122,7 +122,7 @@ def worst(image: Kernel, parts: list[Any], seed: int) -> float:
 
 @pytest.mark.parametrize("radius_px", [0.0, 1.2, 4.3])
 @pytest.mark.parametrize("name", LENSES)
-def test_every_kind_of_lens_and_an_emitting_disk_behind_it(name: str, radius_px: float) -> None:
+def test_every_kind_of_lens_images_a_disk_as_galsim(name: str, radius_px: float) -> None:
     psf, camera, parts = LENSES[name]
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
     error = worst(
@@ -131,13 +131,13 @@ def test_every_kind_of_lens_and_an_emitting_disk_behind_it(name: str, radius_px:
     assert error < TOLERANCE.get((name, radius_px), 5e-4)
 
 
-def test_emitter_and_defocus_together() -> None:
+def test_emitter_and_defocus_combine_as_in_galsim() -> None:
     psf, camera, parts = LENSES["gaussian 0.7"]
     disks = [galsim.TopHat(radius, gsparams=ACCURATE) for radius in (10.0, 3.5)]
     assert worst(build_kernel(psf, camera, 0, 10.0, 3.5), [*parts, *disks], seed=5) < 5e-4
 
 
-def test_the_wings_put_back_are_those_that_are_missing() -> None:
+def test_restored_wings_equal_the_missing_light() -> None:
     """Unscaled, an Airy image is brighter than the whole one by the light beyond its reach: 2 / (pi z)."""
     psf, camera, parts = LENSES["airy f/8"]
     image = build_kernel(psf, camera)
@@ -148,7 +148,7 @@ def test_the_wings_put_back_are_those_that_are_missing() -> None:
 
 
 @pytest.mark.parametrize("radius_px", [0.0, 4.3])
-def test_a_measured_lens_of_no_symmetry(tmp_path: Path, radius_px: float) -> None:
+def test_a_measured_asymmetric_lens_images_as_galsim(tmp_path: Path, radius_px: float) -> None:
     """GalSim draws the cells of a lopsided lens; our image of them against its image of the lens itself."""
     core = galsim.Gaussian(sigma=0.8, gsparams=ACCURATE).shear(g1=0.2, g2=0.1)
     lens = core + 0.3 * galsim.Gaussian(sigma=1.1, gsparams=ACCURATE).shift(1.5, 0.8)

@@ -18,7 +18,7 @@ def held(name: str, frames: int, mirrors: int, seed: int) -> list[galsim_sky.Out
 
 
 @pytest.mark.parametrize("name", galsim_sky.SETUPS)
-def test_we_solve_them_and_refuse_them_in_a_mirror(name: str) -> None:
+def test_galsim_s_frames_are_solved_and_their_mirror_images_refused(name: str) -> None:
     """As a photograph with its field some per cent wrong, and as a calibrated tracker."""
     for outcome in held(name, 5, 1, 7):
         assert len(outcome.solved) >= 4
@@ -28,7 +28,7 @@ def test_we_solve_them_and_refuse_them_in_a_mirror(name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", galsim_sky.SETUPS)
-def test_seventy_of_each_are_as_good_as_we_claim(name: str) -> None:
+def test_seventy_frames_of_each_kind_have_the_claimed_errors(name: str) -> None:
     """NEES is chi-square of three degrees of freedom where a covariance is true: 65 of them have a mean of 3 +- 0.3.
     Ours claims no less than the truth, and more for its floors: 0.03 px of a star, 0.1 px in a photograph."""
     photograph, tracker = held(name, 67, 13, 1)

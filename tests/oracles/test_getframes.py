@@ -66,7 +66,7 @@ def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarra
 
 
 @pytest.mark.parametrize("mean_e", [0.0, 5.0, 300.0, 20_000.0])
-def test_mean_and_variance_of_the_numbers_agree(mean_e: float) -> None:
+def test_mean_and_variance_agree_with_getframes(mean_e: float) -> None:
     mine, theirs = both(mean_e)
     count = mine.size
     variance = mine.var()
@@ -74,7 +74,7 @@ def test_mean_and_variance_of_the_numbers_agree(mean_e: float) -> None:
     assert variance == pytest.approx(theirs.var(), rel=5 * np.sqrt(2 * 2 / count))
 
 
-def test_fixed_pattern_spreads_pixels_alike() -> None:
+def test_fixed_pattern_noise_agrees_with_getframes() -> None:
     """PRNU of 2 % and a dark current that varies by 30 %: the scatter of the pixels' own means."""
     spread = [
         frames.mean(axis=0).std() for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)
@@ -82,6 +82,6 @@ def test_fixed_pattern_spreads_pixels_alike() -> None:
     assert spread[0] == pytest.approx(spread[1], rel=5 * np.sqrt(2 / (2 * SHAPE[0] * SHAPE[1])))
 
 
-def test_saturation_is_the_same_number() -> None:
+def test_saturation_agrees_with_getframes() -> None:
     mine, theirs = both(1e5, read_noise_e=0.0)
     np.testing.assert_allclose(mine, np.median(theirs), rtol=0, atol=1)

@@ -150,7 +150,7 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
 
 
 @pytest.mark.slow
-def test_right_of_mujoco_s_camera_is_right_and_up_is_up(tmp_path: Path) -> None:
+def test_mujoco_s_camera_has_the_image_axes_of_ours(tmp_path: Path) -> None:
     """By MuJoCo's manual alone: its camera looks along -z, +x is right, +y is up; row 0 is the top."""
     balls_m = np.array([[0.6, 0.0, -2.0], [0.0, 0.4, -2.0]])
     right, above = middles(drawn(world_xml(*POSES["as it comes"]), balls_m, tmp_path / "balls.npy"))

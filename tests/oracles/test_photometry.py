@@ -68,7 +68,7 @@ def test_sep_measures_the_true_electrons(stars: dict[str, Any]) -> None:
     within_its_noise(flux, stars, np.pi * 16)
 
 
-def test_sep_finds_the_stars_where_they_are(stars: dict[str, Any]) -> None:
+def test_sep_finds_the_stars_at_their_positions(stars: dict[str, Any]) -> None:
     sep = pytest.importorskip("sep")
     found = sep.extract(np.ascontiguousarray(stars["image"]), 6.0, err=stars["noise_e"])
     away = np.linalg.norm(np.column_stack([found["x"], found["y"]])[:, None] - stars["xy"], axis=2)

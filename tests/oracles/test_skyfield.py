@@ -72,7 +72,7 @@ def named(skyfield: Skyfield, name: str) -> Any:
 
 
 @pytest.mark.parametrize("on_ground", [False, True], ids=["geocenter", "site"])
-def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
+def test_places_match_skyfield(skyfield: Skyfield, on_ground: bool) -> None:
     worst = dict.fromkeys(NAMES, 0.0)
     for ours, theirs, _ in observers(skyfield, on_ground):
         for name in NAMES:
@@ -83,7 +83,7 @@ def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
     assert max(worst.values()) < LIMIT_ARCSEC, worst
 
 
-def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
+def test_satellites_match_skyfield(skyfield: Skyfield, tmp_path: Path) -> None:
     """Places in the GCRS, apparent places from a site with light time and aberration, and where they are sunlit.
 
     Skyfield's Earth casts the shadow of a sphere and lights a satellite or not: near the limb they may differ.
@@ -129,7 +129,7 @@ def circular_tle(number: int, rng: np.random.Generator) -> list[str]:
     return [line + orbit_elements.checksum(line) for line in lines]
 
 
-def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
+def test_magnitudes_match_skyfield(skyfield: Skyfield) -> None:
     """Its front end takes the Sun to be at the barycenter (0.18 mag for Mercury), so it is given the distances."""
     library = pytest.importorskip("skyfield.magnitudelib")
     worst = dict.fromkeys(NAMES[2:], 0.0)

@@ -1,4 +1,4 @@
-"""tetra3rs as a tracker (extra `oracle`): told our camera, it finds our skies where they are."""
+"""tetra3rs as a tracker (extra `oracle`): with our camera model it finds the true attitudes of our frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from skysim.tracking.tracker_interface import Setup
 tetra3rs = pytest.importorskip("tetra3rs")
 
 
-def test_its_camera_is_ours() -> None:
+def test_tetra3rs_s_camera_model_matches_ours() -> None:
     """Distorted, off-center: both turn pixels to the same tangents, by two pieces of code."""
     f = 2500.0
     center = (331.0, 244.0)
@@ -35,17 +35,17 @@ def test_its_camera_is_ours() -> None:
     theirs = tetra3rs_tracker.camera_model(tetra3rs, setup)
     middle = tetra3rs_tracker.image_center_px(setup)
     xy_px = np.array([[20.0, 30.0], [600.0, 400.0], [330.0, 10.0]])
-    told = [theirs.pixel_to_tanplane(*(xy - middle)) for xy in xy_px]
+    tangents = [theirs.pixel_to_tanplane(*(xy - middle)) for xy in xy_px]
     ours = Camera(659, 493, f, center, bent).tangents(xy_px)
-    np.testing.assert_allclose(told, ours, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(tangents, ours, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("options", ["{}", "{fast: true}"])
-def test_it_solves_our_frames_without_a_bias(options: str) -> None:
+def test_tetra3rs_solves_our_frames_without_bias(options: str) -> None:
     """Twelve fields; proper motion and aberration (20 arcsec) are both its own, so what is left is noise."""
     keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
-    told = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
-    shots = list(open_flight(told).shots())
+    scene = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
+    shots = list(open_flight(scene).shots())
     rows = [scoring.score(shot).row for shot in shots]
     assert sum(row.status == "solved" for row in rows) >= 11
     assert not any(row.wrong for row in rows)
@@ -58,7 +58,7 @@ def test_it_solves_our_frames_without_a_bias(options: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["afit_simsat", "collimated_display"])
-def test_it_refuses_what_is_no_sky(name: str) -> None:
+def test_tetra3rs_is_refused_for_a_scene_without_a_sky(name: str) -> None:
     with pytest.raises(InputError, match=re.escape("tetra3rs solves star fields only")):
         build_tracker(build_lab(loader.load(name, {"tracker.name": "tetra3rs"})).camera)
 
@@ -81,13 +81,13 @@ def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> No
     ]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    lines = told.get(
-        "scoreboard", [told | {"right": told.get("solved", 0) / told.get("frames", 1)}]
+    report = json.loads(done.stdout)
+    lines = report.get(
+        "scoreboard", [report | {"right": report.get("solved", 0) / report.get("frames", 1)}]
     )
     assert [line["wrong"] for line in lines] == [0] * len(lines)
     assert min(line["right"] for line in lines) > 0.9
 
 
-def test_it_is_an_entry_point_of_skysim() -> None:
+def test_tetra3rs_is_an_entry_point_of_skysim() -> None:
     assert tracker_interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs

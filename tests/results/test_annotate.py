@@ -25,7 +25,7 @@ def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
     return np.argwhere((picture == bgr).all(axis=2))[:, ::-1]
 
 
-def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
+def test_ticks_surround_the_true_positions_without_covering_them() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
     picture = plots.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[
         :1000
@@ -47,7 +47,7 @@ def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
     )  # the label leans to one side
 
 
-def test_what_nobody_can_see_is_not_marked_and_a_legend_names_the_colors() -> None:
+def test_invisible_sources_are_not_marked_and_a_legend_names_the_colors() -> None:
     """Of two sources the one with a signal-to-noise ratio of 2 has no ticks; one of unknown ratio has."""
     image = np.random.default_rng(1).normal(100, 5, (1200, 1000))
     sources = seen([(300.0, 400.0), (700.0, 800.0)], [False, False])

@@ -59,13 +59,13 @@ def sky_flight(folder: Path) -> Flight:
 
 def dome_flight(folder: Path) -> Flight:
     """A dome photographed into a folder by a noise-free camera: frames and truths."""
-    told = {
+    settings = {
         "exposure.frames": "2",
         "motion.start": "{roll_deg: 4, yaw_deg: 70}",
         "camera.shutter": "{kind: global}",
     }
     small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
-    flight = open_flight(loader.load("afit_simsat", told | small))
+    flight = open_flight(loader.load("afit_simsat", settings | small))
     for shot in flight.shots(solves=False):
         recording.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
     return flight
@@ -111,7 +111,7 @@ def matrix_b_from_a(q: Floats) -> Floats:
     )
 
 
-def test_the_standard_s_own_examples() -> None:
+def test_quaternions_match_the_standard_s_examples() -> None:
     """Annex F2.2: B is A turned by 90 deg about Z. F5.4: by 90, 10 and 45 deg about Z, X and Z, one after the other."""
     turns = Rotation.from_euler("ZXZ", [[90, 0, 0], [90, 10, 45]], degrees=True)
     text = run_export.message(
@@ -133,8 +133,8 @@ def test_under_the_stars_the_message_puts_every_star_on_its_pixel(
     flight, run = stars
     camera = flight.lab.camera
     run_export.export(run, ["aem"], tmp_path, quiet)
-    told, epochs, quaternions = read_aem(tmp_path / "truth.aem")
-    assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == (
+    metadata, epochs, quaternions = read_aem(tmp_path / "truth.aem")
+    assert (metadata["REF_FRAME_A"], metadata["REF_FRAME_B"], metadata["TIME_SYSTEM"]) == (
         "ICRF",
         "STARTRACKER_1",
         "UTC",
@@ -161,8 +161,8 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
     flight, run = dome
     camera = flight.lab.camera
     run_export.export(run, ["aem"], tmp_path, quiet)
-    told, _, quaternions = read_aem(tmp_path / "truth.aem")
-    assert (told["REF_FRAME_A"], told["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
+    metadata, _, quaternions = read_aem(tmp_path / "truth.aem")
+    assert (metadata["REF_FRAME_A"], metadata["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
     place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
     for stem, q in zip(run.stems, quaternions, strict=True):
         seen = Table.read(f"{stem}.ecsv")
@@ -172,7 +172,7 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
         np.testing.assert_allclose(
             pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5
         )
-    assert not (tmp_path / "solutions.aem").exists()  # nobody solved
+    assert not (tmp_path / "solutions.aem").exists()  # no frame was solved
 
 
 @pytest.mark.parametrize("which", ["stars", "dome"])
@@ -189,7 +189,7 @@ def test_angles_of_a_solution_are_its_attitude(which: str, request: pytest.Fixtu
     np.testing.assert_allclose((back * meant.inv()).magnitude(), 0, rtol=0, atol=1e-12)
 
 
-def test_a_message_is_what_the_notation_allows() -> None:
+def test_a_message_follows_the_standard_s_notation() -> None:
     """Printable ASCII, 254 characters a line, times that ascend, quaternions that do not jump."""
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
@@ -211,7 +211,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
 # Tables
 
 
-def test_parquet_is_the_ecsv_with_units(stars: Flown, tmp_path: Path) -> None:
+def test_parquet_has_the_columns_and_units_of_the_ecsv(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
     run_export.export(run, ["parquet", "ecsv"], tmp_path, quiet)
     answers = pyarrow.parquet.read_table(tmp_path / "solutions.parquet")
@@ -292,7 +292,7 @@ def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) 
     assert off.max() < 1e-12
 
 
-def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> None:
+def test_a_film_has_the_frame_rate_of_the_run(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
     (path,) = run_export.export(run, ["video"], tmp_path, quiet)
     film = cv2.VideoCapture(str(path))
@@ -351,7 +351,7 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
         ((-0.3, 0.1, 0.0, 0.0, -0.02), "10 mm"),
     ],
 )
-def test_the_header_s_polynomials_are_the_renderer_s_lens(
+def test_the_header_s_sip_polynomials_match_the_renderer_s_lens(
     distortion: tuple[float, ...], focal_length: str
 ) -> None:
     """Distortion of up to 100 px: forwards to 0.01 px, backwards exactly, as Brown's law is a polynomial."""
@@ -363,14 +363,14 @@ def test_the_header_s_polynomials_are_the_renderer_s_lens(
 
 
 @pytest.mark.slow
-def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
+def test_a_lens_beyond_sip_is_noted_in_header_and_warning() -> None:
     lens = camera((-0.3, 0.1, 0.0, 0.0, -0.02), "6.5 mm")
     forwards, backwards = misfits(lens)
-    told = wcs.header(lens, Rotation.identity())["SIPERR"]
-    assert told > 2 * wcs.MAX_ERROR_PX
-    assert told == pytest.approx(forwards, rel=2 / 3)
+    error_px = wcs.header(lens, Rotation.identity())["SIPERR"]
+    assert error_px > 2 * wcs.MAX_ERROR_PX
+    assert error_px == pytest.approx(forwards, rel=2 / 3)
     assert backwards < 1e-6
-    assert f"{told:.2g} px" in wcs.accuracy_warning(lens)
+    assert f"{error_px:.2g} px" in wcs.accuracy_warning(lens)
     wide = loader.load(
         "shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"}
     )
@@ -378,7 +378,7 @@ def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*datfix")
-def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
+def test_a_distorted_frame_s_header_maps_stars_to_their_pixels(stars: Flown) -> None:
     flight, run = stars
     sources = flight.lab.camera.sources
     seen = Table.read(f"{run.stems[2]}.ecsv")
@@ -403,7 +403,7 @@ def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
 # What cannot be
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(stars: Flown, tmp_path: Path) -> None:
+def test_bad_input_is_refused_in_one_line_and_leaves_no_file(stars: Flown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of a run"):
         recording.open_recording(tmp_path)
     with pytest.raises(
@@ -438,7 +438,7 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(
         ("# %ECSV 1.0", "# ECSV", "not an ECSV table"),
     ],
 )
-def test_a_damaged_truth_is_one_line(
+def test_a_damaged_truth_table_is_refused_in_one_line(
     stars: Flown, tmp_path: Path, old: str, new: str, complaint: str
 ) -> None:
     text = Path(f"{stars[1].stems[0]}.ecsv").read_text()

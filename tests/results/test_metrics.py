@@ -22,11 +22,11 @@ def turned(x: float, y: float, z: float) -> Rotation:
     return Rotation.from_rotvec([x, y, z]) * TRUTH
 
 
-def test_no_error_is_none() -> None:
+def test_equal_attitudes_have_zero_error() -> None:
     assert metrics.cross_and_roll_rad(TRUTH, TRUTH) == pytest.approx((0, 0), abs=1e-15)
 
 
-def test_cross_and_roll_are_the_turn_s_parts() -> None:
+def test_cross_and_roll_are_the_components_of_the_rotation() -> None:
     assert metrics.cross_and_roll_rad(turned(3e-4, -4e-4, 0), TRUTH) == pytest.approx(
         (5e-4, 0), abs=1e-15
     )
@@ -43,7 +43,7 @@ small = st.floats(-1e-4, 1e-4)
 
 @settings(max_examples=100, derandomize=True)
 @given(small, small, small)
-def test_cross_is_how_far_the_boresight_is_off(x: float, y: float, z: float) -> None:
+def test_cross_is_the_angle_between_the_boresights(x: float, y: float, z: float) -> None:
     """The angle between the two boresights on the sky, for small errors to their third power."""
     estimate = turned(x, y, z)
     sights = [rotation.inv().apply([0, 0, 1.0]) for rotation in (estimate, TRUTH)]
@@ -83,7 +83,7 @@ def test_an_error_that_the_tracker_claims_is_wrong_beyond_one_degree() -> None:
         assert metrics.is_wrong(arcmin * ARCMIN_RAD, nees) == wrong
 
 
-def test_normalized_error_by_hand() -> None:
+def test_the_normalized_error_matches_a_hand_calculation() -> None:
     covariance = np.diag([1e-8, 4e-8, 9e-8])
     nees = metrics.normalized_error_squared(turned(1e-4, 2e-4, 3e-4), TRUTH, covariance)
     assert nees == pytest.approx(1 + 1 + 1, rel=1e-10)
@@ -100,7 +100,7 @@ def test_normalized_error_is_chi_square_of_three_for_a_true_covariance() -> None
     assert np.var(nees) == pytest.approx(6, abs=4 * np.sqrt(252 / 3000))
 
 
-def test_overconfident_begins_where_one_correct_error_in_1e8_lies() -> None:
+def test_overconfident_means_rarer_than_one_correct_error_in_1e8() -> None:
     """The tail of chi-square with three degrees of freedom, erfc(sqrt(x / 2)) + sqrt(2 x / pi) exp(-x / 2), is 1e-8."""
 
     def tail(x: float) -> float:

@@ -42,7 +42,7 @@ def bought(**settings: str) -> dict[str, float]:
     return {line.part: line.quantity for line in listed(**settings).lines}
 
 
-def test_a_sphere_of_single_leds() -> None:
+def test_the_parts_of_a_sphere_of_single_leds_are_counted() -> None:
     """Wire: the arcs R (40 deg - t) from each LED to the rim, t uniform in cos t."""
     found = bought()
     radius_m = 1.2
@@ -58,7 +58,7 @@ def test_a_sphere_of_single_leds() -> None:
     assert "trigger" not in found
 
 
-def test_a_drive_of_its_own_and_a_code_take_channels() -> None:
+def test_individually_driven_and_coded_leds_need_driver_channels() -> None:
     pwm = bought(light__led__drive="{kind: pwm, filter: {time_constant: 20 ms}}")
     assert (pwm["driver"], pwm["microcontroller"], pwm["filter"]) == (
         19,
@@ -76,7 +76,7 @@ def test_a_drive_of_its_own_and_a_code_take_channels() -> None:
 
 
 @pytest.mark.parametrize("winding", ["latitude", "spiral", "meridian"])
-def test_tape_is_as_long_as_its_pitches(winding: str) -> None:
+def test_the_length_of_tape_is_the_sum_of_its_pitches(winding: str) -> None:
     scene = loader.load("afit_simsat", SPHERE | {"light.layout": TAPE % winding})
     layout = build_design(scene).light.layout
     assert isinstance(layout, StringConfig)
@@ -96,7 +96,7 @@ def test_tape_is_as_long_as_its_pitches(winding: str) -> None:
         assert found["tape"] == pytest.approx(found["shell"] / 0.1, rel=0.1)
 
 
-def test_tape_whose_leds_differ_has_drivers() -> None:
+def test_tape_with_unequal_leds_needs_drivers() -> None:
     for key, value in {
         "light__led__code": "{kind: hamming}",
         "light__led__drive": "{kind: pwm}",
@@ -109,7 +109,7 @@ def test_tape_whose_leds_differ_has_drivers() -> None:
         assert "tape" not in found
 
 
-def test_boards_hold_their_leds() -> None:
+def test_the_number_of_boards_follows_from_leds_per_board() -> None:
     layout = "{kind: patch_boards, cap_deg: 27, spacing: 2.2 in, pitch: 8 mm, lit: [4, 4]}"
     found = bought(light__layout=layout)
     assert found["led"] == 4 * found["board"]
@@ -118,7 +118,7 @@ def test_boards_hold_their_leds() -> None:
     assert own["sequencer"] == own["board"]
 
 
-def test_a_survey_is_the_cheapest_that_is_good_enough() -> None:
+def test_the_cheapest_sufficient_survey_is_chosen() -> None:
     for sigma, part in {
         "1 mm": "survey_pattern",
         "0.9 mm": "survey_total_station",
@@ -150,13 +150,13 @@ def test_the_table_adds_up() -> None:
         assert total == pytest.approx(fixed + quantity * price, rel=5e-3)
 
 
-def test_every_part_has_a_price_that_is_called_assumed() -> None:
+def test_every_part_has_a_price_marked_as_assumed() -> None:
     text = find_prices("assumed").read_text()
     assert "all of them assumed" in text.splitlines()[0]
     assert {*UNITS} <= {*ASSUMED.parts}
 
 
-def test_the_sky_has_no_parts() -> None:
+def test_a_sky_scene_has_no_parts_list() -> None:
     with pytest.raises(InputError, match=r"light.kind: stars has no parts; allowed: dome"):
         parts_list(loader.load("shefex2"), ASSUMED)
 
@@ -184,7 +184,7 @@ def test_the_sky_has_no_parts() -> None:
         ('part,unit,price\n"led,each,1', "line 2: .* is no line of CSV"),
     ],
 )
-def test_a_bad_table_gets_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_a_bad_price_table_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "prices.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
@@ -192,7 +192,7 @@ def test_a_bad_table_gets_one_line(text: str, message: str, tmp_path: Path) -> N
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_a_missing_price_and_a_missing_file_get_one_line(tmp_path: Path) -> None:
+def test_a_missing_price_or_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "prices.csv"
     path.write_text("# mine\npart,unit,price\nshell,m2,100\n")
     with pytest.raises(InputError, match=r"no price of led; allowed: a line that begins with it"):
@@ -204,7 +204,7 @@ def test_a_missing_price_and_a_missing_file_get_one_line(tmp_path: Path) -> None
         read_prices(tmp_path / "none.csv")
 
 
-def test_a_spreadsheet_s_byte_order_mark_is_no_part_of_the_table(tmp_path: Path) -> None:
+def test_a_byte_order_mark_in_a_table_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_bytes(b"\xef\xbb\xbf" + find_prices("assumed").read_bytes())
     assert repr(read_prices(path).parts) == repr(

@@ -31,7 +31,7 @@ def difference_dn(one: Frame, other: Frame) -> Floats:
     return np.where(dark, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0).ravel()
 
 
-def test_the_truth_is_what_the_plant_says_at_mid_exposure(lab: Lab, attitude: Rotation) -> None:
+def test_the_truth_is_the_given_pose_at_mid_exposure(lab: Lab, attitude: Rotation) -> None:
     """And the stars are where a camera of that attitude sees them, with streaks of the rate."""
     frame, truth = skysim.render_at(lab, attitude, RATE, t_s=7.5)
     assert frame.t_mid_s == truth.t_s == pytest.approx(7.5, abs=1e-12)
@@ -54,7 +54,7 @@ def test_the_truth_is_what_the_plant_says_at_mid_exposure(lab: Lab, attitude: Ro
 
 
 @pytest.mark.slow
-def test_a_frame_at_rest_is_that_of_the_scene_at_rest() -> None:
+def test_a_frame_at_rest_equals_that_of_the_scene_at_rest() -> None:
     """The number selects the noise as it does in the scene: all pixels are equal, but for roundings of the time."""
     scene = skysim.load_scene("shefex2", FULL_SKY)
     for index in range(2):
@@ -65,7 +65,7 @@ def test_a_frame_at_rest_is_that_of_the_scene_at_rest() -> None:
 
 
 @pytest.mark.slow
-def test_a_moving_frame_is_that_of_a_scene_that_moves_so() -> None:
+def test_a_frame_with_given_motion_equals_that_of_a_moving_scene() -> None:
     """Without noise, and to the integration: a sphere keeps its rate."""
     keys = {"motion.rate_deg_s": np.degrees(RATE).tolist(), "camera.detector.noise": False}
     scene = skysim.load_scene("shefex2", FULL_SKY | keys)
@@ -91,9 +91,7 @@ def test_the_same_number_gives_the_same_bits_and_another_independent_noise(
     assert np.corrcoef(pairs[0], shared)[0, 1] == pytest.approx(0.5, abs=5 / np.sqrt(size))
 
 
-def test_a_lab_that_is_built_once_gives_the_frames_of_its_scene(
-    lab: Lab, attitude: Rotation
-) -> None:
+def test_a_reused_lab_gives_the_frames_of_its_scene(lab: Lab, attitude: Rotation) -> None:
     frame, _ = skysim.render_at(lab, attitude, RATE, 3.0, index=5)
     built_again, _ = skysim.render_at(lab.scene, attitude, RATE, 3.0, index=5)
     np.testing.assert_array_equal(frame.image_dn, built_again.image_dn)
@@ -120,7 +118,7 @@ def test_each_camera_of_the_lab_gives_its_own_frame() -> None:
         ({"camera": -1}, "camera: -1 is none of the lab's; allowed: 0 to 0"),
     ],
 )
-def test_a_frame_or_a_camera_that_cannot_be_is_refused(
+def test_an_invalid_frame_or_camera_is_refused(
     lab: Lab, attitude: Rotation, asked: dict[str, int], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):

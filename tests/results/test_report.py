@@ -101,7 +101,7 @@ def test_a_text_from_outside_opens_no_element_in_markdown() -> None:
     assert not re.search(r"<[A-Za-z/!?]", re.sub(allowed, "", outside_of_code))
 
 
-def test_code_that_contains_a_fence_stays_in_its_own() -> None:
+def test_code_that_contains_a_fence_is_fenced_longer() -> None:
     text = of(Code("```\n<b>\n````\nend")).markdown()
     fence = re.findall(r"^(`+)$", text, re.MULTILINE)[-1]
     assert len(fence) == 5
@@ -130,7 +130,7 @@ def test_backticks_are_code_in_html_and_letters_elsewhere(
     assert "`tracker.map`" in capsys.readouterr().out
 
 
-def test_a_page_needs_nothing_from_elsewhere() -> None:
+def test_a_page_loads_nothing_from_outside() -> None:
     page = of(Figure(PICTURE, "a"), Figure(b"GIF89a", "b", "gif")).html()
     assert [one.partition(";")[0] for one in Parsed(page).images] == [
         "data:image/png",
@@ -156,16 +156,16 @@ def test_json_holds_the_numbers_themselves(tmp_path: Path) -> None:
     path = of(Verdict("yes"), Section("s", [table, Figure(PICTURE, "seen")])).save(
         tmp_path / "report.json"
     )
-    told = json.loads(path.read_text())
-    assert (told["title"], told["command"]) == ("a report", "skysim run x")
-    verdict, section = told["blocks"]
+    document = json.loads(path.read_text())
+    assert (document["title"], document["command"]) == ("a report", "skysim run x")
+    verdict, section = document["blocks"]
     assert verdict == {"kind": "verdict", "text": "yes", "tone": ""}
     assert section["blocks"][0]["columns"] == [{"title": "error", "unit": "″"}]
     assert section["blocks"][0]["rows"] == [[1.239], [None], ["WRONG"]]
     assert section["blocks"][1] == {"kind": "figure", "caption": "seen"}
 
 
-def test_what_holds_nothing_is_left_out() -> None:
+def test_empty_blocks_are_left_out() -> None:
     nothing = [
         Text(""),
         Items([], "title"),
@@ -194,7 +194,7 @@ def test_another_suffix_is_refused(tmp_path: Path) -> None:
         of().save(tmp_path / "report.pdf")
 
 
-def test_the_terminal_ends_with_the_answer_and_shows_what_is_for_it(
+def test_the_terminal_ends_with_the_answer_and_shows_only_its_blocks(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     aside = Table([Column("what", kind="text"), Column("note", kind="aside")], [["row", "why so"]])

@@ -20,13 +20,13 @@ def test_a_share_has_wilsons_interval(hits, of):
     z2 = stats.norm.ppf(0.975) ** 2
     p = hits / of
     roots = np.sort(np.roots([1 + z2 / of, -(2 * p + z2 / of), p**2]).real)
-    told = metrics.proportion(hits, of)
-    assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
-    assert (told.value, told.trials) == (p, of)
+    share = metrics.proportion(hits, of)
+    assert (share.low, share.high) == pytest.approx(tuple(roots), abs=1e-9)
+    assert (share.value, share.trials) == (p, of)
 
 
 @pytest.mark.parametrize("count", [1, 12, 1200])
-def test_none_and_all_have_the_exact_bound_of_the_words(count: int) -> None:
+def test_none_and_all_have_the_stated_exact_bound(count: int) -> None:
     """0 of n: 1 - 0.05^(1/n), the same in tables and in words; n of n mirrored."""
     assert metrics.proportion(0, count) == (
         0.0,
@@ -52,7 +52,7 @@ def test_a_claim_needs_as_many_trials_as_its_bound(share: float, count: int) -> 
 
 
 @pytest.mark.long
-def test_intervals_hold_what_they_promise():
+def test_intervals_have_their_stated_coverage():
     """Of 400 samples of 60 each: how often the truth is inside, within four standard errors of 95 % or above it."""
     rng = np.random.default_rng(2)
     truth = {
@@ -65,8 +65,8 @@ def test_intervals_hold_what_they_promise():
     for _ in range(400):
         sample = rng.exponential(size=60)
         for name, value in truth.items():
-            told = metrics.STATISTICS[name](sample)
-            inside[name] += told.low <= value <= told.high
+            estimate = metrics.STATISTICS[name](sample)
+            inside[name] += estimate.low <= value <= estimate.high
     error = math.sqrt(0.95 * 0.05 / 400)
     assert (
         min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error
@@ -95,7 +95,7 @@ def test_none_in_ten_thousand_is_less_than_three_hundredths_of_a_percent() -> No
 
 
 @pytest.mark.parametrize(("probability", "fewest"), [(0.5, 6), (0.9, 29), (0.95, 59), (0.99, 299)])
-def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(
+def test_a_quantile_has_an_interval_from_the_number_of_values_by_wilks(
     probability: float, fewest: int
 ) -> None:
     """n with 1 - p^n >= 95 % (Wilks 1941: 59 and 299); at the median both ends count, 1 - 2 / 2^n."""
@@ -136,18 +136,18 @@ def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability:
 
 
 @pytest.mark.long
-def test_the_interval_of_a_p95_holds_it() -> None:
+def test_the_interval_of_a_p95_covers_it() -> None:
     """Of 2,000 samples of 100 from a skew law: at least 95 %, to four standard errors, and not always."""
     rng = np.random.default_rng(5)
     truth = math.log(20)
     inside = 0
     for sample in rng.exponential(size=(2000, 100)):
-        told = metrics.STATISTICS["p95"](sample)
-        inside += told.low <= truth <= told.high
+        estimate = metrics.STATISTICS["p95"](sample)
+        inside += estimate.low <= truth <= estimate.high
     assert 0.95 - 4 * math.sqrt(0.95 * 0.05 / 2000) < inside / 2000 < 0.99
 
 
-def test_a_single_value_has_no_interval_and_says_what_it_needs() -> None:
+def test_a_single_value_has_no_interval_and_names_the_values_needed() -> None:
     one = metrics.resampled(np.array([3.0]), np.mean)
     assert (one.value, one.trials, one.needs) == (3.0, 1, 1)
     assert math.isnan(one.low)
@@ -167,7 +167,9 @@ SKEW = {  # samples of a size, from a generator
 
 @pytest.mark.parametrize("name", SKEW)
 @pytest.mark.parametrize("statistic", [np.mean, metrics.rms])
-def test_the_bootstrap_of_many_is_the_bootstrap_where_it_takes_over(name: str, statistic) -> None:
+def test_the_fast_bootstrap_of_many_values_matches_the_plain_one_where_it_starts(
+    name: str, statistic
+) -> None:
     """Each end within the scatter of 999 resamples: sqrt(0.025 0.975 / 999) / phi(1.96) = 0.085 sigma, 0.022 of the
     width, for a normal law, of two of them, four times; more where tails are longer."""
     values = SKEW[name](np.random.default_rng(4), metrics.MANY_VALUES)
@@ -185,7 +187,7 @@ def test_the_bootstrap_of_many_is_the_bootstrap_where_it_takes_over(name: str, s
 
 @pytest.mark.parametrize("name", SKEW)
 @pytest.mark.parametrize("count", [2, 3, 100, metrics.MANY_VALUES])
-def test_the_bootstrap_of_few_is_that_of_scipy(name: str, count: int) -> None:
+def test_the_bootstrap_of_few_values_matches_scipy(name: str, count: int) -> None:
     """With the same draws, but for the order of additions."""
     values = SKEW[name](np.random.default_rng(count), count)
     for found, statistic in (
@@ -195,7 +197,7 @@ def test_the_bootstrap_of_few_is_that_of_scipy(name: str, count: int) -> None:
         assert found == pytest.approx(metrics.resampled(values, statistic), rel=1e-12, nan_ok=True)
 
 
-def test_the_interval_of_many_is_skew_as_that_of_the_bootstrap() -> None:
+def test_the_interval_of_many_values_is_as_skewed_as_the_bootstrap_s() -> None:
     """One error of 1e5 among n of nothing: it is drawn k times with the probability of Poisson's law, e^-1 / k!, so the
     interval of the mean is 0 to 3 e5 / n; the normal one would be symmetrical and reach below zero."""
     n = 1_000_000
@@ -208,7 +210,7 @@ def test_the_interval_of_many_is_skew_as_that_of_the_bootstrap() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["exponential", "five of degrees"])
-def test_the_interval_of_many_holds_the_truth(name: str) -> None:
+def test_the_interval_of_many_values_covers_the_truth(name: str) -> None:
     """Of 1,000 samples: 95 % to four standard errors for an exponential law. Rare wrong attitudes are of a number that
     is itself random, and seldom none at all."""
     rng = np.random.default_rng(6)
@@ -220,8 +222,8 @@ def test_the_interval_of_many_holds_the_truth(name: str) -> None:
         values = (
             rng.exponential(size=3000) if name == "exponential" else 1e4 * (rng.random(3000) < rate)
         )
-        told = metrics.mean_of(values)
-        inside += told.low <= truth <= told.high
+        estimate = metrics.mean_of(values)
+        inside += estimate.low <= truth <= estimate.high
     assert (
         inside / runs
         > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[name]

@@ -22,7 +22,7 @@ def turned(axis: str, degrees: np.ndarray | float) -> Rotation:
 
 
 def bare() -> Telemetry:
-    """Nobody flies it: a yaw at 10 deg/s."""
+    """Telemetry without control: a yaw at 10 deg/s."""
     nothing = np.zeros((len(T_S), 3))
     return Telemetry(
         T_S,
@@ -39,7 +39,7 @@ def bare() -> Telemetry:
 
 
 def full() -> Telemetry:
-    """Told to be 2 deg farther in yaw, the IMU 0.5 deg off in roll at the end, the filter 3 arcsec all along."""
+    """The reference is 2 deg ahead in yaw, the IMU ends 0.5 deg off in roll, the filter is 3 arcsec off throughout."""
     log = bare()
     bias = np.full((len(T_S), 3), 5 * DEG / 3600)
     return replace(
@@ -60,7 +60,7 @@ def full() -> Telemetry:
     )
 
 
-def test_the_figures_are_those_of_the_flight() -> None:
+def test_telemetry_figures_match_the_flight() -> None:
     expected = {
         "pointing_deg_worst": 2.0,
         "pointing_deg_end": 2.0,
@@ -78,11 +78,11 @@ def test_the_figures_are_those_of_the_flight() -> None:
     assert telemetry_report.summary(full()) == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_flight_that_nobody_flew_has_no_figures() -> None:
+def test_an_uncontrolled_flight_has_no_control_figures() -> None:
     assert telemetry_report.summary(bare()) == {}
 
 
-def test_the_table_has_what_the_flight_has_in_degrees() -> None:
+def test_the_table_has_the_telemetry_in_degrees() -> None:
     table = telemetry_report.table(full())
     np.testing.assert_allclose(table["true_yaw_deg"], 10 * T_S, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["commanded_yaw_deg"], 10 * T_S + 2, rtol=0, atol=1e-12)
@@ -113,7 +113,7 @@ def test_every_sample_of_the_imu_is_in_its_table() -> None:
 
 
 @pytest.mark.slow
-def test_the_plot_shows_a_panel_for_everything_there_is() -> None:
+def test_the_plot_has_a_panel_for_each_recorded_quantity() -> None:
     heights = [
         cv2.imdecode(np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR).shape[
             0

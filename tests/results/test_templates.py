@@ -41,7 +41,7 @@ def rays(count: int) -> Floats:
     return templates.directions(tilt_rad, azimuth_rad)
 
 
-def test_on_a_sphere_the_paper_has_cassini_s_coordinates() -> None:
+def test_on_a_sphere_templates_use_cassini_s_coordinates() -> None:
     """sin(x / R) = sin t sin a and tan(y / R) = tan t cos a; here from vectors, about the meridian of x."""
     some = rays(200)
     x_m, y_m = templates.on_paper_m(SPHERE, some, 0.0).T
@@ -49,7 +49,7 @@ def test_on_a_sphere_the_paper_has_cassini_s_coordinates() -> None:
     assert y_m == pytest.approx(RADIUS_M * np.arctan2(some[:, 0], some[:, 2]), abs=1e-4)
 
 
-def test_a_flat_panel_is_its_own_paper() -> None:
+def test_the_template_of_a_flat_panel_is_the_panel() -> None:
     some = rays(200)
     height_m = 1.5
     place_m = height_m * some / some[:, 2:]
@@ -98,7 +98,7 @@ def test_the_printed_leds_are_where_the_scene_has_them(lab: Lab) -> None:
     assert seen == place_m.keys()
 
 
-def test_the_pattern_to_cut_is_that_to_print(lab: Lab, tmp_path: Path) -> None:
+def test_the_cutting_pattern_matches_the_printed_one(lab: Lab, tmp_path: Path) -> None:
     """DXF as ezdxf reads it, whose y points up from the sheet's lower edge, against the SVG of the same gores."""
     path = tmp_path / "gores.dxf"
     path.write_text(templates.template(lab, ".dxf"))
@@ -189,6 +189,6 @@ def test_every_face_looks_inward_or_out_of_its_mark(lab: Lab) -> None:
             assert normal @ (a - mark.mean(axis=0)) > 0
 
 
-def test_the_sky_has_no_gores() -> None:
+def test_a_sky_scene_has_no_templates() -> None:
     with pytest.raises(InputError, match=r"light.kind: stars has no .svg; allowed: dome"):
         templates.template(build_lab(loader.load("shefex2")), ".svg")

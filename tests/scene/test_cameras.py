@@ -36,12 +36,12 @@ def field_deg(made: CameraConfig) -> tuple[float, float]:
     return 2 * math.degrees(math.atan(half[0])), 2 * math.degrees(math.atan(half[1]))
 
 
-def test_the_four_of_the_documentation_are_there() -> None:
+def test_the_four_documented_presets_exist() -> None:
     assert {"lu205c", "ec655", "wat902h2", "aps"} <= set(NAMES)
 
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)
-def test_every_value_says_where_it_comes_from(path: Path) -> None:
+def test_every_preset_value_states_its_source(path: Path) -> None:
     lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
     values = [line for line in lines if not re.fullmatch(r"\s*\w+:", line)]
     assert len(values) > 15
@@ -49,7 +49,7 @@ def test_every_value_says_where_it_comes_from(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)
-def test_every_value_stands_on_a_line_of_its_own(path: Path) -> None:
+def test_every_preset_value_has_its_own_line(path: Path) -> None:
     def leaves(part: Any) -> int:
         return sum(map(leaves, part.values())) if isinstance(part, dict) else 1
 
@@ -58,7 +58,7 @@ def test_every_value_stands_on_a_line_of_its_own(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_preset_and_a_lens_are_a_camera(name: str) -> None:
+def test_a_preset_and_a_lens_make_a_camera(name: str) -> None:
     made = camera(name)
     assert made.focal_length_m == 0.025
     # The preset is a body without a lens: the lens's keys are the scene's.
@@ -72,7 +72,7 @@ def bare(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_without_a_lens_the_lens_is_missing(name: str) -> None:
+def test_without_a_lens_the_error_names_the_missing_lens(name: str) -> None:
     with pytest.raises(ValueError, match=r"(?s)focal_length.*Field required"):
         CameraFileConfig.model_validate(with_preset(bare(name)))
 
@@ -84,7 +84,7 @@ def test_the_converter_ends_a_little_above_the_full_well(name: str) -> None:
     assert 0.95 * (2**detector.bits - 1) < full_dn <= 2**detector.bits - 1
 
 
-def test_rows_are_read_at_a_camera_s_pace() -> None:
+def test_a_rolling_preset_reads_its_rows_in_11_to_100_ms() -> None:
     """The slowest, lu205c, does 10 frames a second, the fastest, EC655, 90 (reference §2)."""
     made = {name: camera(name) for name in NAMES}
     read = {
@@ -96,7 +96,7 @@ def test_rows_are_read_at_a_camera_s_pace() -> None:
     assert {name: time_s for name, time_s in read.items() if not 0.011 < time_s <= 0.1} == {}
 
 
-def test_what_the_scene_says_goes_over_the_preset() -> None:
+def test_the_scene_s_keys_replace_the_preset_s() -> None:
     made = camera("ec655", width_px=640, detector={"read_noise_e": 9.0})
     assert (made.width_px, made.height_px) == (640, 493)
     assert made.detector.read_noise_e == 9.0
@@ -123,12 +123,12 @@ def test_a_preset_of_the_base_is_switched_off_by_null() -> None:
     assert with_preset({"camera": {"preset": None} | own}) == {"camera": own}
 
 
-def test_a_camera_without_a_preset_is_left_alone() -> None:
+def test_a_camera_without_a_preset_is_unchanged() -> None:
     raw = {"camera": {"width_px": 640}, "title": "x"}
     assert with_preset(raw) is raw
 
 
-def test_lu205c_sees_what_the_thesis_says() -> None:
+def test_lu205c_has_the_thesis_s_field() -> None:
     # Reference §1.2: 10.45 deg behind 35 mm; §2: 83 us a row are 10 frames a second; the MT9M001's peak of 52 %.
     made = camera("lu205c", focal_length="35 mm")
     assert field_deg(made)[0] == pytest.approx(10.45, abs=0.005)
@@ -158,7 +158,7 @@ def test_ec655_has_the_reference_s_field_and_dynamic_range() -> None:
     assert 1 / (made.height_px * made.shutter.row_time_s) == pytest.approx(90, rel=0.01)
 
 
-def test_wat902h2_has_the_reference_s_field_and_a_video_s_noise() -> None:
+def test_wat902h2_has_the_reference_s_field_and_video_noise() -> None:
     # Reference §2: 41.3 x 31.5 deg behind 8.5 mm. Read noise and the converter's rounding together are 50 dB down.
     made = camera("wat902h2", focal_length="8.5 mm")
     assert field_deg(made) == pytest.approx((41.3, 31.5), abs=0.05)

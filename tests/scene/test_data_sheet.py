@@ -41,7 +41,7 @@ def load(tmp_path: Path, answers: dict[str, str], **own: object) -> loader.Camer
     return loader.load(tmp_path / "scene.yaml").camera
 
 
-def test_a_full_data_sheet_is_taken_as_it_is(tmp_path: Path) -> None:
+def test_a_full_data_sheet_is_used_without_assumptions(tmp_path: Path) -> None:
     assert fill(STATED).missing == []
     camera = load(tmp_path, STATED)
     assert (camera.width_px, camera.height_px, camera.f_number) == (1936, 1216, 1.4)
@@ -86,7 +86,7 @@ def test_a_stated_gain_bounds_an_unknown_full_well() -> None:
     assert lines["detector.full_well_e"] == 2 * (255 - 5)
 
 
-def test_without_a_lens_the_file_is_a_body_that_says_so(tmp_path: Path) -> None:
+def test_without_a_lens_the_file_is_a_camera_body_and_states_it(tmp_path: Path) -> None:
     sheet = fill({"pixels": "2048x2048", "pitch": "5.5 um", "shutter": "interline"})
     written = text(sheet, "x")
     assert "# Not stated: focal_length; the file has no lens" in written
@@ -98,7 +98,7 @@ def test_without_a_lens_the_file_is_a_body_that_says_so(tmp_path: Path) -> None:
     assert (camera.width_px, camera.focal_length_m) == (2048, 0.05)
 
 
-def test_a_lens_without_an_f_number_says_that_a_scene_must_give_it() -> None:
+def test_a_lens_without_an_f_number_leaves_it_to_the_scene() -> None:
     (missing,) = [
         one for one in fill(PLACEHOLDERS | {"focal_length": "16 mm"}).missing if not one.assumed
     ]
@@ -140,7 +140,7 @@ def test_a_lens_without_an_f_number_says_that_a_scene_must_give_it() -> None:
         ({"prnu": "-1 %"}, "answers.prnu: '-1 %'; allowed: greater than or equal to 0"),
     ],
 )
-def test_a_wrong_answer_is_refused_with_what_is_allowed(
+def test_a_wrong_answer_is_refused_with_the_allowed_values(
     answers: dict[str, str], message: str
 ) -> None:
     with pytest.raises(InputError) as caught:

@@ -20,21 +20,21 @@ from skysim.scene import loader, opencv_calibration
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.simulation.flight import simulate_motion
 
-TOLD = OpencvCalibration(
+CALIBRATION = OpencvCalibration(
     1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25)
 )
 
 
 def by_opencv(path: Path, **more: Any) -> Path:
     """A file as OpenCV itself writes it."""
-    focal = TOLD.focal_px
-    (x, y) = TOLD.center_px
+    focal = CALIBRATION.focal_px
+    (x, y) = CALIBRATION.center_px
     keys = {
         "calibration_time": "Sun 22 Nov 2026 14:00:00 UTC",
-        "image_width": TOLD.width_px,
-        "image_height": TOLD.height_px,
+        "image_width": CALIBRATION.width_px,
+        "image_height": CALIBRATION.height_px,
         "camera_matrix": np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]]),
-        "distortion_coefficients": np.array(TOLD.distortion)[:, None],
+        "distortion_coefficients": np.array(CALIBRATION.distortion)[:, None],
         "avg_reprojection_error": 0.21,
         "per_view_reprojection_errors": np.full((3, 1), 0.2, np.float32),
     }
@@ -61,34 +61,34 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
         st.tuples(*[numbers] * 5),
     )
 )
-def test_every_digit_comes_back_by_opencv_and_by_us(
-    tmp_path: Path, told: OpencvCalibration
+def test_a_calibration_round_trips_exactly_through_opencv_and_skysim(
+    tmp_path: Path, calibration: OpencvCalibration
 ) -> None:
     path = tmp_path / "camera.yml"
-    files.write_text(path, opencv_calibration.text(told))
+    files.write_text(path, opencv_calibration.text(calibration))
     assert opencv_calibration.looks_like_calibration(path)
-    assert opencv_calibration.read(path) == told
+    assert opencv_calibration.read(path) == calibration
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     size = (file.getNode("image_width").real(), file.getNode("image_height").real())
-    assert size == (told.width_px, told.height_px)
+    assert size == (calibration.width_px, calibration.height_px)
     fx, cx, fy, cy = file.getNode("camera_matrix").mat()[[0, 0, 1, 1], [0, 2, 1, 2]]
-    assert (fx, fy, cx, cy) == (told.focal_px, told.focal_px, *told.center_px)
-    assert tuple(file.getNode("distortion_coefficients").mat().ravel()) == told.distortion
+    assert (fx, fy, cx, cy) == (calibration.focal_px, calibration.focal_px, *calibration.center_px)
+    assert tuple(file.getNode("distortion_coefficients").mat().ravel()) == calibration.distortion
 
 
-def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
     """By OpenCV 5, by 4, whose first line is no YAML, and as ROS has it, without tags."""
     path = by_opencv(tmp_path / "five.yml")
-    assert opencv_calibration.read(path) == TOLD
+    assert opencv_calibration.read(path) == CALIBRATION
     text = path.read_text()
     (tmp_path / "four.yml").write_text(text.replace("%YAML 1.2", "%YAML:1.0"))
-    assert opencv_calibration.read(tmp_path / "four.yml") == TOLD
+    assert opencv_calibration.read(tmp_path / "four.yml") == CALIBRATION
     ros = text.replace("!!opencv-matrix", "").replace(
         "%YAML 1.2\n---\n", "distortion_model: plumb_bob\n"
     )
     (tmp_path / "ros.yaml").write_text(ros)
     assert opencv_calibration.looks_like_calibration(tmp_path / "ros.yaml")
-    assert opencv_calibration.read(tmp_path / "ros.yaml") == TOLD
+    assert opencv_calibration.read(tmp_path / "ros.yaml") == CALIBRATION
 
 
 MATRIX = np.array([[900.0, 0, 800], [0, 900, 600], [0, 0, 1]])
@@ -163,13 +163,15 @@ def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> N
 @pytest.fixture
 def lens(tmp_path: Path) -> Path:
     """A calibration of a camera like shefex2's, its lens a little other than the scene has it."""
-    told = OpencvCalibration(659, 493, 2540.5, (331.25, 244.5), (-0.12, 0.04, 6e-4, -4e-4, 0.0))
-    files.write_text(tmp_path / "lens.yml", opencv_calibration.text(told))
+    calibration = OpencvCalibration(
+        659, 493, 2540.5, (331.25, 244.5), (-0.12, 0.04, 6e-4, -4e-4, 0.0)
+    )
+    files.write_text(tmp_path / "lens.yml", opencv_calibration.text(calibration))
     return tmp_path / "lens.yml"
 
 
 @pytest.mark.parametrize("focus", ["infinity", "3 m"])
-def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> None:
+def test_a_scene_s_camera_has_opencv_s_calibration(lens: Path, focus: str) -> None:
     """A file beside the scene; directions go through `cv2.projectPoints` and our lens to the same pixels."""
     own = lens.parent / "mine.yaml"
     own.write_text(
@@ -205,7 +207,7 @@ def test_a_scene_s_camera_is_what_opencv_says_it_is(lens: Path, focus: str) -> N
         ("calibration: lens.yml, focal_length: null, pixel: 5", "camera.pixel: 5 has no unit"),
     ],
 )
-def test_a_contradiction_is_told_with_its_line(lens: Path, said: str, complaint: str) -> None:
+def test_a_contradiction_is_reported_with_its_line(lens: Path, said: str, complaint: str) -> None:
     own = lens.parent / "mine.yaml"
     own.write_text(f"schema: 1\nbase: shefex2\ncamera: {{{said}}}\n")
     with pytest.raises(InputError) as raised:
@@ -225,30 +227,36 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     loaded = loader.load(own)
     frame, truth = simulate_motion(loaded).render(0)
     recording.write_frame(lens.parent, frame, truth, loaded)
-    told = opencv_calibration.read(lens)
+    calibration = opencv_calibration.read(lens)
     off = opencv_calibration.text(
         OpencvCalibration(
-            told.width_px, told.height_px, told.focal_px * 1.001, told.center_px, told.distortion
+            calibration.width_px,
+            calibration.height_px,
+            calibration.focal_px * 1.001,
+            calibration.center_px,
+            calibration.distortion,
         )
     )
     files.write_text(lens, off)
     how = plate_solver.make_solver(None, lens)
     answer = plate_solver.solve_file(lens.parent / "frame_0000.fits", how, None)
     assert answer["status"] == "solved"
-    true = scene_pointing(truth, told)
+    true = scene_pointing(truth, calibration)
     assert [answer["ra_deg"], answer["dec_deg"]] == pytest.approx(true, abs=3 / 3600)
     files.write_image(lens.parent / "other.png", np.zeros((480, 640), np.uint16))
     refused = plate_solver.solve_file(lens.parent / "other.png", how, None)
     assert refused["status"].endswith("other.png: 640x480 pixels; this camera's are 659x493")
 
 
-def scene_pointing(truth: Any, told: OpencvCalibration) -> list[float]:
+def scene_pointing(truth: Any, calibration: OpencvCalibration) -> list[float]:
     """RA and Dec, deg, of the image's middle by OpenCV's way back through the lens."""
-    focal = told.focal_px
-    (x, y) = told.center_px
+    focal = calibration.focal_px
+    (x, y) = calibration.center_px
     matrix = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
     middle = np.array([[[329.0, 246.0]]])
-    ray = np.append(cv2.undistortPoints(middle, matrix, np.array(told.distortion)).ravel(), 1)
+    ray = np.append(
+        cv2.undistortPoints(middle, matrix, np.array(calibration.distortion)).ravel(), 1
+    )
     direction = truth.cam_from_lab.inv().apply(ray / np.linalg.norm(ray))
     return [
         float(np.degrees(np.arctan2(direction[1], direction[0]))),

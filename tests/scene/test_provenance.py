@@ -27,7 +27,7 @@ def line_in(path: Path, words: str) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", loader.list_scenes())
-def test_what_is_shown_is_the_scene(name: str, tmp_path: Path) -> None:
+def test_the_shown_values_are_the_scene_s(name: str, tmp_path: Path) -> None:
     """Read back, it is equal: nothing is left out, and quantities keep their unit."""
     path = tmp_path / f"{name}.yaml"
     path.write_text(provenance.text(provenance.effective(name)))
@@ -51,7 +51,7 @@ def test_every_leaf_of_the_schema_is_shown() -> None:
     assert leaves(tree, "") == shown
 
 
-def test_each_value_has_the_place_that_it_comes_from() -> None:
+def test_each_value_has_its_origin() -> None:
     """Its own file, a base, a preset, or the default."""
     found = by_key("simsat_bump")
     own = SCENES / "simsat_bump.yaml"
@@ -71,7 +71,7 @@ def test_each_value_has_the_place_that_it_comes_from() -> None:
     assert found["camera.detector.bits"].value == loader.load("simsat_bump").camera.detector.bits
 
 
-def test_overrides_are_named_and_replace_what_was_there() -> None:
+def test_overrides_are_named_and_replace_earlier_values() -> None:
     """A section with another kind drops the file's keys; an element of a list makes the list the override's."""
     found = by_key(
         "afit_simsat",
@@ -89,7 +89,7 @@ def test_overrides_are_named_and_replace_what_was_there() -> None:
     assert kind["light.layout.hardware_seed"].origin.what == "default"
 
 
-def test_a_calibration_is_named(tmp_path: Path) -> None:
+def test_a_calibration_is_shown_as_an_origin(tmp_path: Path) -> None:
     lens = OpencvCalibration(1600, 1200, 9000.0, (800.0, 600.0), (0.1, 0.0, 0.0, 0.0, 0.0))
     (tmp_path / "lens.yml").write_text(opencv_calibration.text(lens))
     path = tmp_path / "mine.yaml"

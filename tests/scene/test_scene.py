@@ -50,8 +50,8 @@ def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
     return message
 
 
-def spoilt(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
-    """The complaint about a scene with one slip in it, and `(file, line N)` of the slip."""
+def complaint_and_place(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
+    """The complaint about a scene with one fault in it, and `(file, line N)` of the fault."""
     text = whole.read_text()
     assert text.count(right) == 1
     path = tmp_path / "bad.yaml"
@@ -213,7 +213,7 @@ def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(
     assert field.alias == own.get(name, bare)
 
 
-def test_afit_says_what_the_thesis_says() -> None:
+def test_the_afit_scene_has_the_thesis_s_values() -> None:
     loaded = loader.load("afit_simsat")
     # Reference §1.1: apex 48 in, semi-axes 38.88 and 28.60 in, pitch 8 mm, tilt +-30 deg, 35 mm, 1600 x 1200.
     assert loaded.light.surface.apex_m == pytest.approx(48 * 0.0254, abs=1e-12)
@@ -239,7 +239,7 @@ def test_a_scene_is_found_by_name_and_by_path() -> None:
     assert loader.load("shefex2") == loader.load(SHEFEX) == loader.load(str(SHEFEX))
 
 
-def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
+def test_a_scene_s_camera_is_read_without_the_rest(tmp_path: Path) -> None:
     text = SHEFEX.read_text()
     alone = tmp_path / "camera.yaml"
     alone.write_text(text[text.index("camera:") : text.index("exposure:")])
@@ -249,7 +249,7 @@ def test_the_camera_of_a_scene_can_be_read_alone(tmp_path: Path) -> None:
 # Overrides
 
 
-def test_an_override_takes_the_place_of_the_file_s_value() -> None:
+def test_an_override_replaces_the_file_s_value() -> None:
     changed = loader.load(
         "afit_simsat", {"camera.detector.bits": "8", "motion.start": "{yaw_deg: 40}"}
     )
@@ -293,7 +293,7 @@ def test_an_override_may_add_a_section() -> None:
         ("exposure.time", "a\nb", "is not a time; allowed: a time such as"),
     ],
 )
-def test_a_bad_override_is_one_line_and_blamed_on_the_option(
+def test_a_bad_override_is_refused_in_one_line_that_names_the_option(
     key: str, value: str, says: str
 ) -> None:
     message = complaint(SHEFEX, {key: value})
@@ -302,7 +302,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(
     assert str(SHEFEX) not in message
 
 
-# Slips in a file
+# Faults in a file
 
 
 @pytest.mark.slow
@@ -422,10 +422,10 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(
         ),
     ],
 )
-def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
+def test_a_wrong_value_is_reported_with_key_allowed_values_and_line(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
-    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    message, place = complaint_and_place(tmp_path, AFIT, right, wrong)
     assert says in message
     assert message.endswith(place)
 
@@ -457,17 +457,17 @@ def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
         ),
     ],
 )
-def test_a_slip_in_where_the_camera_points_is_not_taken_for_a_vehicle_s(
+def test_an_error_in_pointing_is_not_reported_as_a_vehicle_error(
     tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
-    message, place = spoilt(tmp_path, SHEFEX, right, wrong)
+    message, place = complaint_and_place(tmp_path, SHEFEX, right, wrong)
     assert says in message
     assert message.endswith(place)
 
 
-def test_a_dome_cannot_start_at_a_place_in_the_sky(tmp_path: Path) -> None:
+def test_a_dome_with_a_start_in_the_sky_is_refused(tmp_path: Path) -> None:
     right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
-    message, place = spoilt(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
+    message, place = complaint_and_place(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
     assert (
         message == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
     )
@@ -512,10 +512,10 @@ UNIONS = [
 
 
 @pytest.mark.parametrize(("right", "wrong", "key", "allowed"), UNIONS)
-def test_a_kind_that_is_none_is_answered_with_those_that_are(
+def test_an_unknown_kind_is_answered_with_the_known_ones(
     tmp_path: Path, right: str, wrong: str, key: str, allowed: str
 ) -> None:
-    message, place = spoilt(tmp_path, AFIT, right, wrong)
+    message, place = complaint_and_place(tmp_path, AFIT, right, wrong)
     assert re.fullmatch(
         rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message
     )
@@ -602,7 +602,9 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
         ),
     ],
 )
-def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, says: str) -> None:
+def test_an_error_within_a_kind_is_reported_for_that_kind_alone(
+    key: str, value: str, says: str
+) -> None:
     message = complaint(AFIT, {key: value})
     assert says in message
     assert "tagged-union" not in message
@@ -695,7 +697,7 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
         ),
     ],
 )
-def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: str) -> None:
+def test_contradicting_keys_are_refused_in_one_line(changes: dict[str, str], says: str) -> None:
     assert complaint(AFIT, changes) == f"{says} (overrides)"
 
 
@@ -725,7 +727,7 @@ def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: st
         ),
     ],
 )
-def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
+def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, says: str) -> None:
     free = {"vehicle.mount": "free", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
     assert says in complaint(AFIT, free | {key: value})
     assert loader.load(AFIT, {key: value}).vehicle.mount == "air_bearing"  # where it may have it
@@ -840,24 +842,27 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
         ),
     ],
 )
-def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:
+def test_an_error_in_the_vehicle_is_reported_with_its_key(key: str, value: str, says: str) -> None:
     message = complaint(AFIT, {key: value})
     assert says in message
     assert message.endswith("(overrides)")
 
 
 @pytest.mark.parametrize("kind", ["hold", "jitter", "bump"])
-def test_nobody_need_fly_a_vehicle_that_is_told_nothing(kind: str) -> None:
+def test_elements_without_commands_need_no_controller(kind: str) -> None:
     more = {
         "hold": "",
         "jitter": ", components: [{kind: line, frequency_hz: 9, rms_arcsec: [1, 1, 1]}]",
         "bump": ", rate_deg_s: [1, 1, 1]",
     }[kind]
-    told = {"motion.maneuver": f"[{{kind: {kind}, duration: 1 s{more}}}]", "motion.control": "none"}
-    assert loader.load(AFIT, told).motion.control is None
+    settings = {
+        "motion.maneuver": f"[{{kind: {kind}, duration: 1 s{more}}}]",
+        "motion.control": "none",
+    }
+    assert loader.load(AFIT, settings).motion.control is None
 
 
-def test_a_controller_s_name_is_short_for_its_section() -> None:
+def test_a_controller_s_name_abbreviates_its_section() -> None:
     loaded = [
         loader.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")
     ]
@@ -874,7 +879,7 @@ def written(folder: Path, name: str, text: str) -> Path:
     return path
 
 
-def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
+def test_a_scene_overrides_its_base(tmp_path: Path) -> None:
     """Keys of a section are merged at every depth; a list is taken whole; the name is the file's own."""
     mine = written(
         tmp_path,
@@ -893,7 +898,7 @@ def test_a_scene_says_what_is_different_from_its_base(tmp_path: Path) -> None:
     assert all(getattr(loaded, key) == getattr(base, key) for key in same)
 
 
-def test_a_section_of_another_kind_takes_the_place_of_the_base_s(tmp_path: Path) -> None:
+def test_a_section_of_another_kind_replaces_the_base_s(tmp_path: Path) -> None:
     surface = "light: {surface: {kind: sphere, apex: 1 m, radius: 90 cm}}"
     loaded = loader.load(
         written(tmp_path, "mine.yaml", f"schema: 1\nbase: afit_simsat\n{surface}\n")
@@ -911,7 +916,7 @@ def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
     assert loaded.vehicle.drag == loader.load("simsat_slew").vehicle.drag
 
 
-def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -> None:
+def test_a_base_is_found_beside_the_scene_and_may_have_its_own_base(tmp_path: Path) -> None:
     """And the files that it names are those beside itself, not beside the scene on top of it."""
     model = (SCENES / "vehicles" / "simsat.xml").read_text()
     written(tmp_path, "below/own.xml", model)
@@ -928,7 +933,7 @@ def test_a_base_is_found_beside_the_scene_and_may_have_one_too(tmp_path: Path) -
     assert loaded.camera == loader.load("afit_simsat").camera == loader.load_camera(mine)
 
 
-def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
+def test_an_override_precedes_scene_and_base(tmp_path: Path) -> None:
     mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: afit_simsat\nseed: 2\n")
     loaded = loader.load(mine, {"seed": "3", "exposure.frames": "7"})
     assert (loaded.seed, loaded.exposure.frames) == (3, 7)
@@ -946,14 +951,14 @@ def test_an_override_stands_above_scene_and_base(tmp_path: Path) -> None:
         ("../mine/mine.yaml", "base: ../mine/mine.yaml leads back to this scene"),
     ],
 )
-def test_a_base_that_is_none_is_one_line(tmp_path: Path, base: str, says: str) -> None:
+def test_an_unusable_base_is_refused_in_one_line(tmp_path: Path, base: str, says: str) -> None:
     path = written(tmp_path / "mine", "mine.yaml", f"schema: 1\ntitle: Mine\nbase: {base}\n")
     message = complaint(path)
     assert message.startswith(says)
     assert message.endswith(f"({path}, line 3)")
 
 
-def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
+def test_scenes_that_are_each_other_s_base_are_refused(tmp_path: Path) -> None:
     one = written(tmp_path, "one.yaml", "schema: 1\nbase: two.yaml\n")
     written(tmp_path, "two.yaml", "schema: 1\nbase: three.yaml\n")
     three = written(tmp_path, "three.yaml", "schema: 1\ntitle: Three\nbase: one.yaml\n")
@@ -961,7 +966,7 @@ def test_scenes_that_stand_on_each_other_are_refused(tmp_path: Path) -> None:
     assert complaint(one) == f"{says} ({three}, line 3)"
 
 
-def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None:
+def test_an_error_is_reported_with_the_file_that_contains_it(tmp_path: Path) -> None:
     """Its own where it is above, the base's where it is there; a section between is in both."""
     lower = written(
         tmp_path,
@@ -980,7 +985,7 @@ def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None
     assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (overrides)"
 
 
-def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
+def test_a_list_replaces_the_base_s_list_whole(tmp_path: Path) -> None:
     """The base has a first element with a duration; but this list has taken its place."""
     mine = written(
         tmp_path,
@@ -990,7 +995,7 @@ def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Pat
     assert complaint(mine) == f"motion.maneuver.0.duration: missing ({mine}, line 5)"
 
 
-def test_a_base_that_is_no_yaml_is_one_line(tmp_path: Path) -> None:
+def test_a_base_that_is_not_yaml_is_refused_in_one_line(tmp_path: Path) -> None:
     lower = written(tmp_path, "lower.yaml", "title: [")
     mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\n")
     assert complaint(mine).startswith(f"{lower}, line 1: not YAML: ")
@@ -999,7 +1004,7 @@ def test_a_base_that_is_no_yaml_is_one_line(tmp_path: Path) -> None:
 # The camera: preset and focus
 
 
-def test_what_the_scene_says_stands_above_its_camera_s_preset(tmp_path: Path) -> None:
+def test_a_scene_s_keys_precede_its_camera_preset(tmp_path: Path) -> None:
     """Keys of a section are merged; a section of another kind replaces the preset's."""
     path = tmp_path / "mine.yaml"
     path.write_text(
@@ -1022,13 +1027,13 @@ def test_what_the_scene_says_stands_above_its_camera_s_preset(tmp_path: Path) ->
     assert loader.load_camera(path) == mine
 
 
-def test_an_override_stands_above_the_preset() -> None:
+def test_an_override_precedes_the_preset() -> None:
     assert loader.load("shefex2", {"camera.detector.bits": "8"}).camera.detector.bits == 8
     other = loader.load("shefex2", {"camera.preset": "aps"}).camera
     assert (other.width_px, other.shutter.kind, other.focal_length_m) == (1024, "rolling", 0.025)
 
 
-def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
+def test_a_lens_is_focused_at_infinity_by_default() -> None:
     lens = loader.load("shefex2").camera
     assert lens.focus_m == math.inf
     assert lens.image_distance_m == pytest.approx(0.025, rel=1e-15)
@@ -1037,7 +1042,7 @@ def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
 @pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
 def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
     """There the image would be greater than the object; at the focal length there is none at all."""
-    message, _ = spoilt(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
+    message, _ = complaint_and_place(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
     assert re.match(r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message)
 
 
@@ -1054,29 +1059,29 @@ def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, f
         ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
     ],
 )
-def test_a_focus_that_is_no_distance_is_refused(focus: str, says: str) -> None:
+def test_a_focus_that_is_not_a_distance_is_refused(focus: str, says: str) -> None:
     assert says in complaint(AFIT, {"camera.focus": focus})
 
 
 def test_a_missing_key_is_named_with_its_section_s_line(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, '    apex: "48 in"\n', "")
+    message, _ = complaint_and_place(tmp_path, AFIT, '    apex: "48 in"\n', "")
     line = line_number(AFIT.read_text(), "surface:")
     assert message == f"light.surface.apex: missing ({tmp_path / 'bad.yaml'}, line {line})"
 
 
 def test_a_missing_section_is_named(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, "seed: 1\n", "")
+    message, _ = complaint_and_place(tmp_path, AFIT, "seed: 1\n", "")
     assert message == f"seed: missing ({tmp_path / 'bad.yaml'})"
 
 
 def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
-    message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
+    message, place = complaint_and_place(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
     late = "plus trigger_jitter 0.0001 s"
     assert message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
 
 
 def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:
-    message, _ = spoilt(tmp_path, AFIT, "control: pid", "control: none")
+    message, _ = complaint_and_place(tmp_path, AFIT, "control: pid", "control: none")
     allowed = "such as control: pid; allowed: maneuver: [] without one"
     assert message.startswith(f"motion: a maneuver requires a controller, {allowed}")
 
@@ -1093,7 +1098,9 @@ def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:
         ("schema: 1\n1: 2\n", "1: 1 is not allowed"),
     ],
 )
-def test_what_is_no_scene_at_all_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_file_without_a_scene_is_refused_in_one_line(
+    tmp_path: Path, text: str, says: str
+) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     message = complaint(path)
@@ -1101,7 +1108,7 @@ def test_what_is_no_scene_at_all_is_one_line(tmp_path: Path, text: str, says: st
     assert str(path) in message
 
 
-def test_bytes_that_are_no_text_are_one_line(tmp_path: Path) -> None:
+def test_bytes_that_are_not_text_are_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_bytes(b"\xff\xfe\x80\x81")
     assert f"{path}: cannot be read" in complaint(path)
@@ -1115,7 +1122,7 @@ def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
         loader.load(name)
 
 
-def test_a_camera_file_without_a_camera_is_one_line(tmp_path: Path) -> None:
+def test_a_camera_file_without_a_camera_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text("schema: 1\ntitle: no camera\n")
     with pytest.raises(InputError, match=r"^camera: missing \(.*camera\.yaml\)$"):
@@ -1144,7 +1151,7 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert kinds(motion.Maneuver) == set(LEGS)
 
 
-def test_a_key_that_stands_twice_is_refused(tmp_path):
+def test_a_duplicate_key_is_refused(tmp_path):
     """YAML itself would take the last one without a word."""
     path = tmp_path / "twice.yaml"
     path.write_text((SCENES / "shefex2.yaml").read_text() + "\nseed: 3\n")

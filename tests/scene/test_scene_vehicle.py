@@ -21,7 +21,7 @@ def loaded(**sets: str) -> scene.Scene:
 # --- units --------------------------------------------------------------------------------------------------
 
 
-def test_what_carries_a_unit_comes_out_in_si() -> None:
+def test_vehicle_quantities_become_si() -> None:
     given = loaded(
         vehicle__wheels="{torque_limit: 600 mN m, coulomb: 2 mN m, viscous: 2e-5 N m s, static_imbalance: 0.5 g cm,"
         " dynamic_imbalance: 10 g cm2}",
@@ -33,14 +33,14 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         motion__control="{law: pd, actuators: wheels, desaturation: {start: 1.7 N m s, stop: 800 mN m s, time: 5 s}}",
     )
     vehicle = given.vehicle
-    told = given.motion.control
+    control = given.motion.control
     assert vehicle.wheels is not None
     assert vehicle.fans is not None
     assert vehicle.cmgs is not None
     assert vehicle.disturbances.cable is not None
     assert vehicle.disturbances.air_current is not None
-    assert told is not None
-    assert told.desaturation is not None
+    assert control is not None
+    assert control.desaturation is not None
     figures = {
         0.6: vehicle.wheels.torque_limit_nm,
         2e-3: vehicle.wheels.coulomb_nm,
@@ -57,14 +57,14 @@ def test_what_carries_a_unit_comes_out_in_si() -> None:
         2e-3 * 57.29577951308232: vehicle.disturbances.cable.stiffness_nm_rad,
         3e-3: vehicle.disturbances.air_current.rms_nm[2],
         0.9: vehicle.disturbances.air_current.correlation_s,
-        1.7: told.desaturation.start_nms,
-        0.8: told.desaturation.stop_nms,
-        5.0: told.desaturation.time_s,
+        1.7: control.desaturation.start_nms,
+        0.8: control.desaturation.stop_nms,
+        5.0: control.desaturation.time_s,
     }
     assert list(figures.values()) == pytest.approx(list(figures), rel=1e-12)
 
 
-def test_a_controller_s_name_is_short_for_its_section() -> None:
+def test_a_controller_s_name_abbreviates_its_section() -> None:
     law = loaded(motion__control="pd").motion.control
     assert law is not None
     assert (law.law, law.actuators, law.feedback, law.rate_hz) == ("pd", "ideal", "truth", 100)
@@ -137,19 +137,21 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("sets", "says"), WRONG)
-def test_what_does_not_go_together_is_told_in_one_line(sets: dict[str, str], says: str) -> None:
+def test_contradicting_vehicle_keys_are_refused_in_one_line(
+    sets: dict[str, str], says: str
+) -> None:
     with pytest.raises(InputError) as raised:
         loader.load("afit_simsat", sets)
     assert says in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-def test_a_vehicle_that_nobody_flies_may_be_knocked() -> None:
-    told = loaded(
+def test_a_bump_needs_no_controller() -> None:
+    scene = loaded(
         motion__control="none",
         motion__maneuver="[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms}]",
     )
-    assert told.motion.control is None
+    assert scene.motion.control is None
 
 
 # --- base ---------------------------------------------------------------------------------------------------
@@ -161,7 +163,7 @@ def written(folder: Path, name: str, **tree: object) -> Path:
     return path
 
 
-def test_a_scene_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
+def test_a_scene_contains_only_differences_from_its_base(tmp_path: Path) -> None:
     below = loader.load("afit_simsat")
     mine = loader.load(
         written(
@@ -184,7 +186,9 @@ def test_a_scene_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
     assert (mine.light, mine.motion, mine.title) == (below.light, below.motion, below.title)
 
 
-def test_a_section_of_another_kind_and_a_list_replace_and_null_switches_off(tmp_path: Path) -> None:
+def test_other_kinds_and_lists_replace_the_base_s_and_null_removes_a_section(
+    tmp_path: Path,
+) -> None:
     path = written(
         tmp_path,
         "mine",
@@ -198,7 +202,7 @@ def test_a_section_of_another_kind_and_a_list_replace_and_null_switches_off(tmp_
     assert mine.vehicle.imu == loader.load("simsat_bump").vehicle.imu
 
 
-def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path) -> None:
+def test_a_base_beside_the_scene_resolves_its_own_files(tmp_path: Path) -> None:
     """The base's vehicle is beside the base, though the scene is elsewhere."""
     lab = tmp_path / "lab"
     campaign = tmp_path / "campaign"
@@ -211,7 +215,7 @@ def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path)
     assert Path(mine.vehicle.model) == lab / "ours.xml"
 
 
-def test_a_base_that_is_none_is_told_with_its_place(tmp_path: Path) -> None:
+def test_an_unusable_base_is_reported_with_its_line(tmp_path: Path) -> None:
     path = written(tmp_path, "mine", title="mine", base="nothing")
     with pytest.raises(
         InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"
@@ -226,7 +230,7 @@ def test_a_scene_is_not_its_own_base(tmp_path: Path) -> None:
         loader.load(two)
 
 
-def test_a_slip_is_found_in_the_file_where_it_stands(tmp_path: Path) -> None:
+def test_an_error_names_the_file_that_contains_it(tmp_path: Path) -> None:
     written(tmp_path, "below", base="afit_simsat", exposure={"time": "3 kg"})
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}})
     with pytest.raises(

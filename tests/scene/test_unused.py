@@ -350,7 +350,7 @@ def check_no_effect(case: Case) -> None:
     [case for case in CASES if case.key in ("light.led.pwm_period", "tracker.survey.surface_seed")],
     ids=lambda case: case.key,
 )
-def test_where_it_is_allowed_it_changes_something(case: Case) -> None:
+def test_an_allowed_key_changes_the_result(case: Case) -> None:
     """Else the test above could not fail."""
     settings = SMALL | {"exposure.first": "50 ms"} | case.settings | case.useful
     plain = outcome(case.scene, settings)
@@ -392,7 +392,7 @@ def test_a_key_that_only_an_override_makes_useless_is_tolerated(tmp_path: Path) 
         loader.load(path, {"tracker.detector": "thesis", "tracker.threshold_sigma": "7"})
 
 
-def test_the_default_is_tolerated() -> None:
+def test_a_useless_key_at_its_default_is_tolerated() -> None:
     for value in ("{catalog: hipparcos_hp6.5, limit_mag: 6.0}", "{}"):
         assert loader.load("afit_simsat_ideal", {"tracker": value}).tracker.limit_mag == 6
 

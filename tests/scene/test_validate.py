@@ -81,7 +81,7 @@ def test_an_editor_marks_what_skysim_refuses(wrong: dict[str, Any], tmp_path: Pa
         load(path)
 
 
-def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -> None:
+def test_another_version_is_refused_by_name_anywhere_in_the_file(tmp_path: Path) -> None:
     newer, mine, study = (tmp_path / f"{name}.yaml" for name in ("newer", "mine", "study"))
     newer.write_text("schema: 3\nbase: shefex2\nfuture: 1\n")
     mine.write_text("schema: 1\nbase: newer.yaml\n")
@@ -98,7 +98,7 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
         study_file.load(study)
 
 
-def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Path) -> None:
+def test_a_scene_or_study_without_a_version_gets_the_line_to_add(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     above = tmp_path / "above.yaml"
     path.write_text("base: shefex2\n")
@@ -121,7 +121,7 @@ def test_a_shipped_camera_is_checked_by_its_name() -> None:
 
 
 @pytest.mark.slow
-def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> None:
+def test_each_kind_of_file_is_recognized_and_each_fault_is_one_line(tmp_path: Path) -> None:
     broken = tmp_path / "broken.ecsv"
     xml = tmp_path / "a.xml"
     broken.write_text("# %ECSV 1.0\nnothing\n")
@@ -132,8 +132,8 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
         (DATA / "catalogs" / "hipparcos_hp6.5.ecsv", "a catalog of 7996 stars"),
         (DATA / "catalogs" / "gaia_v8.0.ecsv", "a catalog of 45735 stars"),
     ):
-        told = check_file(path)
-        assert (told.fault, told.what[: len(what)]) == ("", what)
+        result = check_file(path)
+        assert (result.fault, result.what[: len(what)]) == ("", what)
     for path in (broken, xml, tmp_path / "none.yaml", ROOT / "data/published/afit.yaml"):
         fault = check_file(path).fault
         assert fault
@@ -141,7 +141,7 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
+def test_every_file_that_skysim_reads_is_valid(tmp_path: Path) -> None:
     lens = tmp_path / "lens.yml"
     lens.write_text(opencv_calibration.text(load("shefex2").camera.calibration()))
     for path, what in (
@@ -150,12 +150,12 @@ def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
         (Path("end_to_end"), "a study of 6 trials"),
         (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
     ):
-        told = check_file(path)
-        assert (told.fault, told.what[: len(what)]) == ("", what)
+        result = check_file(path)
+        assert (result.fault, result.what[: len(what)]) == ("", what)
     assert "allowed: a .yaml file or one of afit_simsat" in check_file(Path("nosuch")).fault
 
 
-def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
+def test_an_endless_file_is_refused_without_waiting(tmp_path: Path) -> None:
     for suffix in ("yaml", "ecsv", "xml"):
         os.mkfifo(tmp_path / f"pipe.{suffix}")
         (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
@@ -163,7 +163,7 @@ def test_what_has_no_end_is_not_waited_for(tmp_path: Path) -> None:
             assert check_file(tmp_path / f"{name}.{suffix}").fault.endswith("not a regular file")
 
 
-def test_a_wrong_key_of_a_trial_is_told_with_those_that_are_allowed(tmp_path: Path) -> None:
+def test_a_wrong_key_of_a_trial_is_answered_with_the_allowed_ones(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     text = (SCENES / "studies/false_stars.yaml").read_text()
     path.write_text(text.replace("trial.false_lights", "trial.false_light"))
@@ -173,7 +173,7 @@ def test_a_wrong_key_of_a_trial_is_told_with_those_that_are_allowed(tmp_path: Pa
     )
 
 
-def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:
+def test_an_error_found_at_setup_has_its_line(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\ntracker:\n  map: nothing.ecsv\n")
     assert "nothing.ecsv" in check_file(path).fault

@@ -54,7 +54,7 @@ def truth_at(lab: Lab, altitude_deg: float, index: int = 0) -> Truth:
     return render_toward(lab, level(lab, altitude_deg), index)[1]
 
 
-def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
+def test_the_air_raises_and_dims_stars_in_the_frame() -> None:
     """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
     lab = lab_of()
     through = truth_at(lab, 30.0).sources
@@ -82,7 +82,7 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
 
 
 @pytest.mark.slow
-def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
+def test_the_skyline_hides_stars_and_the_truth_marks_them() -> None:
     low = {"light.air.horizon": "{azimuth_deg: [0, 180], altitude_deg: [20, 20]}"}
     free, hilly = (truth_at(lab_of(**keys), 20.0) for keys in ({}, low))
     gone = np.setdiff1d(free.sources.id, hilly.sources.id)
@@ -96,7 +96,7 @@ def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
 
 
 @pytest.mark.slow
-def test_stars_twinkle_by_frame_and_star() -> None:
+def test_scintillation_is_independent_by_frame_and_star() -> None:
     lab = lab_of(**{"light.air.scintillation": "true"})
     sources = [truth_at(lab, 60.0, index).sources for index in (0, 0, 1)]
     same = [one.electrons for one in sources]
@@ -129,7 +129,7 @@ def test_seeing_widens_images_by_its_variance() -> None:
     assert areas[1] - areas[0] == pytest.approx(wanted_px**2, rel=0.03)
 
 
-def test_air_needs_a_site() -> None:
+def test_air_without_a_site_is_refused() -> None:
     with pytest.raises(InputError, match=r"light\.air: requires site\.longitude_deg"):
         load("shefex2", {"light.air": "{}"})
     with pytest.raises(InputError, match="conflicts with a background of kind sky"):
@@ -160,18 +160,18 @@ def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float,
 @pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
 def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
-    told = {"tracker.refraction": "true"}
+    settings = {"tracker.refraction": "true"}
     later = {"exposure.first": "600 s"}
     without = errors_arcsec(
         build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg
     )
-    undone = errors_arcsec(lab_of(**told), altitude_deg)
+    undone = errors_arcsec(lab_of(**settings), altitude_deg)
     assert undone[0] < without[0] + 1.0
     assert undone[1] == pytest.approx(without[1], abs=0.02)
-    assert errors_arcsec(lab_of(**told, **later), altitude_deg)[0] < without[0] + 1.0
+    assert errors_arcsec(lab_of(**settings, **later), altitude_deg)[0] < without[0] + 1.0
 
 
 @pytest.mark.slow
-def test_a_tracker_that_does_not_is_off_by_the_refraction() -> None:
+def test_a_tracker_that_ignores_its_site_errs_by_the_refraction() -> None:
     """57.6" tan(30 degrees) at an altitude of 60 degrees."""
     assert errors_arcsec(lab_of(), 60.0)[0] == pytest.approx(33.2, abs=1.5)

@@ -85,7 +85,7 @@ def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(
 
 
 def off_deg(telemetry: Telemetry) -> Floats:
-    """(K,) by how much the vehicle is not where it was told to be."""
+    """(K,) angle between reference and true attitude, deg."""
     assert telemetry.lab_from_ref is not None
     return np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
 
@@ -114,7 +114,7 @@ def test_every_frame_is_solved_and_used(bumped: Bumped) -> None:
 
 
 @pytest.mark.slow
-def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Bumped) -> None:
+def test_the_imu_errs_permanently_by_the_missed_rotation(bumped: Bumped) -> None:
     """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
     telemetry = bumped.telemetry
     path = bumped.flight.trajectory()
@@ -135,7 +135,7 @@ def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Bumped) -> None
 
 
 @pytest.mark.slow
-def test_the_filter_knows_what_it_does_not_know(bumped: Bumped) -> None:
+def test_the_filter_s_covariance_covers_its_errors(bumped: Bumped) -> None:
     """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
     turns are missed, and after.
     """
@@ -148,7 +148,7 @@ def test_the_filter_knows_what_it_does_not_know(bumped: Bumped) -> None:
 
 
 @pytest.mark.slow
-def test_the_filter_of_an_hour_s_flight_claims_what_its_laboratory_errs_by() -> None:
+def test_over_an_hour_the_filter_s_covariance_includes_the_laboratory_s_errors() -> None:
     """At 2.4 deg/s a frame's time errs by 9 arcsec; unknown to the filter, it errs by 7 sigma, and its bias by 5."""
     spec = loader_of_studies.load("end_to_end").spec
     scene, _ = resolve_point(spec, {"exposure.frames": 150, "exposure.rate_hz": 5})
@@ -173,7 +173,7 @@ def test_the_filter_allows_for_the_survey_s_error() -> None:
     assert np.degrees(error[late]).min() * 3600 > 60  # 0.5 mm of lever are 85 arcsec at 1.2 m
 
 
-def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Bumped) -> None:
+def test_the_star_tracker_restores_attitude_and_bias(bumped: Bumped) -> None:
     telemetry = bumped.telemetry
     assert telemetry.lab_from_filter is not None
     assert telemetry.assumed_bias_rad_s is not None
@@ -187,14 +187,14 @@ def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Bumped) -> None:
     assert deg_h.max() < 5  # of 15, the Earth's turning, that it had to find
 
 
-def test_the_vehicle_is_brought_back(bumped: Bumped) -> None:
+def test_the_vehicle_returns_to_its_reference(bumped: Bumped) -> None:
     off = off_deg(bumped.telemetry)
     assert off.max() > 1
     assert off[bumped.telemetry.t_s > 7].max() < 0.05
 
 
 @pytest.mark.slow
-def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
+def test_under_imu_control_the_vehicle_keeps_the_imu_s_error() -> None:
     telemetry = flown(**EARLY | IMU_ALONE)
     assert telemetry.lab_from_filter is None
     late = telemetry.t_s > 8
@@ -207,7 +207,7 @@ def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
 
 
 @pytest.mark.slow
-def test_what_the_filter_used_is_what_the_frames_give_afterwards(bumped: Bumped) -> None:
+def test_solutions_used_by_the_filter_equal_those_of_the_saved_frames(bumped: Bumped) -> None:
     """Rendered from a piece of the motion when they were due, and from the whole: the same bits, the same solution."""
     tracker = build_tracker(bumped.flight.lab.camera)
     for shot in bumped.shots:
@@ -223,7 +223,7 @@ def test_what_the_filter_used_is_what_the_frames_give_afterwards(bumped: Bumped)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
-def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
+def test_a_solution_arrives_after_its_latency(latency_s: float) -> None:
     """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
     flight = open_flight(
         changed(
@@ -255,7 +255,7 @@ def test_the_loop_with_latency_survives_the_accident() -> None:
     assert off_deg(telemetry)[telemetry.t_s > 7].max() < 0.05
 
 
-def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
+def test_a_frame_without_an_answer_does_not_change_the_filter() -> None:
     """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
     flight = open_flight(
         changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
@@ -268,7 +268,7 @@ def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
     assert (np.diff(sigma, axis=0) > 0).all()
 
 
-def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
+def test_under_the_stars_the_filter_s_reference_is_the_sky() -> None:
     """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
     flight = open_flight(
         changed("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")

@@ -121,7 +121,7 @@ def command(folder: Path, text: str) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(
+def test_a_user_s_pd_law_flies_like_the_built_in_one(
     installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On wheels that turn, with drag and disturbances: by a function, an entry point and a program, to 1e-12."""
@@ -152,10 +152,10 @@ def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(
 
 
 def recorder(
-    seen: list[ControllerInput], told: list[ControllerSetup], torque: Any = (0.0, 0.0, 0.0)
+    seen: list[ControllerInput], setups: list[ControllerSetup], torque: Any = (0.0, 0.0, 0.0)
 ) -> Callable:
     def factory(setup: ControllerSetup) -> Callable[[ControllerInput], Any]:
-        told.append(setup)
+        setups.append(setup)
 
         def law(now: ControllerInput) -> Any:
             seen.append(now)
@@ -166,13 +166,13 @@ def recorder(
     return factory
 
 
-def test_it_gets_what_the_page_says() -> None:
+def test_a_controller_gets_the_documented_setup_and_input() -> None:
     """Set-up and inputs against the scene, its reference and the telemetry of the same run."""
     seen: list[ControllerInput] = []
-    told: list[ControllerSetup] = []
+    setups: list[ControllerSetup] = []
     scene = skysim.load_scene("simsat_slew", SHORT)
-    telemetry = flown(controller=recorder(seen, told, (0.0, 0.0, 5.0)))
-    (setup,) = told
+    telemetry = flown(controller=recorder(seen, setups, (0.0, 0.0, 5.0)))
+    (setup,) = setups
     assert (setup.period_s, setup.actuators, setup.feedback, setup.seed) == (
         0.01,
         "wheels",
@@ -206,9 +206,9 @@ def test_it_gets_what_the_page_says() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feedback", ["imu", "filter"])
-def test_it_measures_what_the_scene_s_feedback_gives(feedback: str) -> None:
+def test_a_controller_s_input_is_the_scene_s_feedback(feedback: str) -> None:
     seen: list[ControllerInput] = []
-    told: list[ControllerSetup] = []
+    setups: list[ControllerSetup] = []
     changes = {
         "motion.control": {"feedback": feedback},
         "motion.maneuver": [],
@@ -216,16 +216,16 @@ def test_it_measures_what_the_scene_s_feedback_gives(feedback: str) -> None:
         "filter.latency": "0 s",
     }
     scene = skysim.load_scene("simsat_bump", changes)
-    telemetry = skysim.simulate(scene, controller=recorder(seen, told)).telemetry
+    telemetry = skysim.simulate(scene, controller=recorder(seen, setups)).telemetry
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
     by = {"imu": telemetry.lab_from_imu, "filter": telemetry.lab_from_filter}
     np.testing.assert_allclose((measured.inv() * by[feedback]).magnitude(), 0, rtol=0, atol=1e-12)
     other = by["imu" if feedback == "filter" else "filter"]
     assert (measured.inv() * other).magnitude().max() > 1e-9
-    assert told[0].rate_limit_rad_s == pytest.approx(np.radians(7.0))
+    assert setups[0].rate_limit_rad_s == pytest.approx(np.radians(7.0))
 
 
-def test_set_up_and_input_come_through_json_as_they_were() -> None:
+def test_controller_setup_and_input_round_trip_through_json() -> None:
     setup = ControllerSetup(
         0.01, np.eye(3) * 1.1, 0.3, None, "ideal", "truth", 3.0, 0.8, 0.6, 5, {"a": 1.5}
     )
@@ -243,7 +243,7 @@ def test_set_up_and_input_come_through_json_as_they_were() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("torque", "told"),
+    ("torque", "message"),
     [
         ([0, np.nan, 0], "torque_nm has a value that is not finite"),
         ([0, 0], r"torque_nm has shape \(2,\); allowed: \(3,\)"),
@@ -252,8 +252,8 @@ def test_set_up_and_input_come_through_json_as_they_were() -> None:
         ([0, 0, 601], "torque_nm is 601 N m; allowed: up to 1000 times the actuators' 0.6 N m"),
     ],
 )
-def test_what_is_no_torque_ends_the_run_in_one_line(torque: Any, told: str) -> None:
-    with pytest.raises(InputError, match=told) as raised:
+def test_an_invalid_torque_ends_the_run_in_one_line(torque: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
         flown(controller=recorder([], [], torque))
     assert str(raised.value).startswith("motion.control.law: factory: ")
     assert str(raised.value).endswith(", at 0 s")
@@ -302,7 +302,7 @@ READY = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("time.sleep(60)", "no answer within 0.5 s"),
         ("sys.exit('on fire')", r"the program ended \(code 1\): on fire"),
@@ -318,10 +318,10 @@ READY = (
         ('print(\'{"tick": 0, "status": "no fuel"}\')', "no fuel"),
     ],
 )
-def test_a_program_that_fails_is_named_and_ended(text: str, told: str, tmp_path: Path) -> None:
+def test_a_program_that_fails_is_named_and_ended(text: str, message: str, tmp_path: Path) -> None:
     note = f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n"
     control = {"motion.control": {"law": "mine", "time_limit": "0.5 s"}}
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         flown(
             changes=control,
             programs=command(tmp_path, READY.replace("sys.stdin", note + "sys.stdin", 1) + text),
@@ -370,7 +370,7 @@ def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
     assert not started.exists()
 
 
-def test_an_unknown_law_is_told_before_the_motion() -> None:
+def test_an_unknown_law_is_refused_before_the_motion() -> None:
     with pytest.raises(
         InputError,
         match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed, or a program",
@@ -379,7 +379,7 @@ def test_an_unknown_law_is_told_before_the_motion() -> None:
 
 
 @pytest.mark.parametrize("name", ["pid", "pd", "prescribed", "mine"])
-def test_a_program_takes_no_name_that_is_taken(name: str, installed: Path) -> None:
+def test_a_program_with_an_existing_name_is_refused(name: str, installed: Path) -> None:
     with pytest.raises(InputError, match=f"programs.{name}: name already in use"):
         tracker_interface.program_commands([f"{name}=x"])
 
@@ -408,7 +408,7 @@ responses: [identified]
 
 
 @pytest.mark.slow
-def test_a_study_s_factor_is_a_controller(installed: Path, tmp_path: Path) -> None:
+def test_a_controller_can_be_a_study_s_factor(installed: Path, tmp_path: Path) -> None:
     path = tmp_path / "which.yaml"
     path.write_text(STUDY.replace("mine", "other"))
     with pytest.raises(
@@ -426,7 +426,7 @@ def test_a_study_s_factor_is_a_controller(installed: Path, tmp_path: Path) -> No
     assert rows[0]["x_arcsec"] == pytest.approx(rows[1]["x_arcsec"], abs=1e-6)
 
 
-def test_a_trial_with_another_release_of_a_controller_is_another(installed: Path) -> None:
+def test_another_release_of_a_controller_changes_the_trial_s_hash(installed: Path) -> None:
     scene = loader.load("simsat_slew", {"motion.control": "mine"})
     before = setups.scene_hash(scene)
     (installed / "mypd-1.0.dist-info/METADATA").write_text(

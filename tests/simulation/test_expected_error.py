@@ -72,7 +72,7 @@ def leds() -> Lab:
     return build_lab(loader.load("afit_simsat"))
 
 
-def test_stars_on_a_ring_give_the_textbook_s_errors(stars: Lab) -> None:
+def test_expected_errors_of_stars_on_a_ring_match_the_textbook(stars: Lab) -> None:
     """Roll sigma / (r sqrt n); cross sqrt(2 / n) sigma / f over sqrt(1 + t^2 + t^4 / 2), t = r / f, both axes."""
     tangent = 0.11
     sigma_px = 0.2
@@ -128,7 +128,7 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     assert lever[2] < 1e-6 * lever[0]
 
 
-def test_a_rotated_survey_rotates_the_solution_as_much(leds: Lab) -> None:
+def test_a_rotated_survey_rotates_the_solution_equally(leds: Lab) -> None:
     """Exactly: it is the rotation that the tracker measures."""
     circle = under_ring(leds)
     turn_rad = np.array([2e-4, -1e-4, 3e-4])
@@ -191,7 +191,7 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
     assert found["non_dimensional", 33.25][1] < found["led_pairs", 33.25][1]
 
 
-def test_background_loses_what_the_integral_says() -> None:
+def test_the_centroid_error_with_background_matches_the_integral() -> None:
     for tau in (0.01, 0.3, 7.0):
         integral = scipy.integrate.quad(lambda t, tau=tau: np.log(t) / (1 + t / tau), 0, 1)[0]
         assert fit_loss(np.array([tau]))[0] == pytest.approx(1 / (1 + integral), rel=1e-6)
@@ -234,7 +234,7 @@ def lit_by_known(exposure: Exposure, lab: Lab) -> Lit:
 @pytest.mark.parametrize(
     ("name", "rate_deg_s"), [("afit_simsat", 2.0), ("shefex2", 2.0), ("apl_dome", 0.5)]
 )
-def test_positions_electrons_peaks_and_paths_are_the_renderer_s(
+def test_positions_electrons_peaks_and_paths_match_the_renderer(
     name: str, rate_deg_s: float
 ) -> None:
     """Peaks are those of centered images: an image between pixels is lower by what a pixel's phase does."""
@@ -272,7 +272,7 @@ def test_positions_electrons_peaks_and_paths_are_the_renderer_s(
     assert np.max(peak) < 1.7
 
 
-def test_a_peak_is_that_of_a_disk_behind_a_gaussian() -> None:
+def test_the_expected_peak_matches_a_disk_blurred_by_a_gaussian() -> None:
     """By integration over the disk, and for a disk alone and a Gaussian alone."""
     for radius, sigma in ((5.0, 1.0), (1.0, 1.0), (0.3, 0.8)):
         r = np.linspace(0, radius, 20001)
@@ -340,7 +340,7 @@ def keyed(survey: dict[str, str]) -> dict[str, str]:
     return {f"tracker.survey.{key}": value for key, value in survey.items()}
 
 
-def test_a_station_off_its_point_is_a_lever_off_its_place() -> None:
+def test_a_station_s_position_error_acts_as_a_lever_error() -> None:
     """All LEDs move together by the centering's error, as they do against a camera that is elsewhere."""
     station = variances_of({"instrument": f'{INSTRUMENT}, centering: "0.4 mm"}}'})
     lever = variances_of({"lever_sigma": "0.4 mm"})
@@ -419,7 +419,7 @@ def expected_at(
         ("ptase_2003", 100, 0.0, False),
     ],
 )
-def test_expected_errors_are_those_of_solved_frames(
+def test_expected_errors_match_solved_frames(
     name: str, count: int, rate_deg_s: float, surveys: bool
 ) -> None:
     """Mean squares of error over expectation. 100 of them vary by 14 % in roll and 10 % across. Stars have 10 to 40 %
@@ -465,7 +465,7 @@ def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola() -> 
     )
 
 
-def test_an_expected_error_is_no_number_with_two_lights(stars: Lab) -> None:
+def test_the_expected_error_is_nan_with_two_lights(stars: Lab) -> None:
     context = detection.context_of(stars)
     at = attitudes.of_frames(stars)
     few = [one.take(np.arange(2)) for one in sampling.sampled(at, context).used]

@@ -94,7 +94,7 @@ def test_a_run_renders_each_frame_once(rendered: list[int]) -> None:
     assert rendered == [0, 1, 2]
 
 
-def test_what_is_due_only_after_the_motion_is_not_rendered_for_it(rendered: list[int]) -> None:
+def test_frames_due_after_the_motion_are_not_rendered_during_it(rendered: list[int]) -> None:
     """Of four frames 0.1 s apart two are due before the end; a loop over all exposures gets the others too."""
     late = FILTERED | {"filter": "{start_deg: 0.5, latency: 0.15 s}"}
     flight = simulate_motion(scene_of("shefex2", 4, **late))
@@ -105,9 +105,7 @@ def test_what_is_due_only_after_the_motion_is_not_rendered_for_it(rendered: list
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, FILTERED, {"tracker__exposure_control": "{mean_dn: 150}"}])
 @pytest.mark.parametrize("solves", [False, True])
-def test_a_shot_is_the_frame_that_is_rendered_alone(
-    changes: Mapping[str, str], solves: bool
-) -> None:
+def test_a_shot_equals_the_frame_rendered_alone(changes: Mapping[str, str], solves: bool) -> None:
     """Bit for bit: from a piece of the motion when due, from the whole motion, and from another flight."""
     scene = scene_of("shefex2", 3, **changes)
     flight = open_flight(scene)
@@ -123,7 +121,7 @@ def test_a_shot_is_the_frame_that_is_rendered_alone(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["simsat_bump", "simsat_slew", "shefex2", "two_heads"])
-def test_a_flight_that_forgets_has_the_same_shots(name: str) -> None:
+def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
     """To the last bit: with the filter in the loop, and without."""
     scene = scene_of(name, 6)
     shots, forgetful = (
@@ -141,7 +139,7 @@ def test_a_flight_that_forgets_has_the_same_shots(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_flight_that_forgets_moves_alike() -> None:
+def test_a_flight_without_history_has_the_same_motion() -> None:
     """Nothing of the motion depends on how much is kept; what is older is gone."""
     scene = scene_of("simsat_slew", 3)
     long = open_flight(scene)
@@ -181,7 +179,9 @@ def test_shots_come_in_the_order_of_time_over_all_cameras(filter_: str) -> None:
     assert sum(turns) > 15
 
 
-def test_only_selected_frames_are_rendered_and_are_those_of_all(rendered: list[int]) -> None:
+def test_only_selected_frames_are_rendered_and_match_those_of_the_whole_run(
+    rendered: list[int],
+) -> None:
     scene = scene_of("shefex2", 6)
     every = images(list(open_flight(scene).shots(solves=False)))
     rendered.clear()
@@ -225,7 +225,7 @@ def test_a_tracker_of_the_user_gets_each_frame_once_and_closes_the_loop() -> Non
 # --- steps --------------------------------------------------------------------------------------------------
 
 
-def test_nothing_else_moves_a_flight_inside_a_loop_over_its_shots() -> None:
+def test_stepping_a_flight_inside_a_loop_over_its_shots_is_refused() -> None:
     flight = open_flight(scene_of("shefex2", 3))
     indices = []
     for shot in flight.shots(solves=False):
@@ -236,7 +236,7 @@ def test_nothing_else_moves_a_flight_inside_a_loop_over_its_shots() -> None:
     assert indices == [0, 1, 2]
 
 
-def test_a_loop_that_was_left_may_be_followed_by_steps_and_another_loop() -> None:
+def test_an_abandoned_loop_may_be_followed_by_steps_and_another_loop() -> None:
     scene = scene_of("shefex2", 4)
     flight = open_flight(scene)
     for shot in flight.shots(solves=False):
@@ -383,7 +383,7 @@ def test_the_telemetry_of_a_flight_in_progress_has_the_ticks_so_far() -> None:
         )
 
 
-def test_the_state_is_that_of_the_trajectory_now() -> None:
+def test_the_state_is_the_trajectory_s_present_one() -> None:
     flight = open_flight(scene_of("simsat_slew", 1, exposure__first="0.5 s"))
     for _ in range(20):
         flight.step()
@@ -397,7 +397,7 @@ def test_the_state_is_that_of_the_trajectory_now() -> None:
     assert (flight.state.lab_from_body * state.lab_from_body.inv()).magnitude() > 0
 
 
-def test_imu_samples_since_a_time_are_the_last_of_all() -> None:
+def test_imu_samples_since_a_time_are_the_latest_ones() -> None:
     """As the gyros give them while the vehicle moves: none is changed or lost later."""
     flight = open_flight(scene_of("simsat_bump", 1, exposure__first="0.6 s"))
     assert len(flight.imu_samples().t_s) == 0
@@ -507,7 +507,7 @@ def difference_dn(one: Frame, other: Frame) -> Floats:
     return np.where(inside, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0).ravel()
 
 
-def test_an_observation_at_the_start_is_exposed_while_the_vehicle_comes_at_its_first_rate() -> None:
+def test_an_observation_at_the_start_extrapolates_with_the_initial_rate() -> None:
     flight = open_flight(scene_of("shefex2", 1))
     shot = flight.observe()
     start = flight.state
@@ -522,7 +522,7 @@ def test_an_observation_at_the_start_is_exposed_while_the_vehicle_comes_at_its_f
 
 
 @pytest.mark.slow
-def test_observations_leave_the_flight_as_it_is() -> None:
+def test_observations_do_not_change_the_flight() -> None:
     """In a loop over shots, with a filter: frames, updates and motion are those of a flight without them."""
     scene = scene_of("two_heads", 4, **HEADS)
     flight = open_flight(scene)

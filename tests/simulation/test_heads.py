@@ -25,7 +25,7 @@ def two_heads(**overrides: object) -> Lab:
     return build_lab(load_scene("two_heads", SHORT | overrides))
 
 
-def test_a_head_is_turned_and_placed_as_the_scene_says() -> None:
+def test_a_head_has_its_declared_rotation_and_position() -> None:
     """[0, 90, 0] looks to the right of the main image: the side's boresight is the main camera's x axis."""
     lab = two_heads(heads=[SIDE | {"mount_error_arcsec": [0, 0, 3600]}], thermal=None)
     head = lab.cameras[1]
@@ -62,7 +62,7 @@ def test_a_head_is_another_chip_with_other_noise() -> None:
     assert np.mean(frame.image_dn == other.image_dn) < 0.5
 
 
-def test_keys_of_a_head_are_put_over_those_of_the_main_camera() -> None:
+def test_keys_of_a_head_override_those_of_the_main_camera() -> None:
     lens = {
         "camera": {"f_number": 2.8},
         "exposure": {"time": "80 ms"},
@@ -103,7 +103,7 @@ def test_frames_of_the_main_camera_do_not_change_with_a_head() -> None:
         ("side", "heads"),
     ],
 )
-def test_a_head_that_cannot_be_is_refused_in_one_line(heads: object, message: str) -> None:
+def test_an_impossible_head_is_refused_in_one_line(heads: object, message: str) -> None:
     with pytest.raises(InputError, match=message) as error:
         two_heads(heads=heads)
     assert "\n" not in str(error.value)
@@ -124,7 +124,7 @@ def test_an_option_without_effect_is_refused_in_a_head_too(tmp_path: Path) -> No
         load_scene(path)
 
 
-def test_the_check_expects_the_roll_of_two_heads_from_the_other_s_boresight() -> None:
+def test_the_expected_roll_of_two_heads_is_from_the_other_s_boresight() -> None:
     """At a right angle the roll about one boresight is an angle across the other: 1 / roll^2 + 2 / cross^2."""
     facts = check(two_heads()).as_dict()["facts"]
     main = facts["expected_error"]["frames"]

@@ -121,7 +121,7 @@ def lab_with(lamp: str, **keys: str) -> Lab:
     return build_lab(loader.load("afit_simsat", LEVEL | given | {"lights": f"[{lamp}]"}))
 
 
-def test_a_lighthouse_is_in_the_frames_in_which_it_is_lit() -> None:
+def test_a_blinking_user_light_is_in_the_frames_in_which_it_is_lit() -> None:
     """In the truth where the lens has it, with the light of its intensity; the other frames are those without it."""
     lab = lab_with(LAMP)
     dark = build_lab(loader.load("afit_simsat", LEVEL))
@@ -156,7 +156,7 @@ def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_no
     assert facts["lights_in_the_field"] == same["lights_in_the_field"]
 
 
-def test_a_curtain_hides_what_is_listed_before_it_and_the_forecast_names_it() -> None:
+def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
     """Lamp and LEDs beyond it are gone from the frame and listed as hidden; those before it are as without it."""
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
     lab = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}")
@@ -195,7 +195,7 @@ def test_a_lighthouse_is_a_section_of_the_scene() -> None:
         loader.load("afit_simsat", {"lights": "[{kind: buoy}]"})
 
 
-def test_lights_are_hardware_and_serve_every_run() -> None:
+def test_user_lights_belong_to_the_hardware_of_every_run() -> None:
     """A lab in another run has the same lights; what a seed draws of them is drawn for the exposure."""
     lab = build_lab(loader.load("afit_simsat"))
     again = lab.in_run(lab.scene.seed + 1)
@@ -248,7 +248,7 @@ def test_the_forecast_sees_the_stars_through_the_air_as_the_frames_do() -> None:
     assert any("all behind the skyline" in line for line in found.findings)
 
 
-def test_a_head_that_looks_at_the_earth_is_told_by_its_own_key() -> None:
+def test_a_head_that_looks_at_the_earth_is_warned_of_by_its_key() -> None:
     """The main camera looks away from the Earth, the head opposite to it, through the payload's skin."""
     head = '[{name: back, position: ["0 m", "0 m", "0 m"], rotation_deg: [0, 180, 0]}]'
     keys = {
@@ -258,9 +258,9 @@ def test_a_head_that_looks_at_the_earth_is_told_by_its_own_key() -> None:
         "light.occlusion": "false",
     }
     findings = check(build_lab(loader.load("shefex2", keys))).findings
-    told = [line for line in findings if "behind the Earth" in line]
-    assert len(told) == 1
-    assert told[0].startswith("heads.0.rotation_deg: ")
+    behind = [line for line in findings if "behind the Earth" in line]
+    assert len(behind) == 1
+    assert behind[0].startswith("heads.0.rotation_deg: ")
 
 
 def test_the_page_s_lighthouse_is_a_light(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def samples_of(lab: Lab) -> tuple[detection.Context, CheckedSamples]:
 
 
 @pytest.mark.slow
-def test_frames_are_checked_where_the_vehicle_will_be() -> None:
+def test_the_check_uses_the_attitudes_of_the_planned_motion() -> None:
     """The reference at mid-exposure; the controller follows it to a hundredth of a degree."""
     lab = lab_of("afit_simsat", exposure__frames="40")
     motion = Flight(lab).simulate_motion().trajectory()
@@ -81,7 +81,7 @@ def test_frames_are_checked_where_the_vehicle_will_be() -> None:
     assert np.linalg.norm(frames.rate_body_rad_s, axis=1).max() == pytest.approx(fastest, rel=0.01)
 
 
-def test_the_reach_is_even_up_to_the_greatest_tilt_and_over_the_whole_sky() -> None:
+def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky() -> None:
     dome = lab_of("afit_simsat")
     sky = lab_of("shefex2")
     frames = attitudes.of_frames(dome)
@@ -104,7 +104,7 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (
             {"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"},
@@ -113,8 +113,10 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
         ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
     ],
 )
-def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], told: str) -> None:
-    with pytest.raises(InputError, match=f"{told}.*allowed: up to vehicle.tilt_stop_deg 30"):
+def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(
+    changes: dict[str, str], message: str
+) -> None:
+    with pytest.raises(InputError, match=f"{message}.*allowed: up to vehicle.tilt_stop_deg 30"):
         check(lab_of("afit_simsat", **changes))
 
 
@@ -122,7 +124,7 @@ def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], 
 
 
 @pytest.mark.slow
-def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
+def test_field_and_pixel_scale_are_those_of_a_pinhole(afit: plan.Check) -> None:
     """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
     field = fact(afit, "field of view").values
     assert field["field_deg"][0] == pytest.approx(
@@ -133,7 +135,7 @@ def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "apl_dome"])
-def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
+def test_the_check_counts_the_lights_that_the_tracker_uses(name: str) -> None:
     lab = lab_of(name, exposure__frames="1")
     frame, _ = Flight(lab).simulate_motion().render(0)
     report = solve_frame(build_tracker(lab.camera), frame)
@@ -143,7 +145,7 @@ def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
     assert found["least"] <= found["mean"] <= found["on_chip"]
 
 
-def test_the_least_lights_are_where_it_says() -> None:
+def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
     lab = lab_of("afit_simsat")
     context, samples = samples_of(lab)
     text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
@@ -255,7 +257,7 @@ def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it
 
 
 @pytest.mark.slow
-def test_what_the_tracker_believes_is_said() -> None:
+def test_the_tracker_s_knowledge_is_stated() -> None:
     changes = {
         "tracker__survey": "{led_sigma: 0.3 mm, rotation_deg: [0.01, 0, 0]}",
         "tracker__assumed_focal_length": "35.07 mm",
@@ -271,11 +273,11 @@ def test_what_the_tracker_believes_is_said() -> None:
         "lever wrong by",
     ):
         assert words in lines
-    told = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
-    assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in told
+    knowledge = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
+    assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in knowledge
 
 
-def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
+def test_error_causes_are_ranked_and_each_injected_one_is_found() -> None:
     """Beside half a millimeter of lever, 0.1 deg of the survey's axes is the first."""
     result = check(lab_of("afit_simsat", tracker__survey__rotation_deg="[0, 0, 0.1]"))
     values = fact(result, "expected error").values["frames"]
@@ -290,7 +292,7 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
 
 
 @pytest.mark.slow
-def test_what_cross_and_sigma_are_of_is_said() -> None:
+def test_the_meaning_of_cross_and_sigma_is_stated() -> None:
     """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
     over_surveys = (
         "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
@@ -305,7 +307,7 @@ def test_what_cross_and_sigma_are_of_is_said() -> None:
 
 
 @pytest.mark.slow
-def test_a_solver_s_own_error_is_a_cause() -> None:
+def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
     """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
     values = fact(
         check(lab_of("afit_simsat_ideal", tracker__solver="infinity")), "expected error"
@@ -550,7 +552,7 @@ def test_smear_is_not_also_reported_as_faint_lights() -> None:
 
 
 @pytest.mark.slow
-def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
+def test_using_the_brightest_hundred_of_many_lights_is_not_warned_of() -> None:
     """The tracker takes as many from a frame; the fact says so, and no warning blames the area or the exposure."""
     tape = "{kind: string, pitch: 4 mm, spacing: 14 mm, cap_deg: 32}"
     dense = lab_of(
@@ -565,13 +567,13 @@ def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
 
 
 @pytest.mark.slow
-def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
+def test_only_an_led_s_image_size_includes_the_led_s_diameter(afit: plan.Check) -> None:
     assert ", LED 2" in fact(afit, "image size").lines[0]
     assert "LED" not in fact(check(lab_of("shefex2")), "image size").lines[0]
 
 
 @pytest.mark.slow
-def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
+def test_the_rate_at_which_smear_equals_image_width_is_stated() -> None:
     result = check(lab_of("shefex2"))
     rate_deg_s = fact(result, "smear").values["width_rate_deg_s"]
     width_px = fact(result, "image size").values["width_px"]
@@ -601,7 +603,7 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(
         pytest.param(GEODESIC, marks=pytest.mark.slow),
     ],
 )
-def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
+def test_similar_fields_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
     """On rendered frames at the attitudes in reach: none, some three of four, all."""
     changes = {
         "light__surface": SPHERE,
@@ -613,24 +615,25 @@ def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: st
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
     tracker = build_tracker(lab.camera)
-    told = []
+    statuses = []
     for n, lab_from_body in enumerate(reach):
         frame, _ = render_at_rest(lab.in_run(n).camera, lab_from_body)
-        told.append(solve_frame(tracker, frame).attitude.status)
-    ambiguous = np.mean([status.startswith("ambiguous") for status in told])
+        statuses.append(solve_frame(tracker, frame).attitude.status)
+    ambiguous = np.mean([status.startswith("ambiguous") for status in statuses])
     assert fact(check(lab), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
 
 
-def test_fields_whose_leds_have_names_are_not_alike() -> None:
+def test_fields_of_coded_leds_are_not_called_similar() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
-    told = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
+    settings = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
     without = check(
-        lab_of("coded_spiral", **told, light__led__code="null", tracker__decoder="null")
+        lab_of("coded_spiral", **settings, light__led__code="null", tracker__decoder="null")
     )
     assert any("look like another one" in line for line in without.findings)
     assert not any(
-        "look like another one" in line for line in check(lab_of("coded_spiral", **told)).findings
+        "look like another one" in line
+        for line in check(lab_of("coded_spiral", **settings)).findings
     )
 
 
@@ -657,7 +660,7 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     assert np.mean(faint) < 0.3
 
 
-def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> None:
+def test_the_star_at_signal_to_noise_five_matches_the_truth_table() -> None:
     """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
     lab = lab_of("shefex2", exposure__frames="1")
     limit = fact(check(lab), "faintest star").values["snr_5_v_mag"]
@@ -672,7 +675,7 @@ def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> N
 
 
 @pytest.mark.slow
-def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
+def test_the_centroid_floor_proposed_by_the_check_makes_claims_correct() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
     nees = [
@@ -722,7 +725,9 @@ def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
 @pytest.mark.parametrize(
     ("ra_deg", "dec_deg", "name"), [(174.9, 2.0, "Mars"), (154.9, 4.8, "Moon")]
 )
-def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
+def test_a_body_s_expected_pixel_value_matches_its_frame(
+    ra_deg: float, dec_deg: float, name: str
+) -> None:
     """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}"
     lab = lab_of("shefex2", motion__start=start, exposure__frames="1", **MOON)
@@ -740,7 +745,7 @@ def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, nam
 @pytest.mark.parametrize(
     "name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"]
 )
-def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
+def test_a_shipped_plan_gives_no_warning(name: str) -> None:
     assert check(lab_of(name)).findings == []
 
 

@@ -160,7 +160,7 @@ def bent_arcsec(altitude_deg: Floats) -> Floats:
 
 
 @pytest.mark.slow
-def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
+def test_detectable_reflections_in_the_wall_are_warned_of() -> None:
     """As many as the tracker detects in a frame near a mirrored LED of its truth; none in a wall as dull as advised."""
     context, samples = plan_of("apl_dome", **SHINY)
     line = dome_warnings.mirror_images(context, samples)

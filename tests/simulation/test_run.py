@@ -149,7 +149,7 @@ def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() 
 
 
 @pytest.mark.parametrize("start", POINTINGS)
-def test_uneven_pixels_cost_what_they_move_the_stars(start: str) -> None:
+def test_uneven_pixels_cause_the_error_of_their_centroid_shift(start: str) -> None:
     """PRNU moves a Gaussian star's center by prnu / sqrt(8 pi) px, whatever its width, and N stars turn by that
     over sqrt(sum r^2): from the integral of g^2 x^2, with g the star's profile. Four sigma."""
     uneven = {"camera.detector.prnu": "0.01", "motion.start": start}
@@ -161,7 +161,7 @@ def test_uneven_pixels_cost_what_they_move_the_stars(start: str) -> None:
     assert 1e-6 < error < 4 * np.degrees(sigma_rad)
 
 
-def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
+def test_a_known_distortion_causes_no_error() -> None:
     lens = {
         "camera.distortion": "[-0.2, 0.1, 0.001, -0.002, 0.05]",
         "camera.principal_point_px": "[340, 230]",
@@ -171,7 +171,7 @@ def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
     assert error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
 
 
-def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
+def test_a_wrong_lever_causes_the_reference_s_error() -> None:
     """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
     moved = {
         "tracker.assumed_camera_body": "['1 mm', '0 m', '381 mm']",
@@ -204,7 +204,7 @@ def test_the_camera_points_where_the_scene_says() -> None:
     ) == pytest.approx(1, abs=1e-12)
 
 
-def test_the_truth_is_that_of_mid_exposure() -> None:
+def test_the_truth_is_the_attitude_at_mid_exposure() -> None:
     """The attitude in the truth puts the stars on the pixels in the truth, while the camera slews."""
     flight = flown("shefex2", exposure__frames="4")
     frame, truth = flight.render(3)
@@ -244,14 +244,14 @@ def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
     np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=1e-12)
 
 
-def test_shutters_open_on_time() -> None:
+def test_shutters_open_at_their_scheduled_times() -> None:
     windows = [exposure_window(loader.load("shefex2"), k) for k in (0, 1, 39)]
     assert [when.open_s for when in windows] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
     assert {when.exposure_s for when in windows} == {0.040}
     assert [when.close_s(493) for when in windows] == pytest.approx([0.14, 0.24, 4.04], abs=1e-12)
 
 
-def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
+def test_a_rolling_shutter_s_truth_is_at_its_middle_row() -> None:
     """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
     # The first and last rows are .35 px off the middle's: a tracker that trusts to .03 px would leave them out.
     loose = {"tracker__centroid_sigma_px": "0.2", "exposure__frames": "1"}
@@ -285,7 +285,7 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     )
 
 
-def test_a_background_is_under_everything_else() -> None:
+def test_a_background_is_added_to_every_pixel() -> None:
     """1000 e-/s of glow for 40 ms at 10 e-/DN: 4 DN more in every pixel, and the same stars on top."""
     dark, lit = (
         simulate_motion(loader.load("shefex2", QUIET_SKY | {"background": glow})).render(0)
@@ -298,7 +298,7 @@ def test_a_background_is_under_everything_else() -> None:
     assert (lit[1].sources.snr < dark[1].sources.snr).all()
 
 
-def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
+def test_jitter_moves_the_camera_by_its_declared_rms() -> None:
     """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
     line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
     still, shaken = (
@@ -311,7 +311,7 @@ def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
     )
 
 
-def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
+def test_a_chip_s_fixed_pattern_does_not_depend_on_the_run_s_seed() -> None:
     one, same, other = (
         build_lab(
             changed("shefex2", seed=seed, camera__detector__hardware_seed=detector)
@@ -326,7 +326,7 @@ def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
 # Random streams
 
 
-def test_frames_do_not_depend_on_those_before() -> None:
+def test_frames_do_not_depend_on_earlier_ones() -> None:
     flight = flown("shefex2", exposure__frames="4")
     in_order = [flight.render(k)[0].image_dn for k in range(4)]
     backwards = [flight.render(k)[0].image_dn for k in (3, 2, 1, 0)][::-1]
@@ -343,7 +343,7 @@ def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
     assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 4 / np.sqrt(1000)
 
 
-def test_the_hardware_s_seed_is_not_the_noise_s() -> None:
+def test_the_run_s_seed_does_not_change_the_hardware() -> None:
     domes = [build_lab(changed("afit_simsat", seed=seed)).camera.sources for seed in ("1", "2")]
     np.testing.assert_array_equal(domes[0].place, domes[1].place)
     np.testing.assert_array_equal(domes[0].strength, domes[1].strength)
@@ -357,14 +357,14 @@ def shots() -> list[Shot]:
     return shots_of(changed("shefex2", exposure__frames="3"))
 
 
-def test_a_run_answers_every_frame(shots: list[Shot]) -> None:
+def test_a_run_has_an_answer_for_every_frame(shots: list[Shot]) -> None:
     assert [shot.frame.index for shot in shots] == [0, 1, 2]
     for shot in shots:
         assert error_deg(shot.report.attitude, shot.truth) < 10 / 60
         assert all(spent >= 0 for spent in shot.seconds.values())
 
 
-def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
+def test_a_blinded_frame_has_a_status_and_no_attitude() -> None:
     (shot,) = shots_of(
         changed("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]")
     )
@@ -373,7 +373,7 @@ def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
 
 
 @pytest.mark.slow
-def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
+def test_a_starless_frame_has_a_status_and_no_attitude() -> None:
     starless = {"light__limit_mag": "0", "motion__start": "{ra_deg: 10, dec_deg: 60}"}
     (shot,) = shots_of(changed("shefex2", exposure__frames="1", **starless))
     assert shot.report.attitude.status != "solved"
@@ -402,7 +402,7 @@ def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
         open_flight(loaded)
 
 
-def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
+def test_the_tracker_s_camera_is_the_true_one_by_default() -> None:
     loaded = loader.load("shefex2", {"camera.distortion": "[-0.2, 0.1, 0, 0, 0]"})
     believed = onboard_model.assumed_camera(loaded)
     lens = Optics.from_camera(loaded.camera)
@@ -414,14 +414,14 @@ def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
     assert longer.focal_px == pytest.approx(believed.focal_px * 1.01, rel=1e-12)
 
 
-def test_a_calibrated_tracker_knows_how_far_the_chip_stands_from_a_focused_lens() -> None:
+def test_a_calibrated_tracker_uses_the_focused_image_distance() -> None:
     """Reference §1.2: 35 mm at 33 in is 36.53 mm, whose 1,600 pixels of 4 um see 10.01 deg."""
     believed = onboard_model.assumed_camera(loader.load("afit_simsat"))
     assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
     assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)
 
 
-def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
+def test_the_shutter_s_smear_adds_to_saturation_and_noise() -> None:
     """A sky of 24,000 e- smears to half as much again in 493 rows of 40 us: stars that fit a well no longer do."""
     bright = QUIET_SKY | {
         "background": "[{kind: uniform, e_s: 600000}]",
@@ -473,7 +473,7 @@ def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
     assert error_deg(shots[-1].report.attitude, shots[-1].truth) < 10 / 60
 
 
-def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
+def test_a_frame_has_the_commanded_exposure_time() -> None:
     """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
     glare = "[{kind: uniform, e_s: 1e5}]"
     scene = controlled(3, "4 ms", "{mean_dn: 1000, min_stars: 1000}", background=glare)
@@ -498,17 +498,17 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
     body = "[{kind: stray, ra_deg: 190, dec_deg: 5, angle_deg: [0, 23.9, 24, 180], pst: [4e-6, 4e-6, 0, 0]}]"
     away = {"motion__rate_deg_s": "[2, 0, 0]", "background": body}
     shots = shots_of(controlled(33, "24 ms", "{mean_dn: 150}", **away))
-    told = exposures_ms(shots)
+    exposure_ms = exposures_ms(shots)
     mean_dn = np.array([shot.frame.image_dn.mean() for shot in shots])
     gone = int(np.argmax(mean_dn < 70))
     assert 15 < gone < 25  # four degrees at 2 deg/s, ten frames a second
     # In its light every frame above the reference is followed by one a step shorter, down to the least.
-    assert told[1] == pytest.approx(22)
-    assert min(told[:gone]) < 5
+    assert exposure_ms[1] == pytest.approx(22)
+    assert min(exposure_ms[:gone]) < 5
     for n in range(gone):
-        assert (mean_dn[n] > 150) == (told[n + 1] < told[n])
+        assert (mean_dn[n] > 150) == (exposure_ms[n + 1] < exposure_ms[n])
     # After that it grows to what four stars take, and stays.
-    assert told[-1] == told[-5] > min(told)
+    assert exposure_ms[-1] == exposure_ms[-5] > min(exposure_ms)
     assert [shot.report.attitude.status for shot in shots[-5:]] == ["solved"] * 5
     assert not any(shot.report.attitude.solved for shot in shots[5:gone])
 
@@ -544,7 +544,7 @@ MOON = {
 }
 
 
-def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
+def test_the_moon_is_in_the_frame_and_in_its_truth_table() -> None:
     frame, truth = simulate_motion(loader.load("shefex2", MOON)).render(0)
     (moon,) = (body for body in truth.bodies if body.name == "moon")
     row = list(truth.sources.id).index(moon.id)
@@ -574,7 +574,7 @@ def test_the_moon_moves_among_the_stars_during_a_run() -> None:
     assert 25 < moved_arcsec < 40
 
 
-def test_bodies_belong_to_the_sky_and_to_years_of_the_ephemeris() -> None:
+def test_bodies_require_a_sky_and_a_date_within_the_ephemeris() -> None:
     with pytest.raises(InputError, match=r"light.*bodies"):
         loader.load("afit_simsat", {"light.bodies": "{}"})
     with pytest.raises(

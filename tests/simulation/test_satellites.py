@@ -72,7 +72,7 @@ def test_a_file_requires_a_place_on_the_ground_or_in_orbit(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("v_mag", [2.0, 4.0, 4.5, 5.0, 6.0])
-def test_a_long_streak_is_rejected_as_one_thing(v_mag: float) -> None:
+def test_a_long_streak_is_rejected_as_one_object(v_mag: float) -> None:
     """Also at 4.5, where its light is near the threshold and the streak breaks into pieces, up to nine a streak."""
     random = f"{{per_field: 3, seed: 5, v_mag: [{v_mag}, {v_mag}], rate_deg_s: [15, 20]}}"
     keys = {"exposure__time": "999 ms", "exposure__rate_hz": "1", "tracker__brightest": "1000"}

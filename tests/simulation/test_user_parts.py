@@ -72,7 +72,7 @@ def angle(a: Rotation, b: Rotation) -> np.ndarray:
 # --- prescribed motions -------------------------------------------------------------------------------------
 
 
-def test_a_prescribed_motion_is_the_reference_itself() -> None:
+def test_a_prescribed_motion_equals_its_reference() -> None:
     """A slew of a vehicle out of balance, at every step of a millisecond; and the rate is the reference's."""
     flight = moved(changes=PRESCRIBED)
     reference = plan(flight.lab.scene.motion)
@@ -106,7 +106,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (
             {"motion.maneuver": [{"kind": "step", "duration": "1 s"}]},
@@ -128,8 +128,10 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
         ),
     ],
 )
-def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_keys_that_contradict_a_prescribed_motion_are_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
         simulate_motion(skysim.load_scene("afit_simsat", PRESCRIBED | changes))
 
 
@@ -163,7 +165,7 @@ def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_pa
     )
 
 
-def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> None:
+def test_an_error_in_a_profile_names_the_lines_of_file_and_scene(tmp_path: Path) -> None:
     columns = swing(TIMES)
     path = profile_scene(tmp_path, columns)
     table = tmp_path / "swing.csv"
@@ -171,10 +173,10 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
     table.write_text("\n".join([*lines[:9], lines[8], *lines[9:]]))
     with pytest.raises(InputError) as raised:
         build_lab(loader.load(path))
-    told = str(loader.located(raised.value, str(path), {}))
+    message = str(loader.located(raised.value, str(path), {}))
     assert re.fullmatch(
         rf"motion.maneuver.0: {table}, line 10: time 0.7 s is not after 0.7 s, by .* at least \({path}, line 7\)",
-        told,
+        message,
     )
     table.unlink()
     with pytest.raises(
@@ -185,7 +187,7 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "changes", "size_deg", "told"),
+    ("scene", "changes", "size_deg", "message"),
     [
         (
             "afit_simsat",
@@ -208,12 +210,12 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
         ("afit_simsat", {}, 40, r"tilt of 30.\d deg at"),
     ],
 )
-def test_what_the_vehicle_cannot_follow_is_refused(
-    scene: str, changes: dict[str, Any], size_deg: float, told: str
+def test_a_profile_that_the_vehicle_cannot_follow_is_refused(
+    scene: str, changes: dict[str, Any], size_deg: float, message: str
 ) -> None:
     """The torque of Euler's equation, the gyros' range and the tilt stop. A fifth of the angles is followed."""
     ways = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"}} | changes
-    with pytest.raises(InputError, match=told) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         moved(scene, ways, profile=swing(TIMES, size_deg))
     assert str(raised.value).startswith("motion.maneuver")
     if "torque_limit" not in str(changes):
@@ -221,7 +223,7 @@ def test_what_the_vehicle_cannot_follow_is_refused(
 
 
 @pytest.mark.slow
-def test_the_torque_of_a_profile_is_eulers() -> None:
+def test_the_torque_of_a_profile_satisfies_eulers_equation() -> None:
     """Just refused by a limit below it and just allowed above: J alpha + w x J w, largest over the samples."""
     columns = swing(TIMES)
     lab = open_flight(skysim.load_scene("afit_simsat", ONE), profile=columns).lab
@@ -255,16 +257,16 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
         InputError, match=r"a chirp of 60 Hz requires a motion\.control\.rate_hz above 120"
     ):
         loader.load("afit_simsat", {"motion.maneuver": str(chirp(from_hz=60.0)["motion.maneuver"])})
-    for wrong, told in (
+    for wrong, message in (
         ({"to_hz": 0.5}, "from_hz and to_hz are both 0.5"),
         ({"duration": "2.9 s"}, "shorter than a period"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             skysim.load_scene("afit_simsat", chirp(**wrong))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("sweep", "middle_hz"), [("linear", 1.75), ("log", math.sqrt(0.5 * 3.0))])
-def test_a_chirp_has_the_frequency_that_it_says(sweep: str, middle_hz: float) -> None:
+def test_a_chirp_has_its_declared_frequency(sweep: str, middle_hz: float) -> None:
     """From zero crossings of the angle half way: amplitude and period of the oscillation there."""
     element = {
         "kind": "chirp",
@@ -368,7 +370,7 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
         (ZeroDivisionError("by\nday"), "failed: ZeroDivisionError: by day"),
     ],
 )
-def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status: str) -> None:
+def test_an_exception_of_a_tracker_function_is_the_frame_s_status(answer: Any, status: str) -> None:
     def mine(image: np.ndarray) -> Any:
         if isinstance(answer, Exception):
             raise answer
@@ -381,7 +383,7 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
 
 
 @pytest.mark.slow
-def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
+def test_an_estimator_or_a_registered_name_serves_as_tracker(sky: Run) -> None:
     height_px, width_px = sky[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
     theirs = estimator.StarTracker.for_sky(
@@ -398,11 +400,11 @@ def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
         InputError, match=r"tracker.name: unknown tracker 'nobody's'|unknown tracker 'nobody'"
     ):
         skysim.simulate(scene, tracker="nobody")
-    for wrong, told in (
+    for wrong, message in (
         (5, "tracker: int; allowed"),
         (estimator.StarTracker, "tracker: the class StarTracker; allowed"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             skysim.simulate(scene, tracker=wrong)
 
 
@@ -432,7 +434,7 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
     assert np.degrees(telemetry.lab_from_body[-1].as_rotvec()[2]) > 0.1
 
 
-def test_a_profile_that_is_not_there_is_refused() -> None:
+def test_a_missing_profile_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"profile: nowhere\.csv is not a file; allowed: a file, or a table"
     ):

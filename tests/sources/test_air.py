@@ -119,7 +119,7 @@ def test_refraction_on_the_horizon_is_half_a_degree() -> None:
     assert not none.bending_rad(zenith_rad).any()
 
 
-def test_bodies_rise_as_stars_do() -> None:
+def test_bodies_are_refracted_like_stars() -> None:
     """The Moon is raised by the refraction of its place, and its bright limb stays across the line of sight."""
     time = datetime.datetime(2012, 6, 24, 20, 0)
     air = air_at(SITES[0])
@@ -187,7 +187,7 @@ def _identity() -> Any:
     return Rotation.identity()
 
 
-def test_a_skyline_goes_around_the_circle() -> None:
+def test_a_skyline_is_interpolated_around_the_full_circle() -> None:
     skyline = HorizonConfig(azimuth_deg=(10, 90, 350), altitude_deg=(4, 20, 8))
     at_deg = [350, 0, 10, 50, 220, 370]
     wanted = [8, 6, 4, 12, 14, 4]
@@ -206,7 +206,7 @@ def test_a_skyline_goes_around_the_circle() -> None:
     assert sky.below_horizon(directions).tolist() == [True, False, True, False]
 
 
-def test_the_wavelength_of_refraction_is_the_band_s() -> None:
+def test_refraction_uses_the_band_s_wavelength() -> None:
     """Of a flat band from 400 to 1000 nm by Planck's law at 5772 K, counted in photons."""
     m = np.linspace(400e-9, 1000e-9, 2001)
     photons = m**-4 / np.expm1(0.014387769 / (m * 5772))

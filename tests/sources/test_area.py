@@ -32,7 +32,7 @@ def test_a_cap_of_a_sphere_has_two_pi_r_h(apex_m: float, radius_m: float, cap_de
     assert found_m2 == pytest.approx(2 * math.pi * radius_m * height_m, rel=1e-12)
 
 
-def test_half_a_spheroid() -> None:
+def test_a_half_spheroid_has_its_textbook_area() -> None:
     """Oblate, a > c: pi a^2 (1 + (1 - e^2) / e artanh e) (Beyer, CRC Standard Mathematical Tables)."""
     a_m = 1.3
     c_m = 0.9
@@ -44,7 +44,7 @@ def test_half_a_spheroid() -> None:
     assert cap_area_m2(dome, 90) == pytest.approx(expected_m2, rel=1e-10)
 
 
-def test_a_displaced_and_tilted_sphere_is_the_same_sphere() -> None:
+def test_displacement_and_tilt_do_not_change_the_area() -> None:
     """Half of it above a plane through the bearing that is its center's too."""
     dome = surface(
         kind="sphere",
@@ -56,7 +56,7 @@ def test_a_displaced_and_tilted_sphere_is_the_same_sphere() -> None:
     assert cap_area_m2(dome, 90) == pytest.approx(2 * math.pi * 1.2**2, rel=1e-10)
 
 
-def test_a_disk_of_a_flat_panel_and_a_whole_one() -> None:
+def test_a_flat_panel_has_the_area_of_its_disk_or_rectangle() -> None:
     assert cap_area_m2(surface(kind="flat", apex="1.5 m"), 40) == pytest.approx(
         math.pi * (1.5 * math.tan(math.radians(40))) ** 2, rel=1e-10
     )
@@ -64,7 +64,7 @@ def test_a_disk_of_a_flat_panel_and_a_whole_one() -> None:
     assert cap_area_m2(whole, 40) == pytest.approx(0.4, rel=1e-12)
 
 
-def test_a_rim_ends_it() -> None:
+def test_the_area_ends_at_the_rim() -> None:
     dome = surface(kind="sphere", apex="1 m", radius="1 m", rim_height="0.5 m")
     assert cap_area_m2(dome, 90) == pytest.approx(2 * math.pi * 0.5, rel=5e-3)
     assert np.isclose(cap_area_m2(dome, 45), 2 * math.pi * (1 - math.sqrt(0.5)), rtol=1e-12)

@@ -36,7 +36,7 @@ def revolution_s(orbit: CircularOrbit) -> np.ndarray:
 
 @pytest.mark.parametrize("from_pole_deg", [70.0, 40.0, 100.0, 20.0])
 @pytest.mark.parametrize("earth_deg", [10.0, 25.0])
-def test_an_inertial_boresight_is_free_of_the_earth_by_trigonometry(
+def test_the_free_share_of_an_inertial_boresight_matches_trigonometry(
     sphere: CircularOrbit, from_pole_deg: float, earth_deg: float
 ) -> None:
     """cos(nadir angle) = -sin(b) cos(u) for a boresight at b from the orbit's pole; the Earth's radius is arcsin(R/r).
@@ -60,7 +60,7 @@ def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: Circular
     assert found.earth_deg == pytest.approx(np.full(500, limb_deg), abs=1e-6)
 
 
-def test_the_sun_excludes_a_cone_about_the_year(sphere: CircularOrbit) -> None:
+def test_the_sun_excludes_a_cone_over_the_year(sphere: CircularOrbit) -> None:
     """An orbit about the equator, zenith pointing, at the equinox: the Sun is within 90 degrees for half an orbit."""
     found = sample(sphere, START, revolution_s(sphere), Pointing("zenith", POLE[0]), POLE, 0.1)
     assert found.outside(ExclusionConfig(sun_deg=90, stars=0))["Sun"].mean() == pytest.approx(
@@ -91,7 +91,7 @@ def test_stars_are_counted_in_the_field_and_above_the_limb(sphere: CircularOrbit
 
 
 @pytest.mark.parametrize("name", ["sun", "moon"])
-def test_places_between_the_nodes_are_the_ephemeris_s(name: str) -> None:
+def test_positions_between_nodes_match_the_ephemeris(name: str) -> None:
     spline = place_spline(name, START, 1e5)
     ephemeris = load_ephemeris()
     for t_s in (1234.0, 54321.0):

@@ -8,7 +8,7 @@ from scipy import stats
 from skysim.sources.dome.layouts.boards import Boards, tilt_boards
 
 
-def test_glue_tilts_boards_evenly_over_a_cap_and_turns_them_about_no_normal() -> None:
+def test_glue_tilts_are_uniform_over_a_cap_without_rotation_about_the_normal() -> None:
     """The normal is uniform over the cap: its height and its azimuth are uniform. The rotation is the shortest one."""
     count = 20_000
     most_rad = 0.3

@@ -92,7 +92,7 @@ def test_velocity_is_the_derivative_of_position() -> None:
     )
 
 
-def test_a_sun_synchronous_orbit_turns_once_a_year() -> None:
+def test_a_sun_synchronous_orbit_precesses_once_a_year() -> None:
     """Vallado 2013, section 11.4.1: at 800 km an inclination of 98.6 degrees gives 0.9856 degrees a day."""
     _, node_rate = circular(altitude="800 km", inclination_deg=98.6).rates_rad_s
     assert np.degrees(node_rate) * 86400 == pytest.approx(0.9856, rel=5e-3)
@@ -128,7 +128,7 @@ def test_an_oem_is_interpolated_between_its_samples(
         ("META_START\n", "", "line 5: META_STOP before META_START"),
     ],
 )
-def test_bad_oems_are_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_a_bad_oem_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "orbit.oem"
     t_s = np.array([0.0, 60.0])
     path.write_text(oem_text(t_s, *ellipse(t_s)).replace(old, new, 1), encoding="utf-8")

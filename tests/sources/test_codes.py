@@ -49,7 +49,7 @@ def test_an_exposure_has_the_mean_light_of_its_bits(open_s: float, exposure_s: f
     np.testing.assert_allclose(shown.mean_level(open_s, exposure_s, 0), expected, rtol=0, atol=2e-4)
 
 
-def test_bits_fail_as_often_as_stated_and_independently() -> None:
+def test_bits_fail_at_the_stated_rate_independently() -> None:
     """Binomial: 400,000 bits at 3 %, and the failures of two LEDs coincide as often as independent ones."""
     kind = PlainCodeConfig(kind="gray", depth=1.0, dropout=0.03)
     shown = LedCodes(codebook(kind, 400), kind, None, 3)
@@ -78,7 +78,7 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
     )
 
 
-def test_a_run_s_code_begins_anywhere_and_its_clock_is_the_hardware_s() -> None:
+def test_a_run_s_code_phase_is_random_and_its_clock_belongs_to_the_hardware() -> None:
     settings = {
         "light.led.code": "{kind: cyclic, bit_time: 20 ms}",
         "light.led.clock": "{offset_ppm: 50}",

@@ -75,7 +75,7 @@ def fibers(variation: float, **points: Any) -> Sources:
     return lit({"kind": "fibers", "points": ends, "radius_variation": variation}, APL)
 
 
-def test_fibers_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_radius() -> None:
+def test_fiber_displacement_along_the_normal_is_uniform_within_its_declared_share() -> None:
     """Uniform over +-.4 % of 4 ft, which is 4.9 mm: mean and variance to four of their sigmas."""
     ideal = fibers(0.0)
     real = fibers(0.004)
@@ -93,7 +93,7 @@ def test_fibers_stand_off_along_the_normal_evenly_by_the_declared_share_of_the_r
         np.testing.assert_array_equal(getattr(real, name), getattr(ideal, name))
 
 
-def test_a_camera_off_the_center_of_apl_s_dome_errs_as_the_reference_says() -> None:
+def test_a_camera_off_the_center_of_apl_s_dome_has_the_reference_s_error() -> None:
     """(r / R)(dR / R) at most: 34 arcsec at 50 mm, and no more than its square beside it; none in the center."""
     camera_m = np.array([0.05, 0, 0])
     ideal = fibers(0.0).place[:, :3]
@@ -104,7 +104,7 @@ def test_a_camera_off_the_center_of_apl_s_dome_errs_as_the_reference_says() -> N
     assert 0.9 * bound < apart.max() < bound * (1 + 0.05 / (4 * FOOT_M) + 0.004)
 
 
-def test_fibers_carry_the_stars_that_another_layout_projects() -> None:
+def test_fibers_show_the_stars_of_a_projected_sky() -> None:
     """Marked by a laser from the center: in its direction whatever the radius, Hipparcos' number on each."""
     stars = {"kind": "celestial", "cap_deg": 80, "count": 100, "camera": ["0 m"] * 3}
     stars |= {"zenith_ra_deg": 0, "zenith_dec_deg": 90}
@@ -142,7 +142,7 @@ def led_e_s_sr() -> float:
     return float(led_strength_e_s_sr(13e-6, "white", BAND))
 
 
-def test_rounding_to_pixels_is_an_even_error_over_a_pitch() -> None:
+def test_rounding_to_pixels_is_a_uniform_error_over_a_pitch() -> None:
     """Variance p^2 / 12 along either axis, mean none, no correlation: to four sigmas of some 2,000 stars."""
     wanted = lit(EVERYWHERE)
     drawn = lit(PANEL)
@@ -223,7 +223,7 @@ def refreshed(duty: float, **more: Any) -> Sources:
     return lit(PANEL | more, drive={"kind": "refresh", "rate_hz": 60, "duty": duty})
 
 
-def test_all_pixels_of_a_row_shine_together_and_a_row_later_than_the_one_above() -> None:
+def test_pixels_of_a_row_light_up_together_and_rows_one_after_another() -> None:
     """A 1,050th of a frame from a row to the next, downwards; another panel has another phase."""
     drawn = refreshed(0.2)
     row = np.rint(own_m(drawn.place)[:, 1] / 0.258e-3 + 524.5)
@@ -262,7 +262,7 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
     return np.array([lit_moments_s(begin, begin + exposure_s, *pulses)[0] for begin in begins])
 
 
-def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
+def test_rows_that_are_not_lit_within_the_exposure_are_dark() -> None:
     """NPS's stars lit for a quarter of a frame, in an exposure of a quarter: by each row's own turn, or not at all."""
     changes = {
         "light.led.drive.duty": "0.25",
@@ -293,7 +293,7 @@ def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
 # The bench
 
 
-def test_a_bench_shows_its_stars_on_its_pixels_in_their_place_in_the_sky() -> None:
+def test_a_bench_shows_stars_on_pixels_at_their_sky_positions() -> None:
     """Gnomonic about the axis by spherical trigonometry, lab -y at position angle roll; rounded to a pixel."""
     made = shown()
     stars = catalog.read("gaia_v8.0")
@@ -318,7 +318,7 @@ def test_a_bench_shows_its_stars_on_its_pixels_in_their_place_in_the_sky() -> No
     assert np.all(made.place[:, 3] == 0)
 
 
-def test_the_field_ends_where_the_display_does() -> None:
+def test_a_bench_s_field_ends_with_its_display() -> None:
     """All the stars within it to the limit, none beyond: counted through a wider one."""
     wide = shown(pixels=[3000, 3000], limit_mag=6.0)
     narrow = shown(limit_mag=6.0)
@@ -343,15 +343,15 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("conjugate_m", [None, 20.0, 500.0])
-def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(
+def test_a_camera_on_a_lever_sees_only_the_collimation_s_parallax(
     conjugate_m: float | None,
 ) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
-    told = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
+    settings = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
     lab = build_lab(
         loader.load(
             "collimated_display",
-            told | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
+            settings | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
         )
     )
     central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
@@ -394,7 +394,7 @@ def glow_e_s(lab: Lab) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> None:
+def test_a_black_panel_has_the_light_of_all_pixels_over_the_contrast() -> None:
     """20 x 15 pixels drawn white one by one, off the axis and seen aslant: their light on the frame over the contrast.
 
     The chip has some 170 x 130 pixels of it: an edge to half a pixel at each end is under a per cent.
@@ -429,7 +429,7 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
     )
 
 
-def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
+def test_a_black_bench_has_the_light_of_the_display_pixels_within_each_chip_pixel() -> None:
     """A pixel of the chip holds (81.7 / 37.1)^2 of the display's, each 1 / contrast of a white star; none beside it."""
     changes = {"light.contrast": "400", "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"}
     lab = build_lab(loader.load("collimated_display", changes))
@@ -450,7 +450,7 @@ def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
 
 
 @pytest.mark.slow
-def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None:
+def test_the_glow_is_on_the_frame_only_with_a_finite_contrast() -> None:
     """A noise-free frame with it less one without is the glow by the exposure, but for what is taken off the stars."""
     silent = {"camera.detector.noise": "false"}
     plain = build_lab(loader.load("collimated_display", silent))
@@ -472,7 +472,7 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
     )
 
 
-# Slips
+# Faulty keys
 
 
 @pytest.mark.slow
@@ -512,7 +512,7 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
         ),
     ],
 )
-def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str) -> None:
+def test_a_wrong_panel_is_refused_in_one_line(overrides: dict[str, str], says: str) -> None:
     assert_refused("nps_tas2", overrides, says)
 
 
@@ -552,7 +552,7 @@ def test_a_wrong_panel_is_told_in_one_line(overrides: dict[str, str], says: str)
         ),
     ],
 )
-def test_a_wrong_display_is_told_in_one_line(
+def test_a_wrong_display_is_refused_in_one_line(
     name: str, overrides: dict[str, str], says: str
 ) -> None:
     assert_refused(name, overrides, says)
@@ -566,7 +566,7 @@ def assert_refused(name: str, overrides: dict[str, str], says: str) -> None:
 
 
 @pytest.mark.parametrize(("width_m", "fits"), [(0.5, True), (0.2, True), (0.2 - 1e-6, False)])
-def test_pixels_must_fit_the_surface_which_ends_with_them(width_m: float, fits: bool) -> None:
+def test_the_surface_ends_with_its_pixels_which_must_fit(width_m: float, fits: bool) -> None:
     config = layouts.LcdConfig.model_validate(PANEL | {"pixels": [20, 15], "pitch": "1 cm"})
     plane = surface.Plane(np.zeros(3), half_m=np.array([width_m / 2, 1.0]))
     if fits:

@@ -75,7 +75,7 @@ def test_rays_meet_the_surface_on_its_equation_and_on_themselves(
     np.testing.assert_allclose(np.cross(along, rays), 0, rtol=0, atol=1e-13)
 
 
-def test_measured_dome_has_the_reference_s_figures() -> None:
+def test_the_measured_dome_has_the_reference_s_dimensions() -> None:
     # Reference A4: radius from the bearing 48 in at the apex, 48.29 in at most, near 29 degrees.
     angle_deg = np.arange(0, 40, 0.02)
     rays = np.column_stack(
@@ -98,7 +98,7 @@ def test_measured_dome_at_the_rim_height_has_the_reference_s_radius() -> None:
     assert np.linalg.norm(met) / INCH_M == pytest.approx(48.011, abs=0.01)
 
 
-def test_a_sphere_about_the_bearing_is_equally_far_everywhere() -> None:
+def test_a_sphere_about_the_bearing_has_constant_distance() -> None:
     # Reference A2: exact.
     made = surface({"kind": "sphere", "apex": "48 in", "radius": "48 in"})
     radius = np.linalg.norm(made.meet(np.zeros(3), upward_rays(100, 2)), axis=1)
@@ -106,7 +106,7 @@ def test_a_sphere_about_the_bearing_is_equally_far_everywhere() -> None:
 
 
 @pytest.mark.parametrize("part", [MEASURED, SPHERE, {"kind": "flat", "apex": "48 in"}])
-def test_the_apex_is_where_it_is_declared(part: dict) -> None:
+def test_the_apex_has_its_declared_height(part: dict) -> None:
     """Straight above the dome's own axis; the offset moves it along."""
     made = surface(part)
     offset = light.SurfaceConfig.model_validate(part).offset_m
@@ -213,13 +213,13 @@ def test_lit_leds_are_within_the_range_and_all_of_it_is_used(afit: Sources) -> N
     assert {len(pattern) for pattern in patterns(lit_dome(lit=[9, 9]))} == {9}
 
 
-def test_no_led_stands_twice(afit: Sources) -> None:
+def test_no_two_leds_share_a_position(afit: Sources) -> None:
     assert len(np.unique(afit.id)) == len(afit)
     nearest = cKDTree(afit.place[:, :3]).query(afit.place[:, :3], k=2)[0][:, 1]
     assert nearest.min() > 0.0079
 
 
-def test_the_same_hardware_seed_is_the_same_dome_and_another_is_another() -> None:
+def test_the_same_hardware_seed_gives_the_same_dome_and_another_seed_another() -> None:
     first, again, other = (lit_dome(hardware_seed=seed) for seed in (5, 5, 6))
     for name in set(Sources.__slots__) - {"motion", "chromatic"}:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
@@ -227,7 +227,7 @@ def test_the_same_hardware_seed_is_the_same_dome_and_another_is_another() -> Non
 
 
 @pytest.mark.parametrize("spacing_in", [2.0, 2.6, 5.2])
-def test_boards_are_as_dense_as_their_spacing_says(spacing_in: float) -> None:
+def test_the_density_of_boards_follows_from_their_spacing(spacing_in: float) -> None:
     """One board in every spacing squared of the cap of 2 pi R^2 (1 - cos 27 deg), evenly."""
     leds = lit_dome(spacing=f"{spacing_in} in", lit=[9, 9])
     middle = leds.place[leds.id % 9 == 4, :3]
@@ -238,7 +238,7 @@ def test_boards_are_as_dense_as_their_spacing_says(spacing_in: float) -> None:
     assert np.degrees(np.arccos(middle[:, 2] / np.linalg.norm(middle, axis=1))).max() <= 27
 
 
-def test_boards_are_as_many_in_equal_areas() -> None:
+def test_boards_are_uniform_in_area() -> None:
     """Fibonacci's spiral is uniform in the cosine: each tenth of the cap's area has a tenth of the boards."""
     z = dome.cap(1000, np.radians(27))[:, 2]
     counts, _ = np.histogram(z, np.linspace(np.cos(np.radians(27)), 1, 11))
@@ -266,12 +266,12 @@ def test_without_scatter_all_leds_are_equal() -> None:
     np.testing.assert_array_equal(logs(lit_dome()), 0)
 
 
-def test_neighbors_scatter_on_their_own() -> None:
+def test_neighboring_leds_scatter_independently() -> None:
     drawn = logs(lit_dome(led=LED | {"scatter": 0.08}, lit=[9, 9], spacing="1.5 in")) / 0.08
     assert abs(np.mean(drawn[1:] * drawn[:-1])) < 4 / np.sqrt(len(drawn))
 
 
-def test_brightness_belongs_to_the_hardware_and_not_to_the_run() -> None:
+def test_brightness_depends_on_the_hardware_seed_not_on_the_run() -> None:
     """The scene's own seed changes nothing, nor does what others draw; the hardware's seed changes all."""
     built = loader.load("afit_simsat").light
     rerun = loader.load("afit_simsat", {"seed": "99"}).light

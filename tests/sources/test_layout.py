@@ -106,7 +106,7 @@ def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_ca
     np.testing.assert_array_equal(leds.id, np.arange(len(leds)))
 
 
-def test_fibonacci_has_its_share_in_every_cap() -> None:
+def test_a_fibonacci_layout_has_the_expected_share_in_every_cap() -> None:
     """Of N LEDs over 40 deg, N (1 - cos a) / (1 - cos 40 deg) within a of any point: to 2 per cent and an LED."""
     leds = lit({"kind": "fibonacci", "count": 20_000})
     about = unit(np.array([[0, 0, 1.0], [0.3, 0.1, 1], [-0.2, 0.4, 1], [0.05, -0.5, 1]]))
@@ -118,7 +118,7 @@ def test_fibonacci_has_its_share_in_every_cap() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
-def test_poisson_disk_leaves_none_too_near_and_no_room(surface: dict) -> None:
+def test_a_poisson_disk_layout_keeps_its_distance_and_leaves_no_gap(surface: dict) -> None:
     """No pair nearer than the spacing; and no place, but one in a thousand, has every LED farther than that."""
     leds = lit({"kind": "poisson_disk", "spacing": "1.3 in"}, surface)
     tree = cKDTree(leds.place[:, :3])
@@ -150,7 +150,7 @@ def test_poisson_disk_covers_as_random_sequential_adsorption_does(
     assert 2 * cover[1] - cover[0] == pytest.approx(0.547, rel=0.03)
 
 
-def test_random_leds_are_a_poisson_field() -> None:
+def test_random_leds_are_a_poisson_point_process() -> None:
     """Nearest neighbors of density n are .5 / sqrt(n) away, sd .2614 / sqrt(n); tenths of the area hold a tenth."""
     leds = lit({"kind": "random", "count": 4000, "hardware_seed": 3})
     place_in = leds.place[:, :3] / INCH_M
@@ -197,7 +197,7 @@ def test_the_afit_field_sees_eight_of_a_thousand(
 @pytest.mark.parametrize(
     "layout", [*SPREADS, BOARDS, SKY | {"count": 40}], ids=lambda part: part["kind"]
 )
-def test_the_same_hardware_is_the_same_dome_and_another_has_other_lamps(layout: dict) -> None:
+def test_the_hardware_seed_determines_the_dome(layout: dict) -> None:
     first, again, other = (lit(layout | {"hardware_seed": s}, scatter=0.08) for s in (5, 5, 6))
     for name in set(Sources.__slots__) - {"motion", "chromatic"}:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
@@ -247,7 +247,7 @@ def test_grid_boards_lie_along_their_rows() -> None:
     np.testing.assert_allclose(step_m[:, 0], 0, rtol=0, atol=1e-15)
 
 
-def test_boards_stand_where_the_list_says_with_their_leds_and_levels() -> None:
+def test_listed_boards_have_their_positions_leds_and_levels() -> None:
     leds = listed_boards(
         {"azimuth_deg": 30, "tilt_deg": 20, "leds": [4, 0, 8], "levels": [1.0, 0.5, 0.25]},
         {"azimuth_deg": 200, "tilt_deg": 7, "leds": [4, 1]},
@@ -293,13 +293,16 @@ def test_glue_moves_each_led_in_its_board_s_plane_by_as_much_as_declared() -> No
     real = lit(BOARDS | {"glue_scatter": "0.12 mm"}, MEASURED)
     np.testing.assert_array_equal(ideal.id, real.id)
     np.testing.assert_array_equal(ideal.start_s, real.start_s)
-    slip = (real.place - ideal.place)[:, :3]
-    n = len(slip)
+    displacement = (real.place - ideal.place)[:, :3]
+    n = len(displacement)
     assert n > 1000
-    np.testing.assert_allclose(np.einsum("nj,nj->n", slip, ideal.normal), 0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.einsum("nj,nj->n", displacement, ideal.normal), 0, rtol=0, atol=1e-15
+    )
     one = unit(np.cross(ideal.normal, [0, 1.0, 0]))
     a, b = (
-        np.einsum("nj,nj->n", slip, axis) / 0.12e-3 for axis in (one, np.cross(ideal.normal, one))
+        np.einsum("nj,nj->n", displacement, axis) / 0.12e-3
+        for axis in (one, np.cross(ideal.normal, one))
     )
     for value in (a, b):
         assert abs(value.mean()) < 4 / np.sqrt(n)
@@ -336,7 +339,7 @@ def test_glue_tilts_boards_evenly_up_to_its_limit_and_keeps_them_flat() -> None:
 
 
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
-def test_from_its_nominal_place_the_camera_sees_the_stars_where_they_are(surface: dict) -> None:
+def test_from_its_nominal_position_the_camera_sees_stars_in_true_directions(surface: dict) -> None:
     """Angle from the zenith and position angle there, by spherical trigonometry from the apparent RA and Dec."""
     leds = lit(SKY | {"count": 60}, surface)
     stars = catalog.read("hipparcos_hp6.5")
@@ -365,7 +368,7 @@ def test_from_its_nominal_place_the_camera_sees_the_stars_where_they_are(surface
 
 
 @pytest.mark.parametrize("drive", ["pwm", "direct"])
-def test_light_at_the_nominal_place_follows_pogson(drive: str) -> None:
+def test_light_at_the_nominal_position_follows_pogson_s_law(drive: str) -> None:
     """I D cos(theta) / d^2 of every LED is 10^(-0.4 V) of the brightest's, whatever its distance and slant."""
     leds = lit(SKY | {"limit_mag": 4.5}, FLAT, drive={"kind": drive})
     to_camera = np.array([0.01, -0.02, 15 * INCH_M]) - leds.place[:, :3]
@@ -379,7 +382,7 @@ def test_light_at_the_nominal_place_follows_pogson(drive: str) -> None:
     assert np.ptp(distance_m) > 0.1  # they did have something to make up for
 
 
-def test_no_star_is_shown_brighter_than_told() -> None:
+def test_no_star_is_shown_brighter_than_the_limit() -> None:
     leds = lit(SKY | {"limit_mag": 4.5, "camera": ["0 m", "0 m", "0 m"], "brightest_mag": 2.0})
     assert np.sum(leds.magnitude < 2) >= 5  # Orion
     expected = 10 ** (-0.4 * (np.maximum(leds.magnitude, 2.0) - 2.0))
@@ -398,7 +401,7 @@ def test_count_and_limit_choose_the_brightest_that_are_on_the_dome() -> None:
     assert {27989, 24436, 25336, 25930, 26311, 26727} <= set(to_limit.id)
 
 
-def test_a_millimeter_off_the_nominal_place_costs_what_the_apl_dome_says() -> None:
+def test_a_millimeter_off_the_nominal_position_errs_as_in_the_apl_dome() -> None:
     """Reference 5: on a sphere of 4 ft a camera 1 mm off its center is wrong by 169 arcsec, d/R sin of the angle."""
     dome_4ft = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
     leds = lit(SKY | {"limit_mag": 6.0, "cap_deg": 80, "camera": ["0 m", "0 m", "0 m"]}, dome_4ft)
@@ -430,7 +433,7 @@ def test_listed_directions_are_on_the_surface_and_positions_as_they_are() -> Non
     np.testing.assert_array_equal(leds.normal, [[0, 0, -1.0], [0, 0, -1.0]])
 
 
-def test_a_file_says_what_a_list_says(tmp_path: Path) -> None:
+def test_a_file_of_leds_equals_a_list_in_the_scene(tmp_path: Path) -> None:
     path = tmp_path / "leds.csv"
     path.write_text("# surveyed\nazimuth_deg, tilt_deg, magnitude\n0,0,1.0\n\n90,30,3.5\n")
     listed = {"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.1]}
@@ -470,7 +473,7 @@ def test_a_file_says_what_a_list_says(tmp_path: Path) -> None:
     ],
     ids=["poisson_disk", "circles", "spiral", "boards", "sky"],
 )
-def test_the_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -> None:
+def test_the_exported_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -> None:
     path = tmp_path / "leds.csv"
     direct = {"drive": {"kind": "direct"}, "scatter": 0.0}
     config = {
@@ -519,7 +522,7 @@ def test_an_led_is_on_its_tape_where_the_list_says(winding: str) -> None:
     assert np.all(rows["tape_m"][np.append(True, ~same)] == 0)
 
 
-def test_the_leds_of_a_survey_are_a_list_too(tmp_path: Path) -> None:
+def test_a_survey_s_file_is_a_list_of_leds(tmp_path: Path) -> None:
     place_m = lit({"kind": "fibonacci", "count": 5}, SPHERE).place[:, :3]
     zero = (0.0, 0.0)
     lens: dict[str, Any] = {
@@ -564,7 +567,7 @@ def test_the_leds_of_a_survey_are_a_list_too(tmp_path: Path) -> None:
         ("x_m,y_m,z_m\n0,0,0\n", ".0: 0 deg from the zenith"),
     ],
 )
-def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_bad_file_of_leds_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "leds.csv"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -648,7 +651,7 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
         ),
     ],
 )
-def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
+def test_a_wrong_layout_is_refused_in_one_line(layout: str, says: str) -> None:
     assert_refused({"light.layout": layout}, says)
 
 
@@ -673,7 +676,7 @@ def test_a_wrong_layout_is_told_in_one_line(layout: str, says: str) -> None:
         ),
     ],
 )
-def test_a_wrong_sky_is_told_in_one_line(more: str, says: str) -> None:
+def test_a_wrong_projected_sky_is_refused_in_one_line(more: str, says: str) -> None:
     camera = "" if "camera" in more else "camera: [0 m, 0 m, 0.3 m],"
     layout = (
         f"{{kind: celestial, cap_deg: 30, {camera} zenith_ra_deg: 1, zenith_dec_deg: 2, {more}}}"
@@ -688,7 +691,7 @@ def assert_refused(overrides: dict[str, str], says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_boards_can_be_told_apart_where_there_are_any() -> None:
+def test_each_led_has_its_board_s_number_if_there_are_boards() -> None:
     config = loader.load("afit_simsat").light
     leds = dome.sources(config, BAND)
     boards = dome.board_of(config.layout, leds.id)
@@ -706,7 +709,7 @@ def test_boards_can_be_told_apart_where_there_are_any() -> None:
 # Drives
 
 
-def test_direct_current_never_goes_out_and_dims_in_strength() -> None:
+def test_leds_at_direct_current_are_always_lit_and_dimmed_by_current() -> None:
     leds = lit(
         {"kind": "listed", "directions_deg": [[0, 1], [0, 2]], "levels": [1.0, 0.2]},
         drive={"kind": "direct"},
@@ -731,7 +734,7 @@ def sequential(count: int, **more: Any) -> dict[str, Any]:
     return {"kind": "patch_boards", "cap_deg": 40, "pitch": "8 mm", "boards": [board]}
 
 
-def test_sequential_leds_shine_one_after_another_each_for_its_share() -> None:
+def test_sequential_leds_are_lit_one_after_another_for_their_share() -> None:
     """Eq. 37: D = t_on / sum T; never two at once, and the whole cycle is lit where every level is one."""
     leds = lit(sequential(5), drive={"kind": "sequential", "slot": "1 ms"})
     np.testing.assert_allclose(leds.period_s, 5e-3, rtol=1e-15, atol=0)
@@ -758,7 +761,7 @@ def test_a_cycle_is_as_long_as_its_controller_has_leds(controller: str | int, sh
         np.testing.assert_allclose(start, np.arange(len(start)), rtol=0, atol=1e-9)
 
 
-def test_controllers_start_whenever_they_are_switched_on() -> None:
+def test_controllers_have_independent_random_phases() -> None:
     """Phases of boards are uniform over the cycle: mean to four sigmas, and the boards' are not one another's."""
     leds = lit(BOARDS | {"lit": [5, 5], "spacing": "1.5 in"}, drive={"kind": "sequential"})
     first = np.array([leds.start_s[leds.id // 9 == b].min() for b in np.unique(leds.id // 9)])
@@ -767,7 +770,7 @@ def test_controllers_start_whenever_they_are_switched_on() -> None:
     assert 0 <= first.min() < first.max() < 5e-3
 
 
-def test_a_layout_without_boards_needs_to_be_told_its_controllers() -> None:
+def test_a_layout_without_boards_requires_leds_per_controller() -> None:
     spread = {
         "light.layout": "{kind: fibonacci, cap_deg: 30, count: 9}",
         "light.led.drive": "{kind: sequential}",

@@ -66,7 +66,7 @@ def test_twice_as_far_is_a_quarter_as_bright(distance_m: float) -> None:
     )
 
 
-def test_lambert_s_emitter_and_the_aperture_each_cost_a_cosine() -> None:
+def test_emitter_and_aperture_each_contribute_a_cosine() -> None:
     out, into = np.cos(np.radians([30.0, 10.0]))
     assert irradiance(out, into) == pytest.approx(5e12 * out * into, rel=1e-14)
 
@@ -104,7 +104,7 @@ def test_a_table_of_cosines_is_lambert_s_lobe() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_measured_lobe_that_falls_falls_in_between(seed: int) -> None:
+def test_interpolation_of_a_decreasing_lobe_is_decreasing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     angle_deg = np.append(0, np.sort(rng.uniform(1, 90, 6)))
     intensity = np.append(1, np.sort(rng.uniform(0, 1, 6))[::-1])
@@ -120,7 +120,7 @@ def test_a_measured_lobe_that_falls_falls_in_between(seed: int) -> None:
 @pytest.mark.parametrize(
     "emitter", [cosine(0.0), cosine(1.0), cosine(2.5), measured([0, 180], [1.0, 1.0])]
 )
-def test_nothing_goes_backwards_or_comes_from_behind(
+def test_an_led_emits_nothing_backwards_and_nothing_is_received_from_behind(
     cos_out: float, cos_in: float, emitter: Emitter
 ) -> None:
     assert irradiance(cos_out, cos_in, emitter=emitter) == 0.0
@@ -134,7 +134,7 @@ def test_a_lambertian_disk_sends_pi_times_its_strength_into_the_half_space() -> 
     assert 2 * np.pi * (sent @ weight) / 2 == pytest.approx(np.pi * 5e12, rel=1e-13)
 
 
-def test_a_scene_s_led_names_its_laws() -> None:
+def test_a_scene_names_the_laws_of_its_leds() -> None:
     part = {
         "intensity": "16 mcd",
         "disk_diameter": "2 mm",
@@ -145,7 +145,7 @@ def test_a_scene_s_led_names_its_laws() -> None:
     assert Emitter.from_config(LedConfig.model_validate(part)) == LAMBERT
 
 
-def test_every_lobe_of_a_scene_is_known_here() -> None:
+def test_every_lobe_of_the_schema_is_implemented() -> None:
     kinds = [
         part.model_fields["kind"].annotation.__args__[0]
         for part in (CosineLobeConfig, LobeTableConfig)
@@ -160,7 +160,7 @@ def test_the_falloff_that_a_scene_names_is_the_one_used(monkeypatch: pytest.Monk
     )
 
 
-def test_every_falloff_falls() -> None:
+def test_every_falloff_is_decreasing() -> None:
     distance = np.linspace(0.2, 5, 50)
     for law in FALLOFF.values():
         assert np.all(np.diff(law(distance)) < 0)
@@ -187,7 +187,7 @@ def aging(hours: float, scatter: object = 0.0) -> AgingConfig:
     return AgingConfig.model_validate({"hours": hours, "life_hours": 36_000.0, "scatter": scatter})
 
 
-def test_the_procedure_of_tm_21_finds_the_life_that_a_scene_states() -> None:
+def test_the_tm_21_procedure_recovers_the_scene_s_lifetime() -> None:
     """A line fitted to the logarithms of the light measured every thousand hours, and where it crosses 70 %."""
     hours = np.arange(1000.0, 10_001.0, 1000.0)
     light = [float(aging_factors(aging(each), np.zeros(1))[0]) for each in hours]
@@ -197,7 +197,7 @@ def test_the_procedure_of_tm_21_finds_the_life_that_a_scene_states() -> None:
 
 
 @pytest.mark.parametrize("scatter", [0.2, {"tolerance": 0.3}])
-def test_leds_age_at_rates_of_their_own(scatter: object) -> None:
+def test_each_led_ages_at_its_own_rate(scatter: object) -> None:
     config = aging(12_000.0, scatter)
     rates = (
         -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000))) / 12_000
@@ -211,13 +211,13 @@ def test_leds_age_at_rates_of_their_own(scatter: object) -> None:
         assert (rates / nominal).std() == pytest.approx(0.3 / math.sqrt(3), rel=0.02)
 
 
-def test_a_dome_ages_and_nothing_else_of_it_changes() -> None:
+def test_aging_changes_only_the_light_of_a_dome() -> None:
     """Each LED by its own factor, the same in every run of the same hardware."""
     band = Band.from_efficiency(0.3)
 
     def leds(keys: str) -> Sources:
-        told = {"light.led.aging": keys} if keys else {}
-        return sources(loader.load("afit_simsat", told).light, band)
+        settings = {"light.led.aging": keys} if keys else {}
+        return sources(loader.load("afit_simsat", settings).light, band)
 
     new, even, own = (leds(keys) for keys in ("", "{hours: 9000, life_hours: 18000}", UNEVEN))
     np.testing.assert_allclose(even.strength / new.strength, math.sqrt(0.7), rtol=1e-12)
@@ -231,7 +231,7 @@ def test_a_dome_ages_and_nothing_else_of_it_changes() -> None:
 UNEVEN = "{hours: 9000, life_hours: 18000, scatter: 0.2}"
 
 
-def test_panels_age_as_one() -> None:
+def test_all_pixels_of_a_panel_age_alike() -> None:
     """Their pixels, and the glow of the black ones."""
     keys = {"light.layout.contrast": "500"}
     cameras = [
@@ -249,7 +249,7 @@ def test_panels_age_as_one() -> None:
     np.testing.assert_allclose(glows[1], math.sqrt(0.7) * glows[0], rtol=1e-12)
 
 
-def test_warm_up_is_the_cooling_law_of_newton() -> None:
+def test_warm_up_follows_newton_s_law() -> None:
     """The light follows d g / d t = (steady - g) / time from 1."""
     config = WarmUpConfig.model_validate({"steady": 0.88, "time": "7 min"})
     times = np.array([10.0, 60.0, 420.0, 3000.0])
@@ -273,7 +273,9 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[s
     dark = keys | {"light.led.intensity": "1e-20 cd"}
     warm = keys | {"light.led.warm_up": "{steady: 0.8, time: 2 s}"}
     for index in (0, 1):
-        dark_dn, cold_dn, warm_dn = (still(scene, told, index) for told in (dark, keys, warm))
+        dark_dn, cold_dn, warm_dn = (
+            still(scene, settings, index) for settings in (dark, keys, warm)
+        )
         t_s = exposure_window(loader.load(scene, keys), index).middle_s(len(dark_dn))
         left = 0.8 + 0.2 * math.exp(-t_s / 2)
         np.testing.assert_allclose(

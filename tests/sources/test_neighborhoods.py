@@ -25,7 +25,7 @@ def surroundings(
     return tuple(tuple(np.roll(ring, turn).tolist()) for turn in range(nearest))
 
 
-def test_no_two_neighborhoods_are_alike_however_they_are_turned() -> None:
+def test_no_two_neighborhoods_are_equal_under_rotation() -> None:
     place = cap(150, 0.6)
     level = unique_levels(3, 6, place, np.random.default_rng(2))
     assert set(level.tolist()) == {0, 1, 2}
@@ -51,7 +51,9 @@ def test_no_two_neighborhoods_are_alike_however_they_are_turned() -> None:
         ),
     ],
 )
-def test_layouts_that_cannot_have_them_are_refused(layout: str, reason: str) -> None:
+def test_layouts_without_distinguishable_neighborhoods_are_refused(
+    layout: str, reason: str
+) -> None:
     with pytest.raises(InputError, match=reason):
         loader.load(SCENE, {"light.layout": layout})
 

@@ -61,7 +61,7 @@ def best() -> Sources:
 
 
 @pytest.mark.slow
-def test_places_are_searched_once_for_each_dome_and_camera() -> None:
+def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None:
     """Brightness is drawn after the search, from the same stream: a kept search changes no byte, and no other dome."""
     few = WANTED | {"count": 12, "rounds": 1, "levels": [1, 0.5], "spacing": "20 mm"}
     spreads.optimized_places.cache_clear()
@@ -102,7 +102,7 @@ def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) ->
 
 
 @pytest.mark.long
-def test_its_worst_attitudes_are_better_than_any_other_layout_s(best: Sources) -> None:
+def test_an_optimized_layout_has_better_worst_attitudes_than_any_other(best: Sources) -> None:
     """At 2,000 attitudes drawn apart from those it was made for: the worst, and the mean of the worst hundredth."""
     mine = variances(best.place[:, :3])
     for kind in ("fibonacci", "random", "poisson_disk"):
@@ -129,13 +129,13 @@ def sparse_is_not_worse(seed: int, **more: int) -> None:
 
 
 @pytest.mark.long
-def test_where_few_leds_are_seen_its_worst_attitudes_are_no_worse() -> None:
+def test_with_few_visible_leds_an_optimized_layout_is_no_worse() -> None:
     sparse_is_not_worse(0)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_with_any_seed_it_is_not_worse(seed: int) -> None:
+def test_an_optimized_layout_is_no_worse_for_any_seed(seed: int) -> None:
     """As shipped: sparse, and dense, where it is clearly better, at 5,000 attitudes that it was not made for."""
     sparse_is_not_worse(seed, rounds=100)
     shipped = {
@@ -152,7 +152,7 @@ def test_with_any_seed_it_is_not_worse(seed: int) -> None:
 
 
 @pytest.mark.long
-def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
+def test_an_optimized_layout_keeps_cap_surface_and_spacing(best: Sources) -> None:
     place_m = best.place[:, :3]
     assert len(best) == COUNT
     assert (
@@ -166,7 +166,7 @@ def test_it_keeps_to_cap_surface_and_spacing(best: Sources) -> None:
 
 
 @pytest.mark.long
-def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_optimized_layout_depends_on_its_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
     monkeypatch.setattr(optimize, "OPTIONS", quick)
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
@@ -176,7 +176,7 @@ def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.long
-def test_its_information_is_the_estimator_s(best: Sources) -> None:
+def test_the_layout_s_information_matches_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
     part = layouts.OptimizedConfig.model_validate(WANTED)
     place_m = best.place[:, :3]
@@ -203,7 +203,7 @@ def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
 
 
 @pytest.mark.slow
-def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror_is_not() -> None:
+def test_a_rotated_field_coincides_wholly_and_a_mirrored_one_does_not() -> None:
     """Seven LEDs, and the same rigidly turned by 30 deg: share 1, LED on LED; two left out: 5 of 7."""
     pattern = on_sphere(
         np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60])
@@ -240,7 +240,9 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
 
 
 @pytest.mark.long
-def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(best: Sources) -> None:
+def test_no_optimized_field_shares_half_with_another_while_spiral_fields_nearly_coincide(
+    best: Sources,
+) -> None:
     """A Fibonacci spiral is itself again a step along: benchmarks/dome_identify.py refuses 89 frames of a hundred."""
     config = layouts.OptimizedConfig.model_validate(WANTED)
     assert optimize.layout_ambiguity(config, best.place[:, :3]).fraction.max() <= 0.5
@@ -253,7 +255,7 @@ def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(bes
     assert np.mean(darts.fraction > 0.5) < 0.01  # these are identified
 
 
-def test_too_many_for_their_spacing_are_refused() -> None:
+def test_too_many_leds_for_their_spacing_are_refused() -> None:
     with pytest.raises(InputError, match=r"light.layout.spacing: \d+ of 120 LEDs fit 0.2 m apart"):
         lit(WANTED | {"spacing": "200 mm"})
 
@@ -286,7 +288,7 @@ def test_an_led_is_as_bright_as_the_chip_finds_its_star() -> None:
     assert np.ptp(stars.v_i) > 1  # colors did differ
 
 
-def test_doubles_within_a_disk_are_one_led_of_their_light() -> None:
+def test_doubles_within_a_disk_are_merged_to_one_led_of_their_light() -> None:
     """No light is lost, and no two are nearer than a disk, though merged ones stand between their stars' places."""
     wide = lit(SKY)
     fine = dome.sources(
@@ -333,7 +335,7 @@ def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
     assert not optimize.spacing_ok(place_m, 0.0201)
 
 
-def test_field_and_lever_are_the_scene_s_own_if_left_out() -> None:
+def test_field_and_lever_default_to_the_scene_s() -> None:
     """2 atan(w / 2 f) of the chip's sides, f the image distance; of a layout on a panel or of fibers too."""
     layout = "{kind: optimized, count: 20, cap_deg: 20, tilt_deg: 8, spacing: 20 mm%s}"
     own = {

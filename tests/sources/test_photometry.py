@@ -84,21 +84,21 @@ G_V = {
 }
 
 
-def test_a_g2_star_sends_the_reference_s_photons() -> None:
+def test_a_g2_star_has_the_reference_s_photon_rate() -> None:
     # Reference §2: 56,200 photons/s/mm² in 400-1000 nm, 28,800 in 400-700: three figures, so half a per cent.
     assert star_flux_e_s_m2(0.0, *SUN, ALL) * 1e-6 == pytest.approx(56_200, rel=2e-3)
     visible = Band(np.array([400e-9, 700e-9]), np.ones(2))
     assert star_flux_e_s_m2(0.0, *SUN, visible) * 1e-6 == pytest.approx(28_800, rel=5e-3)
 
 
-def test_near_5450_angstrom_a_v0_star_sends_about_a_thousand_photons() -> None:
+def test_near_5450_angstrom_a_v0_star_gives_about_a_thousand_photons() -> None:
     # Reference §2: 996 photons/s/cm²/Å at 5450 Å; V's mean lies 5 nm to the red of there, so 2 %.
     there = black_body_v0(np.array([545e-9]), np.array(5770.0))[0]
     assert there * 1e-4 * 1e-10 == pytest.approx(996, rel=0.02)
 
 
 @pytest.mark.parametrize("kelvin", [2800.0, 5770.0, 30000.0])
-def test_any_black_body_scaled_to_v0_is_v0(kelvin: float) -> None:
+def test_any_black_body_scaled_to_v0_has_the_energy_flux_of_v0(kelvin: float) -> None:
     """Summed by hand over Bessell's table: mean energy flux 3.63e-9 erg/s/cm²/Å."""
     rows = (DATA / "bands" / "johnson_v.csv").read_text().splitlines()[4:]
     nm, response = np.array([[float(cell) for cell in row.split(",")] for row in rows]).T
@@ -110,7 +110,7 @@ def test_any_black_body_scaled_to_v0_is_v0(kelvin: float) -> None:
     assert mean == pytest.approx(3.63e-9 * 1e-7 / 1e-4 / 1e-10, rel=1e-4)  # 1 nm steps against 0.1
 
 
-def test_black_body_colors_are_planck_s() -> None:
+def test_black_body_colors_follow_planck_s_law() -> None:
     """Two wavelengths' ratio by Planck's law with its constants written out; Wien's peak where it belongs."""
     red, blue = black_body_v0(np.array([800e-9, 450e-9]), np.array(5000.0))
     x_red, x_blue = (1.438776877e-2 / (nm * 1e-9 * 5000) for nm in (800, 450))
@@ -130,14 +130,14 @@ def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
     )  # Pogson's definition
 
 
-def test_liebe_s_rate_is_that_of_a_third_of_the_photons() -> None:
+def test_liebe_s_rate_is_a_third_of_the_photons() -> None:
     # Reference §2: 19,100 e-/s/mm² at V = 0 is efficiency times transmission of 0.34, three figures.
     assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency(0.34)) * 1e-6 == pytest.approx(
         19_100, rel=2e-3
     )
 
 
-def test_an_interline_chip_takes_the_reference_s_rate() -> None:
+def test_an_interline_chip_collects_the_reference_s_rate() -> None:
     # Reference §2: 15,000 e-/s/mm². The curve's height was chosen for it; three figures.
     assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency("interline")) * 1e-6 == pytest.approx(
         15_000, rel=5e-3
@@ -208,7 +208,7 @@ def test_known_stars_have_about_their_temperatures() -> None:
     assert kelvin[row[69673]] == pytest.approx(4290, rel=0.06)
 
 
-def test_redder_is_cooler_and_absurd_colors_are_the_ends() -> None:
+def test_redder_stars_are_cooler_and_absurd_colors_are_clipped() -> None:
     kelvin = temperature_k(np.nan, np.linspace(-0.369, 4.5, 500))
     assert np.all(np.diff(kelvin) < 0)
     ends = stellar_sequence().temperature_k[[0, -1]]
@@ -223,7 +223,7 @@ def test_a_star_without_colors_is_a_g2_star(nothing: float) -> None:
 
 
 @pytest.mark.parametrize("missing", [0.0, np.nan])
-def test_b_v_steps_in_where_v_i_is_missing(missing: float) -> None:
+def test_b_v_is_used_where_v_i_is_missing(missing: float) -> None:
     stars = stellar_sequence()
     b_v = np.delete(stars.b_v, np.flatnonzero(np.abs(stars.b_v) < 0.11))
     wanted = np.delete(stars.temperature_k, np.flatnonzero(np.abs(stars.b_v) < 0.11))
@@ -235,7 +235,7 @@ def test_an_a0_star_keeps_its_v_i_of_zero() -> None:
     np.testing.assert_array_equal(complete_colors(-0.02, 0.0), [-0.02, 0.0])
 
 
-def test_the_table_is_the_integral() -> None:
+def test_the_tabulated_rate_matches_the_integral() -> None:
     """Interpolated in the temperature against integrated at it, for temperatures between the table's own."""
     band = Band.from_efficiency("thick_ccd")
     v_i = np.linspace(-0.36, 4.4, 37)
@@ -244,7 +244,7 @@ def test_the_table_is_the_integral() -> None:
     np.testing.assert_allclose(star_flux_e_s_m2(0.0, np.nan, v_i, band), exact, rtol=2e-5, atol=0)
 
 
-def test_a_whole_catalog_takes_no_time() -> None:
+def test_a_whole_catalog_is_converted_in_little_time() -> None:
     color = np.random.default_rng(1).uniform(-0.3, 3, 100_000)
     star_flux_e_s_m2(5.0, color, color, ALL)
     begin = time.perf_counter()
@@ -252,7 +252,7 @@ def test_a_whole_catalog_takes_no_time() -> None:
     assert time.perf_counter() - begin < 1.0  # 25 ms on a quiet machine
 
 
-def test_a_sky_of_a_star_a_square_arcsecond() -> None:
+def test_sky_radiance_is_that_of_one_star_per_square_arcsecond() -> None:
     # 4 pi sr are 5.3464e11 square arcseconds.
     whole_sky = 4 * np.pi * sky_radiance_e_s_m2_sr(21.5, ALL)
     assert whole_sky == pytest.approx(5.34638e11 * star_flux_e_s_m2(21.5, *SUN, ALL), rel=1e-5)
@@ -266,7 +266,7 @@ def test_one_watt_of_555_nm_is_683_lumens() -> None:
     )
 
 
-def test_the_eye_s_curve_is_the_cie_s() -> None:
+def test_the_eye_s_response_matches_the_cie_s() -> None:
     """V(lambda) from the standard's well-known lines: .0380 at 450 nm, .503 at 510, .631 at 600, .107 at 650."""
     cd = led_strength_e_s_sr(1.0, 555e-9, ALL)
     for nm, efficiency in ((450, 0.0380), (510, 0.503), (600, 0.631), (650, 0.107)):
@@ -279,7 +279,7 @@ def pupil_sr() -> float:
     return float(np.pi / 4 * (0.035 / 8) ** 2 / (33 * 0.0254) ** 2)
 
 
-def test_an_led_fills_the_lens_as_the_reference_says() -> None:
+def test_an_led_gives_the_lens_the_reference_s_light() -> None:
     """Reference §2: 0.6 cd, T .85, QE .30 gives 3.1e7 e-/ms (two figures), every photon taken as green, 300 lm/W.
 
     Our white light has 304 lm/W (1.5 % less power) in photons of 563 nm on average (1.6 % more of them a watt),
@@ -293,7 +293,7 @@ def test_an_led_fills_the_lens_as_the_reference_says() -> None:
     assert electrons_ms == pytest.approx(green, rel=0.005)
 
 
-def test_white_light_is_white_and_as_efficacious_as_the_reference_s() -> None:
+def test_white_light_has_the_reference_s_color_and_efficacy() -> None:
     nm, power = read_columns(DATA / "led" / "white.csv")
     eye_nm, eye = read_columns(DATA / "bands" / "photopic.csv")
     lm_w = 683 * np.sum(power * np.interp(nm, eye_nm, eye)) / np.sum(power)
@@ -310,7 +310,7 @@ def read_columns(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("wavelength_m", [340e-9, 900e-9])
-def test_light_that_nobody_sees_has_no_candelas(wavelength_m: float) -> None:
+def test_invisible_light_has_no_candelas(wavelength_m: float) -> None:
     with pytest.raises(
         InputError,
         match=r"^light\.led\.spectrum: .* candelas; allowed: 360 to 830 nm, or radiant_intensity$",
@@ -318,7 +318,7 @@ def test_light_that_nobody_sees_has_no_candelas(wavelength_m: float) -> None:
         led_strength_e_s_sr(0.1, wavelength_m, ALL)
 
 
-def test_a_watt_is_a_watt_by_whichever_name() -> None:
+def test_a_strength_in_watts_or_candelas_gives_the_same_light() -> None:
     """A lamp of so many candela is one of so many watts a steradian by its own luminous efficacy."""
     for spectrum in ("white", 555e-9, 630e-9):
         watts = 0.2 / lumens_per_watt(spectrum)
@@ -405,7 +405,7 @@ def test_a_wrong_name_is_answered_with_the_right_ones() -> None:
         curve_file("gone.csv")
 
 
-def test_a_user_s_own_curve_is_read_and_read_anew_when_it_changes(tmp_path: Path) -> None:
+def test_a_user_s_curve_is_read_again_when_its_file_changes(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_text("# measured\nwavelength_nm,qe\n500,0.2\n600,0.4\n")
     assert Band.from_efficiency(str(path)).response_at(550e-9) == pytest.approx(0.3, rel=1e-12)
@@ -426,7 +426,7 @@ def test_a_user_s_own_curve_is_read_and_read_anew_when_it_changes(tmp_path: Path
         "a,b\n400,0\n500,0\n",
     ],
 )
-def test_a_file_that_is_no_curve_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_not_a_curve_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "bad.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=r"^.*bad\.csv: not a response curve.*$"):
@@ -503,7 +503,7 @@ ORION = {
 @pytest.mark.parametrize(
     ("scene", "keys"), [("shefex2", ORION), ("afit_simsat", {"camera.pixel": "32 um"})]
 )
-def test_a_gray_curve_gives_the_frame_of_its_number(
+def test_a_constant_curve_gives_the_frame_of_its_number(
     scene: str, keys: dict[str, str], tmp_path: Path
 ) -> None:
     """Every light, the sky's glow included, passes the lens once."""
@@ -527,7 +527,7 @@ def still_frame(scene: Scene) -> Floats:
     return render_at_rest(lab.camera, lab.start)[0].image_dn
 
 
-def test_a_lens_that_lets_nothing_to_the_chip_is_refused(tmp_path: Path) -> None:
+def test_a_lens_that_blocks_all_light_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "infrared.csv"
     path.write_text("wavelength_nm,transmission\n1300,0.6\n1400,0.6\n")
     with pytest.raises(
@@ -544,7 +544,7 @@ def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
         loader.load("shefex2", {"camera.transmission": value})
 
 
-def test_a_measured_spectrum(tmp_path: Path) -> None:
+def test_a_measured_spectrum_matches_its_colored_or_white_led(tmp_path: Path) -> None:
     """A table of a Gaussian is a colored LED, in any unit of power; that of the white LED is the white LED."""
     band = Band.from_efficiency("cmos")
     path = tmp_path / "led.csv"
@@ -560,7 +560,7 @@ def test_a_measured_spectrum(tmp_path: Path) -> None:
     assert led_strength_e_s_sr(0.3, white, band) == led_strength_e_s_sr(0.3, "white", band)
 
 
-def test_a_power_without_bound_is_no_spectrum(tmp_path: Path) -> None:
+def test_a_spectrum_with_unbounded_power_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
     path.write_text("wavelength_nm,power\n400,1\n500,inf\n")
     with pytest.raises(InputError, match=r"not a response curve; allowed: .* within 0 and inf"):
@@ -594,7 +594,9 @@ def test_a_spectrum_is_white_a_file_or_a_wavelength(keys: dict[str, str], messag
 
 
 @pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(470, 25), (525, 35), (630, 18), (590, 3)])
-def test_colored_led(peak_nm: float, fwhm_nm: float) -> None:
+def test_a_colored_led_gives_the_electrons_of_its_wavelength(
+    peak_nm: float, fwhm_nm: float
+) -> None:
     """Its Gaussian spectrum with QE and the eye's response, against adaptive quadrature."""
     band = Band.from_efficiency("cmos")
     sigma = fwhm_nm / 2.3548200450309493
@@ -629,7 +631,7 @@ def skipped(name: str) -> int:
     return next(n for n, line in enumerate(lines) if line[0].isdigit())
 
 
-def test_color_scatter() -> None:
+def test_colors_of_leds_scatter_as_declared() -> None:
     """LEDs of 630 nm within 2 nm, at equal candela: by the slope of QE times wavelength over V."""
     band = Band.from_efficiency("cmos")
     led = LedConfig.model_validate(

@@ -16,7 +16,7 @@ OPTIMIZE, AMBIGUITY = (
 )
 
 
-def test_a_site_has_room_beside_all_leds_but_the_one_that_moves() -> None:
+def test_a_site_is_free_if_only_the_moving_led_is_near() -> None:
     rng = np.random.default_rng(1)
     found = 0
     sites_m = rng.uniform(0, 1, (300, 3))
@@ -68,7 +68,7 @@ def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> N
     assert score.under_two(place_m) == np.sum(seen < 2)
 
 
-def test_most_of_a_field_that_another_shows_is_that_of_all_rotations() -> None:
+def test_the_largest_common_share_of_two_fields_is_over_all_rotations() -> None:
     """Fields of two rings, at any angles: every neighbor of each field is laid on every one of the other."""
     rng = np.random.default_rng(5)
     counts = rng.integers(3, 6, (8, 2))

@@ -90,7 +90,7 @@ def test_a_star_is_in_the_direction_of_a_whole_pixel_on_the_wall() -> None:
 
 
 @pytest.mark.parametrize(("focus_m", "block"), [(1.07, 1), (0.8, 1), (1.3, 3)])
-def test_a_spot_is_as_wide_as_that_of_traced_rays(focus_m: float, block: int) -> None:
+def test_a_spot_is_as_wide_as_ray_tracing_gives(focus_m: float, block: int) -> None:
     """Rays from all over the pupil through the sharp image of all over a block, to the wall; two moments of each."""
     places = [[0.3, 0.2, 1.1], [-0.35, 0.0, 1.1], [0.0, 0.4, 1.08], [0.1, 0.0, 1.21]]
     points = {
@@ -149,7 +149,7 @@ def test_a_pixel_s_light_is_lost_by_the_lens_alone(falloff: float) -> None:
     assert shown(falloff=0, block=3).strength[0] == pytest.approx(9 * single, rel=1e-12)
 
 
-def test_white_pixels_light_the_wall_as_the_square_of_distance_and_the_incidence_say() -> None:
+def test_illuminance_of_the_wall_follows_distance_squared_and_incidence() -> None:
     """All pixels' light over the wall is that of all of them: I cos(i) / D^2 integrated over the picture."""
     rng = np.random.default_rng(2)
     shell = surface.build_surface(config().surface)
@@ -175,7 +175,7 @@ def test_white_pixels_light_the_wall_as_the_square_of_distance_and_the_incidence
 
 
 @pytest.mark.slow
-def test_black_glows_as_all_pixels_by_the_contrast() -> None:
+def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
     """A Lambertian wall of the radiance L = J / A of white pixels: its electrons are L times the camera's etendue.
 
     In the frame's middle, and nothing beside the picture.
@@ -232,12 +232,12 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
         ({"points": POINTS | {"levels": [1.0, 1e-9]}}, "is black on 256 gray levels"),
     ],
 )
-def test_a_wrong_projector_is_told(more: dict[str, Any], says: str) -> None:
+def test_a_wrong_projector_is_refused(more: dict[str, Any], says: str) -> None:
     with pytest.raises((InputError, ValueError), match=says):
         shown(**more)
 
 
-def test_a_projector_has_no_pulses_of_its_own_leds() -> None:
+def test_the_projector_s_light_does_not_pulse() -> None:
     with pytest.raises(InputError, match="pwm cannot drive a projector; allowed: direct, refresh"):
         loader.load("projected_dome", {"light.led.drive": "{kind: pwm}"})
     with pytest.raises(

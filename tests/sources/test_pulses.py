@@ -24,7 +24,7 @@ def counted(
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_light_mean_and_spread_are_those_that_one_counts(seed: int) -> None:
+def test_light_mean_time_and_spread_match_a_direct_count(seed: int) -> None:
     rng = np.random.default_rng(seed)
     period = rng.uniform(0.2, 3.0)
     begin = rng.uniform(-5, 5)
@@ -47,7 +47,7 @@ def test_steady_light_has_the_moments_of_a_uniform_line() -> None:
         )
 
 
-def test_a_pulse_within_is_its_own_moments_and_the_dark_has_none() -> None:
+def test_a_single_pulse_has_its_own_moments_and_darkness_has_none() -> None:
     assert lit_moments_s(0.0, 10.0, 100.0, 4.0, 2.0) == pytest.approx(
         (2.0, 5.0, 2 / np.sqrt(12)), abs=1e-14
     )
@@ -61,7 +61,7 @@ def test_parts_of_an_interval_add_up() -> None:
     assert parts == pytest.approx(lit_moments_s(edges[0], edges[-1], *pulses)[0], rel=1e-12)
 
 
-def test_a_million_pulses_cost_no_loop_and_lose_nothing() -> None:
+def test_a_million_pulses_are_summed_in_closed_form_without_loss() -> None:
     lit, mean, spread = lit_moments_s(0.0, 1000.0, 1e-3, 0.0, 2.5e-4)
     assert lit == pytest.approx(250.0, rel=1e-9)
     assert mean == pytest.approx(500 - 3.75e-4, abs=1e-7)
@@ -97,7 +97,7 @@ def test_lit_time_is_that_of_brute_force_sampling(
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.floats(0, 1000), st.integers(1, 40), st.floats(0, 1e-3), st.floats(0.01, 1))
-def test_whole_periods_shine_for_exactly_their_duty(
+def test_whole_periods_are_lit_for_exactly_their_duty(
     begin: float, periods: int, start: float, duty: float
 ) -> None:
     on = duty * 1e-3

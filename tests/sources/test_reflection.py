@@ -57,7 +57,7 @@ def glow(wall: Surface, sources: Sources, **config: object) -> DiffuseLight:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_integrating_sphere(share: float) -> None:
+def test_an_integrating_sphere_has_its_textbook_irradiance(share: float) -> None:
     """E = P / (A (1 - rho)), everywhere, wherever the LEDs are; a Lambertian LED of 1 / sr has P = pi."""
     wall = sphere()
     points, normals = on_wall(wall, 7)
@@ -67,7 +67,7 @@ def test_integrating_sphere(share: float) -> None:
 
 
 @pytest.mark.parametrize("rim_deg", [50.0, 90.0, 120.0])
-def test_cap_of_a_sphere(rim_deg: float) -> None:
+def test_diffuse_light_in_a_spherical_cap_matches_theory(rim_deg: float) -> None:
     """E = P / (A (1 - rho f)), with f the cap's share of the sphere A."""
     wall = sphere(rim_deg)
     share = 0.6
@@ -107,7 +107,7 @@ def test_light_is_conserved_in_an_ellipsoid() -> None:
     assert absorbed == pytest.approx(emitted, rel=5e-3)
 
 
-def test_floor_under_one_led() -> None:
+def test_diffuse_light_of_a_floor_under_one_led_matches_a_hand_calculation() -> None:
     """An LED at the height h above a black room's floor: E = I cos^4 / h^2, and a flat panel sees the floor's light.
 
     A Lambertian floor of the exitance rho E(x) lights a point above the LED's foot with rho E(x) cos cos / (pi d^2) dA.
@@ -238,7 +238,7 @@ def brute_force(name: str, led_m: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("name", list(QUADRICS))
-def test_images_are_where_brute_force_finds_them(name: str) -> None:
+def test_reflected_images_match_brute_force(name: str) -> None:
     """All of them, and no other, within 1e-7 rad."""
     wall, led_m = QUADRICS[name]
     source = leds(led_m[None], np.array([[0.0, 0.0, 1.0]]))
@@ -254,7 +254,7 @@ def test_images_are_where_brute_force_finds_them(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(QUADRICS))
-def test_images_are_as_bright_as_rays_from_the_led_say(name: str) -> None:
+def test_reflected_images_are_as_bright_as_traced_rays(name: str) -> None:
     """A narrow cone of random rays from the LED: the density where they cross the plane of the camera's pupil."""
     wall, led_m = QUADRICS[name]
     normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
@@ -311,7 +311,7 @@ def test_leds_on_a_flat_wall_have_no_image() -> None:
     assert len(images) == 0
 
 
-def test_fresnel() -> None:
+def test_fresnel_reflectances_match_the_textbook() -> None:
     """((n - 1) / (n + 1))^2 at normal incidence, all at grazing, half the s component's at Brewster's angle."""
     n = 1.49
     config = ReflectionConfig(refractive_index=n)
@@ -325,7 +325,7 @@ def test_fresnel() -> None:
     )
 
 
-def test_names() -> None:
+def test_reflections_and_ghosts_have_names() -> None:
     assert light_name(17) == "17"
     assert light_name(2 * MIRRORED + 17) == "reflection of 17"
     assert light_name(3_000_000_000_000 + MIRRORED + 5) == "ghost of reflection of 5"

@@ -82,7 +82,7 @@ def test_a_class_2_sphere_has_three_quarters_as_many_triangles(frequency: int) -
         ("II", 2, {0.64085: 60, 0.71364: 30}),
     ],
 )
-def test_its_chords_are_those_of_the_tables(
+def test_geodesic_chords_match_the_published_tables(
     class_: str, frequency: int, chords: dict[float, int]
 ) -> None:
     """Chord factors of geodesic domes as builders use them (Kenner 1976, tables), and how often each occurs."""
@@ -122,7 +122,7 @@ def test_geodesic_leds_are_the_vertices_seen_from_the_bearing(on: dict[str, Any]
     assert np.all(np.diff(tilt) > -1e-9)
 
 
-def test_it_turns_about_the_zenith() -> None:
+def test_a_geodesic_layout_rotates_about_the_zenith() -> None:
     plain, turned = (
         lit({"kind": "geodesic", "frequency": 6, "rotation_deg": deg}).place[:, :3]
         for deg in (0, 25)
@@ -211,7 +211,7 @@ def test_the_turns_of_a_spiral_are_a_spacing_apart() -> None:
     np.testing.assert_allclose(1.2 * tilt[1:], 0.06 * turned / (2 * np.pi), rtol=0, atol=2e-6)
 
 
-def test_circles_on_a_sphere_are_a_spacing_apart_and_as_long_as_they_are() -> None:
+def test_circles_on_a_sphere_have_their_spacing_and_circumference() -> None:
     place_m = lit({"kind": "string", "pitch": "10 mm", "spacing": "6 cm"}).place[:, :3]
     tilt, _ = angles(place_m)
     rings, counts = np.unique(np.round(tilt, 8), return_counts=True)
@@ -249,7 +249,7 @@ def test_strips_are_between_half_a_spacing_and_a_spacing_apart() -> None:
         assert 0.038 < apart_m < 0.08 * 1.01
 
 
-def test_tapes_are_off_by_their_pitch_and_their_glue() -> None:
+def test_tape_leds_err_by_pitch_and_glue() -> None:
     """By 1 % of the pitch of each tape, and by 2 mm sideways, with a correlation of 1 / e after 0.3 m."""
     layout = {"kind": "string", "winding": "meridian", "pitch": "20 mm", "spacing": "2 cm"}
     ideal = lit(layout).place[:, :3]
@@ -374,7 +374,7 @@ def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
         ),
     ],
 )
-def test_a_layout_that_cannot_be_is_one_line(layout: str, complaint: str) -> None:
+def test_an_impossible_layout_is_refused_in_one_line(layout: str, complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         loader.load("afit_simsat", {"light.layout": layout})
     assert complaint in str(caught.value)

@@ -52,7 +52,7 @@ def part_m(segments: int, on: dict[str, Any] = CAP, **room: Any) -> np.ndarray:
 # --- the sizes
 
 
-def test_a_cap_is_as_high_and_wide_as_a_spherical_cap() -> None:
+def test_a_cap_has_the_height_and_width_of_a_spherical_cap() -> None:
     np.testing.assert_allclose(
         part_m(1), [RADIUS_M - RIM_M, 2 * HALF_WIDTH_M, 2 * HALF_WIDTH_M], rtol=1e-9
     )
@@ -79,7 +79,7 @@ def test_a_thick_shell_is_larger_by_its_thickness() -> None:
     np.testing.assert_allclose(part_m(1, thickness="5 cm"), expected, rtol=1e-9)
 
 
-def test_half_a_cap_is_a_box_of_half_its_width() -> None:
+def test_a_half_cap_is_half_as_wide() -> None:
     """Cut through the apex: turned or not, it is R - h by r by 2 r, or better."""
     box = part_m(2)
     upright = np.sort([RADIUS_M - RIM_M, HALF_WIDTH_M, 2 * HALF_WIDTH_M])
@@ -101,7 +101,7 @@ def test_a_gore_is_as_wide_as_its_chord_at_the_rim(segments: int) -> None:
     assert np.linalg.norm(box) >= np.hypot(meridian_m, chord_m / 2)
 
 
-def test_a_panel_is_as_thin_and_as_wide_and_high_as_it_says() -> None:
+def test_a_panel_has_its_declared_thickness_width_and_height() -> None:
     panel = {"kind": "flat", "apex": "1.2 m", "width": "2.4 m", "height": "1.3 m"}
     np.testing.assert_allclose(part_m(1, panel, thickness="6 cm"), [0.06, 1.3, 2.4], rtol=1e-9)
 
@@ -214,7 +214,7 @@ def test_a_dome_that_fits_is_built(room: dict[str, Any], on: dict[str, Any]) -> 
         ),
     ],
 )
-def test_a_dome_that_does_not_fit_is_one_line_with_both_numbers(
+def test_a_dome_that_does_not_fit_is_refused_with_both_numbers(
     room: dict[str, Any], on: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -223,7 +223,7 @@ def test_a_dome_that_does_not_fit_is_one_line_with_both_numbers(
     assert "\n" not in str(caught.value)
 
 
-def test_the_number_of_segments_that_it_names_is_enough() -> None:
+def test_the_number_of_segments_named_by_the_error_is_enough() -> None:
     door = {"door": ["0.7 m", "1.2 m"]}
     with pytest.raises(InputError, match=r"or segments: (\d+)$") as caught:
         check(door)
@@ -243,7 +243,7 @@ def test_the_number_of_segments_that_it_names_is_enough() -> None:
         ("{ceiling: 3 m}", "light.room.ceiling: unknown key"),
     ],
 )
-def test_a_room_that_makes_no_sense_is_one_line(room: str, complaint: str) -> None:
+def test_an_invalid_room_is_refused_in_one_line(room: str, complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         loader.load("afit_simsat", {"light.room": room})
     assert complaint in str(caught.value)

@@ -89,7 +89,7 @@ def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
         assert np.array([*velocity]) == pytest.approx(state[3:], abs=1e-8)
 
 
-def test_gcrs_of_teme_is_the_published_one() -> None:
+def test_the_rotation_from_teme_to_gcrs_matches_the_published_one() -> None:
     """Vallado et al. 2006, appendix C: 6 April 2004, 07:51:28.386 UTC; their EOP and polar motion differ by a meter."""
     date = datetime.datetime(2004, 4, 6, 7, 51, 28, 386009)
     place_km = orbit_elements.gcrs_from_teme(date) @ [5094.18016210, 6127.64465950, 6380.34453270]
@@ -97,7 +97,7 @@ def test_gcrs_of_teme_is_the_published_one() -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "json", "xml"])
-def test_omm_and_tle_are_the_same_satellite(kind: str, tmp_path: Path) -> None:
+def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(OMM))
     writer.writeheader()
@@ -157,7 +157,7 @@ def test_magnitudes_follow_range_and_light() -> None:
     assert satellites.magnitude(6.0, 1e6, np.pi / 2, 0.01) == pytest.approx(11.0)
 
 
-def test_the_shadow_is_a_cone_behind_the_earth() -> None:
+def test_the_earth_s_shadow_is_a_cone() -> None:
     """On a circle about the Earth's axis the umbra ends where the limb hides all of the Sun."""
     sun_m = np.array([1.496e11, 0.0, 0.0])
     radius_m = 7e6
@@ -181,7 +181,7 @@ def test_the_shadow_is_a_cone_behind_the_earth() -> None:
     assert lit(edge - 0.5 * sun_rad) == pytest.approx(half, abs=0.01)
 
 
-def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
+def test_satellites_behind_the_earth_s_ellipsoid_are_hidden() -> None:
     high = np.array([0.0, 0.0, 7e6])
     pole_m = EARTH_RADIUS_M * (1 - EARTH_FLATTENING)
     limb_rad = np.arcsin(pole_m / 7e6)
@@ -196,7 +196,7 @@ def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
     assert camera_orbit.hidden_by_earth(ground, horizon).tolist() == [False, True]
 
 
-def test_a_path_is_that_of_places_at_its_times(low_orbits: orbit_elements.MeanElements) -> None:
+def test_a_path_matches_positions_at_its_times(low_orbits: orbit_elements.MeanElements) -> None:
     """Place and motion at mid-exposure give the apparent place at another time of a long exposure."""
 
     def observer_at(after_s: float) -> GcrsState:

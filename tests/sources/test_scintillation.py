@@ -28,7 +28,7 @@ def profile() -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.mark.parametrize("air_mass", [1.0, 2.5])
-def test_a_point_s_instant_is_rytov_s(air_mass: float) -> None:
+def test_instantaneous_point_scintillation_follows_rytov(air_mass: float) -> None:
     """19.12 lambda^(-7/6) X^(11/6) ∫ Cn^2 h^(5/6) dh: a pupil of 1 mm, 10 us."""
     h, strength, _ = profile()
     rytov = 19.12 * RED_M ** (-7 / 6) * air_mass ** (11 / 6) * np.sum(strength * h ** (5 / 6))
@@ -37,7 +37,7 @@ def test_a_point_s_instant_is_rytov_s(air_mass: float) -> None:
 
 
 @pytest.mark.parametrize("height_m", [0.0, 2400.0])
-def test_wide_apertures_and_long_exposures_are_young_s(height_m: float) -> None:
+def test_wide_apertures_and_long_exposures_follow_young(height_m: float) -> None:
     """Osborn et al. (2015), equation 7, approached from below: in sigma 11 to 20 % less at 10 cm, 1 % at 2 m."""
     for aperture_m, least in ((0.1, 0.88), (0.3, 0.97), (2.0, 0.99)):
         for air_mass in (1.0, 2.0):
@@ -60,7 +60,7 @@ def test_wide_apertures_and_long_exposures_are_young_s(height_m: float) -> None:
     ("aperture_m", "exposure_s", "air_mass"),
     [(0.018, 0.05, 1.0), (0.05, 0.005, 2.0), (0.3, 0.02, 1.0)],
 )
-def test_between_them_it_is_the_integral_over_all_frequencies(
+def test_intermediate_apertures_match_the_integral_over_all_frequencies(
     aperture_m: float, exposure_s: float, air_mass: float
 ) -> None:
     """With the wind along x: sinc^2(f_x V t) itself, over layers 250 m thick, in polar coordinates."""
@@ -80,7 +80,7 @@ def test_between_them_it_is_the_integral_over_all_frequencies(
     assert one(air_mass, aperture_m, exposure_s) == pytest.approx(total, rel=0.02)
 
 
-def test_waves_through_a_screen_scintillate_by_the_spectrum() -> None:
+def test_simulated_waves_through_a_screen_match_the_spectrum() -> None:
     """Plane waves of 650 nm, 9 km after Kolmogorov screens of a weak layer, by Fresnel's propagator: a point, and 6 cm.
 
     Phase spectrum of a layer: 0.0229 r0^(-5/3) f^(-11/3), r0^(-5/3) = 0.423 k^2 Cn^2 dz.
@@ -123,7 +123,7 @@ def test_stars_twinkle_less_through_wider_lenses_and_longer_exposures() -> None:
     assert one(60.0, 0.02, 0.1) == one(40.0, 0.02, 0.1)
 
 
-def test_a_millimeter_s_lens_twinkles_less_than_young_s_law_says() -> None:
+def test_a_millimeter_s_aperture_scintillates_less_than_young_s_law() -> None:
     """The law had 0.32 for 18 mm and 50 ms at the zenith."""
     young = np.sqrt(10e-6 * 1.56**2 * 0.018 ** (-4 / 3) / 0.05)
     assert young == pytest.approx(0.32, abs=0.005)

@@ -46,7 +46,7 @@ SKYFIELD = {
 
 
 @pytest.mark.parametrize("name", SKYFIELD)
-def test_places_are_those_of_skyfield(name: str) -> None:
+def test_solar_system_positions_match_skyfield(name: str) -> None:
     date, (ra_deg, dec_deg) = SKYFIELD[name]
     seen = ephemeris.observe_from(dynamical(date), GEOCENTER)
     ra, dec = of_date(ephemeris.place(name, seen).direction, seen.tt_jd)
@@ -54,7 +54,7 @@ def test_places_are_those_of_skyfield(name: str) -> None:
     assert abs(dec - dec_deg) * 3600 < 0.01
 
 
-def test_the_moon_of_skyfield_is_as_far_and_as_lit() -> None:
+def test_the_moon_s_distance_and_phase_match_skyfield() -> None:
     """Skyfield 1.55 with DE421: 368,405.543 km, phase angle 69.0819 degrees, bright limb at 285.044 degrees."""
     seen = ephemeris.observe_from(dynamical("1992-04-12"), GEOCENTER)
     moon = ephemeris.place("moon", seen)
@@ -73,7 +73,7 @@ def test_the_moon_of_skyfield_is_as_far_and_as_lit() -> None:
     )
 
 
-def test_the_earth_moves_as_fast_as_erfa_says() -> None:
+def test_the_earth_s_velocity_matches_erfa() -> None:
     """Positions of the ephemeris, differenced over a day, against ERFA's own theory; and the Sun against its place."""
     for jd in np.linspace(2441400.5, 2487400.5, 15):
         one, other = (
@@ -88,7 +88,7 @@ def test_the_earth_moves_as_fast_as_erfa_says() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(ephemeris.load_ephemeris().series)))
-def test_the_series_join_where_an_interval_ends(name: str) -> None:
+def test_the_ephemeris_is_continuous_between_intervals(name: str) -> None:
     shipped = ephemeris.load_ephemeris()
     days = shipped.series[name].days
     joint_jd = shipped.first_jd + days * np.arange(1, 8)
@@ -98,7 +98,7 @@ def test_the_series_join_where_an_interval_ends(name: str) -> None:
         assert np.linalg.norm(before + after - 2 * at) < tolerance_km
 
 
-def test_a_site_is_where_astropy_has_it() -> None:
+def test_a_site_s_position_matches_astropy() -> None:
     """Position within 1 m but for polar motion (9 m), velocity within 1 mm/s."""
     site = SiteConfig(latitude_deg=-22.9, longitude_deg=-43.2, height="2400 m")
     where = EarthLocation.from_geodetic(-43.2 * u.deg, -22.9 * u.deg, 2400 * u.m)
@@ -168,7 +168,7 @@ def lit(
 
 
 @pytest.mark.parametrize(("name", "sun_au", "observer_au", "phase_deg", "v_mag"), PUBLISHED)
-def test_magnitudes_are_the_authors_own(
+def test_planetary_magnitudes_match_the_authors_examples(
     name: str, sun_au: float, observer_au: float, phase_deg: float, v_mag: float
 ) -> None:
     at = lit(name, sun_au, observer_au, phase_deg)
@@ -176,7 +176,7 @@ def test_magnitudes_are_the_authors_own(
     assert body_discs.magnitude(name, at, J2000_JD) == pytest.approx(v_mag, abs=6e-4)
 
 
-def test_uranus_and_neptune_are_the_authors_own() -> None:
+def test_magnitudes_of_uranus_and_neptune_match_the_authors_examples() -> None:
     """The same file; its latitudes of Uranus are planetographic."""
     year = 365.25
     for latitude_deg, sun_au, observer_au, v_mag in (
@@ -216,7 +216,7 @@ def test_moon_and_sun_at_their_mean_distances() -> None:
     assert body_discs.magnitude("sun", sun, J2000_JD) == pytest.approx(-26.74)
 
 
-def test_earthshine_is_as_dim_as_is_measured() -> None:
+def test_earthshine_has_its_measured_brightness() -> None:
     """The earthlit disc of a thin crescent is some 10 mag fainter than the full Moon; that of a full one is dark."""
     thin = lit("moon", 1.0, body_discs.MOON_KM / ephemeris.AU_KM, 150.0)
     sunlit = body_discs.magnitude("moon", thin, J2000_JD)

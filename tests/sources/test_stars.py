@@ -44,7 +44,7 @@ def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(stars: Catalog, date: datetime.datetime) -> None:
+def test_apparent_places_match_skycoord(stars: Catalog, date: datetime.datetime) -> None:
     # Stars whose parallax is known: SkyCoord needs a distance for space motion.
     near = stars.take(stars.parallax_rad > 1 * MAS_RAD)
     with (
@@ -71,7 +71,7 @@ def test_apparent_places_are_skycoord_s(stars: Catalog, date: datetime.datetime)
     assert off.max() < 1
 
 
-def test_aberration_is_a_year_s_ellipse_of_20_5_arcsec() -> None:
+def test_annual_aberration_is_an_ellipse_of_20_5_arcsec() -> None:
     # The constant of aberration is 20.4955"; perihelion and the Sun's own motion add or take 0.35" and 0.01".
     pole = star(ra_rad=np.radians(270.0), dec_rad=np.radians(66.56))  # the pole of the ecliptic
     days = [datetime.datetime(2021, 1, 1) + datetime.timedelta(days=5 * n) for n in range(73)]
@@ -86,7 +86,7 @@ def test_aberration_is_a_year_s_ellipse_of_20_5_arcsec() -> None:
     assert off.min() == pytest.approx(20.4955 - 0.34, abs=0.03)
 
 
-def test_a_star_ahead_of_the_observer_is_drawn_forward() -> None:
+def test_aberration_shifts_a_star_toward_the_direction_of_motion() -> None:
     # By hand: at right angles to the motion the star moves by v/c toward it; 7.6 km/s is 5.23".
     ahead = np.array([0.0, 0.0, 7600.0])
     still = star_sources.apparent(star(), DATES[1])[0]
@@ -126,7 +126,7 @@ def test_proper_motion_is_along_the_parallel_and_the_meridian() -> None:
     )
 
 
-def test_the_sun_bends_light_outward() -> None:
+def test_the_sun_deflects_stars_outward() -> None:
     # 1.75" at the limb falls as 1/tan(half the elongation): 4.07 mas at 90 degrees. In March the Sun is at x.
     date = datetime.datetime(2021, 3, 20, 9, 37)  # the equinox, Astronomical Almanac
     pole = star(dec_rad=np.pi / 2)
@@ -137,13 +137,13 @@ def test_the_sun_bends_light_outward() -> None:
     assert (unbent - sun_side)[0] / MAS_RAD == pytest.approx(4.07, abs=0.1)
 
 
-def test_a_camera_at_the_vernal_equinox_by_hand() -> None:
+def test_pixels_at_the_vernal_equinox_match_a_hand_calculation() -> None:
     # Looking along X with north (Z) up, east (Y) is left: x = -Y, y = -Z, z = X.
     matrix = star_sources.cam_from_icrs(0.0, 0.0, 0.0).as_matrix()
     np.testing.assert_allclose(matrix, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], rtol=0, atol=1e-15)
 
 
-def test_a_rolled_camera_by_hand() -> None:
+def test_pixels_of_a_rolled_camera_match_a_hand_calculation() -> None:
     # Up at position angle 90 is east: y = -Y; then north is to the right: x = +Z.
     matrix = star_sources.cam_from_icrs(0.0, 0.0, 90.0).as_matrix()
     np.testing.assert_allclose(matrix, [[0, 0, 1], [0, -1, 0], [1, 0, 0]], rtol=0, atol=1e-15)
@@ -214,7 +214,7 @@ def test_sources_are_as_bright_as_their_magnitude_and_color(stars: Catalog) -> N
     assert relative[27989] > 1.5  # Betelgeuse
 
 
-def test_no_star_so_bright_gives_no_source(stars: Catalog) -> None:
+def test_a_limit_brighter_than_every_star_gives_no_source(stars: Catalog) -> None:
     assert (
         len(
             star_sources.sources(

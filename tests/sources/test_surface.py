@@ -133,7 +133,7 @@ def test_points_lie_on_their_rays_and_satisfy_the_equation(name: str, origin_in:
 
 
 @pytest.mark.parametrize("name", [*KINDS, "cloud"])
-def test_normals_are_the_numerical_gradient_s(name: str, cloud: dict) -> None:
+def test_normals_match_the_numerical_gradient(name: str, cloud: dict) -> None:
     """Perpendicular to chords between neighbors found by rays alone; of length 1; towards the bearing."""
     shape = made(cloud if name == "cloud" else KINDS[name], **MOVED)
     rays = rays_for(name, 80, 3)
@@ -200,7 +200,7 @@ def test_a_wall_of_one_thickness_is_a_sphere() -> None:
     np.testing.assert_allclose(met, ball.meet(origin, rays), rtol=0, atol=1e-14)
 
 
-def test_newton_settles_in_few_steps_from_anywhere_inside(
+def test_newton_converges_in_few_steps_from_anywhere_inside(
     cloud: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Eight are allowed here of the 200 by which bisection alone would end."""
@@ -215,7 +215,7 @@ def test_newton_settles_in_few_steps_from_anywhere_inside(
             assert len(far) > 20
 
 
-def test_a_ray_that_does_not_settle_is_an_error_not_a_point(
+def test_a_ray_that_does_not_converge_is_an_error(
     cloud: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shape = made(cloud)
@@ -244,7 +244,7 @@ def test_a_rim_s_half_angle_is_seen_from_the_bearing(name: str, cloud: dict) -> 
 
 
 @pytest.mark.parametrize("name", ["sphere", "oblate", "vault", "wall", "cloud"])
-def test_a_rim_s_height_goes_with_the_dome(name: str, cloud: dict) -> None:
+def test_the_rim_s_height_moves_with_the_dome(name: str, cloud: dict) -> None:
     """Upright it is a height above the bearing; displaced, nothing is left beneath the displaced plane."""
     part = cloud if name == "cloud" else KINDS[name]
     rim = 40 * INCH_M
@@ -299,7 +299,7 @@ def test_the_design_s_sphere_is_not_its_outside() -> None:
     assert np.linalg.norm(top - shape.center_m) / INCH_M == pytest.approx(47.9314, abs=1e-9)
 
 
-def test_the_wall_thickens_evenly_with_the_angle_and_no_more_beyond_its_base() -> None:
+def test_the_wall_thickens_linearly_with_the_angle_down_to_its_base() -> None:
     shape = made(DESIGN)
     angle = np.radians([0, 10, 20, 30, 40, 60])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
@@ -347,7 +347,7 @@ def test_the_measured_dome_s_best_sphere_is_the_reference_s() -> None:
 # What the estimator believes
 
 
-def test_upright_quadrics_are_believed_exactly() -> None:
+def test_the_tracker_models_upright_quadrics_exactly() -> None:
     center, axes = made(MEASURED, offset=["1 in", "2 in", "3 in"]).as_ellipsoid()
     np.testing.assert_allclose(center / INCH_M, [1, 2, 22.4], rtol=0, atol=1e-12)
     np.testing.assert_allclose(axes / INCH_M, [38.88, 38.88, 28.60], rtol=0, atol=1e-12)
@@ -356,7 +356,7 @@ def test_upright_quadrics_are_believed_exactly() -> None:
 
 
 @pytest.mark.parametrize("name", ["flat", "vault", "across", "drum"])
-def test_what_is_straight_is_believed_to_be_an_endless_ellipsoid(name: str) -> None:
+def test_straight_walls_are_modeled_by_infinite_semi_axes(name: str) -> None:
     """Where rays meet it within a couple of meters, to a few micrometers: the sagitta of 1000 km and rounding."""
     more = MOVED if name == "flat" else {"offset": MOVED["offset"]}
     shape = made(KINDS[name], **more)
@@ -367,7 +367,7 @@ def test_what_is_straight_is_believed_to_be_an_endless_ellipsoid(name: str) -> N
     assert np.abs(apart_m).max() < 3e-6
 
 
-def test_a_wall_s_and_a_tilted_ellipsoid_s_nearest_ellipsoid_say_how_near_they_are() -> None:
+def test_the_nearest_ellipsoid_of_other_surfaces_states_its_residual() -> None:
     """The design contour is the thesis's prolate spheroid to the micrometers that its wall's straight law leaves.
 
     An ellipsoid with axes along the lab's has no cross term, which is what a tilt makes, of first order.
@@ -390,7 +390,7 @@ def test_the_nearest_ellipsoid_of_an_ellipsoid_is_itself() -> None:
     np.testing.assert_allclose(found.semi_axes_m / INCH_M, [38, 45, 31], rtol=0, atol=1e-5)
 
 
-def test_the_survey_s_error_is_kept() -> None:
+def test_the_nearest_ellipsoid_keeps_the_survey_error() -> None:
     assert made(MEASURED, error="0.3 mm").survey_sigma_m == pytest.approx(3e-4, rel=1e-12)
     assert made(DESIGN).survey_sigma_m == 0
 
@@ -398,7 +398,7 @@ def test_the_survey_s_error_is_kept() -> None:
 # Surveyed points
 
 
-def test_zernike_polynomials_are_the_textbook_s_and_their_gradients_their_own() -> None:
+def test_zernike_polynomials_and_gradients_match_the_textbook() -> None:
     """R_n^m as a Jacobi polynomial (Born & Wolf, app. VII); orthogonal on the disk; slopes by differences."""
     radius, azimuth = np.random.default_rng(1).uniform([0, 0], [1, 2 * np.pi], (50, 2)).T
     disk = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth)])
@@ -423,7 +423,7 @@ def test_zernike_polynomials_are_the_textbook_s_and_their_gradients_their_own() 
         np.testing.assert_allclose(slope[..., axis], chord, rtol=0, atol=1e-6)
 
 
-def test_a_cloud_without_noise_is_the_dome_to_two_micrometers(tmp_path: Path) -> None:
+def test_a_noise_free_point_cloud_gives_the_dome_to_two_micrometers(tmp_path: Path) -> None:
     """What degree 6 leaves of the measured ellipsoid is 0.5 um rms; the normals are within its slope."""
     shape = made(survey_of(tmp_path / "exact.csv", 3000, 0.0, seed=3))
     assert isinstance(shape, Radial)
@@ -437,7 +437,7 @@ def test_a_cloud_without_noise_is_the_dome_to_two_micrometers(tmp_path: Path) ->
     assert np.abs(shape.inward(met) - true.inward(expected)).max() < 5e-5
 
 
-def test_a_cloud_with_noise_comes_back_within_theory(cloud: dict) -> None:
+def test_a_noisy_point_cloud_gives_the_dome_within_theoretical_error(cloud: dict) -> None:
     """28 terms of 3,000: residuals sigma sqrt(1 - 28/3000), the surface sigma sqrt(28/3000) = 9.7 um rms.
 
     Four of chi's own sigmas for each: 1 / sqrt(2 * 2972) of the first, 1 / sqrt(2 * 28) of the second.
@@ -461,8 +461,8 @@ def test_a_cloud_with_noise_comes_back_within_theory(cloud: dict) -> None:
     assert shape.fit.max_residual_m == np.abs(shape.fit.residual_m).max()
 
 
-def test_a_cloud_s_best_ellipsoid_is_the_dome_s_within_its_noise(cloud: dict) -> None:
-    """The axes themselves are ill told by a cap; where the ellipsoid is, is not."""
+def test_a_cloud_s_nearest_ellipsoid_is_the_dome_s_within_noise(cloud: dict) -> None:
+    """A cap determines the axes poorly but the position of the ellipsoid's surface well."""
     believed = made(cloud, rim_deg=38).nearest_ellipsoid()
     assert believed.rms_m < 3e-5
     met = (
@@ -473,7 +473,7 @@ def test_a_cloud_s_best_ellipsoid_is_the_dome_s_within_its_noise(cloud: dict) ->
     assert np.sqrt(np.mean(apart_m**2)) < 1e-4 * np.sqrt(28 / 3000) * 1.5
 
 
-def test_a_cloud_ends_where_its_points_do(cloud: dict) -> None:
+def test_the_surface_of_a_cloud_ends_with_its_points(cloud: dict) -> None:
     angle = np.radians([39.0, 40.5, 42.0])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
     assert list(np.isnan(made(cloud).meet(np.zeros(3), rays)[:, 0])) == [False, False, True]
@@ -501,7 +501,7 @@ DRAWN |= {
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_what_is_drawn_is_the_surface(name: str) -> None:
+def test_the_drawn_mesh_is_on_the_surface(name: str) -> None:
     """Every corner of the stage's sheet is one of the surface, within its rim."""
     shape = made(DRAWN[name])
     sheet = mjcf_export.shell_m(shape, 0.3)
@@ -511,7 +511,7 @@ def test_what_is_drawn_is_the_surface(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["rimmed", "narrow", "panel"])
-def test_what_is_drawn_goes_out_to_the_rim(name: str) -> None:
+def test_the_drawn_mesh_extends_to_the_rim(name: str) -> None:
     """Half a degree beyond the last ring there is nothing."""
     shape = made(DRAWN[name])
     last = mjcf_export.shell_m(shape, 0.6)[-1]
@@ -519,7 +519,7 @@ def test_what_is_drawn_goes_out_to_the_rim(name: str) -> None:
     assert np.isnan(shape.meet(np.zeros(3), beyond)[:, 0]).all()
 
 
-# Slips
+# Faulty keys
 
 
 def complaint(more: str) -> str:
@@ -530,7 +530,7 @@ def complaint(more: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("surface", "says"),
     [
         ("{kind: torus}", "light.surface.kind: 'torus' is not allowed; allowed: 'sphere', 'ellipsoid', 'flat'"),
         ("{kind: [flat]}", r"light.surface.kind: \['flat'\] is not allowed"),
@@ -570,15 +570,17 @@ def complaint(more: str) -> str:
         ("{kind: surveyed, file: pyproject.toml, unit: mm}", "light.surface.file: 'pyproject.toml' is not a file"),
     ],
 )  # fmt: skip
-def test_a_slip_is_one_line_with_its_key_and_what_is_allowed(told: str, says: str) -> None:
-    assert re.search(says, complaint(told))
+def test_a_wrong_surface_is_refused_in_one_line_with_key_and_allowed_values(
+    surface: str, says: str
+) -> None:
+    assert re.search(says, complaint(surface))
 
 
 def surveyed_complaint(path: Path, more: str = "") -> str:
     return complaint(f"{{kind: surveyed, file: '{path}', unit: mm{more}}}")
 
 
-def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_point_cloud_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
     for text in (
         "",
@@ -594,7 +596,7 @@ def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path) -> None:
         )
 
 
-def test_points_that_tell_no_smooth_dome_are_refused(tmp_path: Path) -> None:
+def test_points_that_determine_no_smooth_dome_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
     rng = np.random.default_rng(1)
     good = dome_points_m(500, 1)
@@ -637,7 +639,7 @@ def test_every_kind_of_part_has_its_surface() -> None:
 @pytest.mark.parametrize(
     ("rim_deg", "mean_z"), [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)]
 )
-def test_samples_are_even_over_the_solid_angle_down_to_the_rim_or_the_horizon(
+def test_samples_are_uniform_in_solid_angle_down_to_rim_or_horizon(
     rim_deg: float | None, mean_z: float | None
 ) -> None:
     """On a sphere about the bearing; z is then uniform, from the lowest direction's to 1 (Archimedes)."""

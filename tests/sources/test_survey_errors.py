@@ -65,7 +65,7 @@ def inside_of(**more: Any) -> Surface:
 # --- the laws of the draws ----------------------------------------------------------------------------------
 
 
-def test_every_led_is_believed_off_by_its_own_error_about_each_axis() -> None:
+def test_every_led_of_the_map_has_its_own_error_about_each_axis() -> None:
     eyes, lab = believing(tracker__survey="{led_sigma: 0.2 mm, seed: 3}")
     error = (eyes.leds.position_m - lab.camera.sources.place[:, :3]) / 0.2e-3
     assert len(error) > 1000
@@ -77,7 +77,7 @@ def test_every_led_is_believed_off_by_its_own_error_about_each_axis() -> None:
     np.testing.assert_array_equal(eyes.leds.id, lab.camera.sources.id)
 
 
-def test_over_the_seeds_the_camera_s_place_errs_by_lever_sigma() -> None:
+def test_over_the_seeds_the_camera_s_position_errs_by_lever_sigma() -> None:
     true_m = np.array([0.0, 0.01, 0.381])
     error = [survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
     is_chi_square(np.array(error) / 1e-4)
@@ -90,7 +90,7 @@ def test_over_the_seeds_the_surface_is_raised_by_its_declared_error() -> None:
     )
 
 
-def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
+def test_a_raised_sphere_is_a_larger_sphere_with_its_leds_on_it() -> None:
     """Every LED along its normal by one and the same draw, and the believed surface with them."""
     inside = inside_of(error="2 mm", offset=["1 cm", "0 m", "0 m"])
     directions = np.random.default_rng(1).normal(size=(50, 3)) * [0.3, 0.3, 0.0] + [0, 0, 1]
@@ -111,7 +111,7 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
     )
 
 
-def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> None:
+def test_leds_are_on_a_raised_ellipsoid_within_kantorovich_s_bound() -> None:
     """The LEDs' own believed height is all of the draw, the ellipsoid's at least 2 sqrt(a b) / (a + b) of it."""
     eyes, lab = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
     assert lab.scene.light.kind == "dome"
@@ -150,10 +150,10 @@ ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
 
 
 @pytest.mark.slow
-def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_does() -> None:
+def test_survey_errors_depend_on_their_own_seed_and_not_on_the_run_s() -> None:
     def places(seed: int, own: int) -> tuple[bytes, ...]:
-        told = ALL.format(lever="0.1 mm", seed=own)
-        eyes, _ = believing(seed=str(seed), tracker__survey=told, light__surface__error="0.1 mm")
+        survey = ALL.format(lever="0.1 mm", seed=own)
+        eyes, _ = believing(seed=str(seed), tracker__survey=survey, light__surface__error="0.1 mm")
         return tuple(
             one.tobytes()
             for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m)
@@ -164,7 +164,7 @@ def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_do
     assert not set(places(1, 6)) & set(first)
 
 
-def test_one_error_more_leaves_the_others_as_they_were() -> None:
+def test_a_further_survey_error_does_not_change_the_others() -> None:
     alone, _ = believing(tracker__survey=ALL.format(lever="0 m", seed=5))
     both, lab = believing(tracker__survey=ALL.format(lever="0.1 mm", seed=5))
     assert alone.leds.position_m.tobytes() == both.leds.position_m.tobytes()
@@ -172,11 +172,11 @@ def test_one_error_more_leaves_the_others_as_they_were() -> None:
     assert both.lever.camera_body_m.tobytes() != lab.camera.mount.camera_body_m.tobytes()
 
 
-def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
+def test_the_survey_does_not_change_the_hardware() -> None:
     """Frames are the same whatever is believed."""
     frames = []
-    for told in ("{}", ALL.format(lever="5 mm", seed=1)):
-        lab = build_lab(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
+    for survey in ("{}", ALL.format(lever="5 mm", seed=1)):
+        lab = build_lab(loaded(tracker__survey=survey, exposure=BARE_CAMERA["exposure"]))
         frames.append(render_at_rest(lab.camera, lab.start)[0].image_dn.tobytes())
     assert frames[0] == frames[1]
 
@@ -185,15 +185,15 @@ def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_distance(
+def test_a_pupil_position_error_rotates_the_attitude_by_shift_over_led_distance(
     seed: int,
 ) -> None:
     """The sight of an LED at p from the bearing stays as it was if the vehicle turns by p x shift / |p|^2.
 
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
     """
-    told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
-    eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
+    survey = f"{{lever_sigma: 2 mm, seed: {seed}}}"
+    eyes, lab = believing(tracker__survey=survey, motion__start="{roll_deg: 7}", **BARE_CAMERA)
     frame, truth = render_at_rest(lab.camera, lab.start)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
@@ -238,7 +238,7 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
         ),
     ],
 )
-def test_what_cannot_be_surveyed_is_told_in_one_line(
+def test_an_impossible_tracker_survey_is_refused_in_one_line(
     name: str, changes: dict[str, str], complaint: str
 ) -> None:
     with pytest.raises(InputError, match=complaint) as refused:

@@ -64,14 +64,14 @@ def draws(config: TotalStationConfig, own: bool, setup: bool) -> np.ndarray:
 # --- the laws
 
 
-def test_a_survey_without_errors_is_the_truth() -> None:
+def test_a_total_station_without_errors_gives_the_truth() -> None:
     """Polar coordinates and back, to the rounding of a meter."""
     found = survey_errors.surveyed_m(station(), PLACES_M, np.zeros(PLACES_M.shape), np.zeros(8))
     np.testing.assert_allclose(found, PLACES_M, rtol=0, atol=1e-15)
 
 
 @pytest.mark.slow
-def test_the_own_errors_have_the_covariance_that_is_claimed() -> None:
+def test_independent_errors_have_the_claimed_covariance() -> None:
     """Monte Carlo of angles and distances through the polar coordinates, each LED, each element."""
     config = station()
     error_m = draws(config, own=True, setup=False)
@@ -87,7 +87,7 @@ def test_the_own_errors_have_the_covariance_that_is_claimed() -> None:
 
 
 @pytest.mark.slow
-def test_the_common_errors_have_the_covariance_that_is_claimed() -> None:
+def test_common_errors_of_a_survey_have_the_claimed_covariance() -> None:
     """Between any two LEDs too: sum over the errors of the outer products of their displacements."""
     config = station()
     error_m = draws(config, own=False, setup=True).reshape(DRAWS, -1)
@@ -173,7 +173,7 @@ def survey_of(**more: Any) -> SurveyErrorsConfig:
 
 
 @pytest.mark.slow
-def test_the_tracker_believes_what_the_station_measured() -> None:
+def test_the_tracker_uses_the_station_s_measurements() -> None:
     """Places, covariance and common errors, over surveys: all errors together are chi-square as claimed."""
     inside = surface.build_surface(
         light.SurfaceConfig.model_validate(
@@ -218,7 +218,7 @@ def test_the_error_across_the_line_from_the_bearing_is_that_of_drawn_errors() ->
     )
 
 
-def test_the_final_match_admits_what_the_identification_admits() -> None:
+def test_the_final_match_and_identification_use_the_same_gates() -> None:
     """Distances err by 1 mm along sights from beside the bearing, mostly along the line from it.
 
     An LED that the identification matches and the final match does not makes the tracker refuse the frame: 2 % of the
@@ -290,7 +290,7 @@ def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
         ),
     ],
 )
-def test_a_survey_that_makes_no_sense_is_one_line(changes: dict[str, str], complaint: str) -> None:
+def test_an_invalid_survey_is_refused_in_one_line(changes: dict[str, str], complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         loader.load("afit_simsat", changes)
     assert complaint in str(caught.value)

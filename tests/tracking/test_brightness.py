@@ -24,7 +24,7 @@ LEVELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", [{}, {"light.led.drive": "{kind: direct}"}])
-def test_measured_fluxes_scatter_about_the_expected_ones_as_leds_do(drive: dict[str, str]) -> None:
+def test_measured_fluxes_scatter_as_the_leds_do(drive: dict[str, str]) -> None:
     """By 8 % from LED to LED, as the scene has it, and little more; and every attitude of the spiral is found."""
     lab = build_lab(loader.load("coded_spiral", LEVELS | drive))
     tracker = build_tracker(lab.camera)

@@ -99,15 +99,15 @@ def test_uncompensated_earth_rate_makes_the_navigator_drift_by_15_deg_an_hour() 
     )
 
 
-def test_compensated_earth_rate_is_taken_away_again() -> None:
+def test_a_compensated_earth_rate_causes_no_drift() -> None:
     flight = flown(
         5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]"
     )
     assert np.abs(error(telemetry_of(flight))).max() < 1e-4 * ARCSEC
 
 
-def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
-    """Turn-on bias and an Earth nobody takes away: minus the mean rate of the navigator's drift in body axes."""
+def test_the_reported_bias_is_the_gyros_excess_rate() -> None:
+    """Turn-on bias and uncompensated Earth rate: minus the navigator's mean drift rate in body axes."""
     unit = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 30, scale_ppm: 0, quantum_arcsec: 0,"
     unit += " misalignment_arcsec: 0}, earth_rate: uncompensated}"
     telemetry = telemetry_of(
@@ -124,7 +124,7 @@ def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
     assert np.degrees(np.linalg.norm(drift)) * 3600 > 20
 
 
-def test_a_wrong_home_stays_in_the_navigator() -> None:
+def test_an_initial_attitude_error_stays_in_the_navigator() -> None:
     """Zeroed while the vehicle stood wrong by (roll, pitch, yaw): its Euler angles are short of it by that."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
     start = "{roll_deg: 5, pitch_deg: 10, yaw_deg: -40}"
@@ -137,7 +137,7 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
 
 
 @pytest.mark.long
-def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> None:
+def test_under_imu_control_the_vehicle_follows_the_navigator_s_error() -> None:
     """The navigator is brought to the reference, (0, 0, 0), so the vehicle stands off by the home's error."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
     flight = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
@@ -155,7 +155,7 @@ def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> N
 # --- what it feels ------------------------------------------------------------------------------------------
 
 
-def test_the_imu_feels_the_vibration() -> None:
+def test_the_imu_measures_the_vibration() -> None:
     """The navigator adds up the shaken vehicle's rates: it is where that is, seen from where it was zeroed."""
     shake = "[{kind: line, frequency_hz: 20, rms_arcsec: [200, 0, 0]}]"
     flight = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
@@ -171,7 +171,7 @@ def test_the_imu_feels_the_vibration() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [100, 400, 1000])
-def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
+def test_the_imu_measures_the_whole_flight_tick_by_tick(rate_hz: int) -> None:
     """The samples of all ticks together are those of the whole flight at once: as many, and their sum to 1e-9 rad."""
     place = np.array([0.1, 0.1, 0.14])
     flight = flown(
@@ -224,7 +224,7 @@ def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     )
 
 
-def test_a_turn_beyond_the_gyros_limit_is_missing_for_good() -> None:
+def test_rotation_beyond_the_gyros_limit_is_permanently_lost() -> None:
     """25 deg/s on gyros that stop at 10: two seconds lose 30 deg."""
     limited = PERFECT.replace("{arw", "{rate_limit_deg_s: 10, arw")
     telemetry = telemetry_of(
@@ -239,7 +239,7 @@ def test_a_turn_beyond_the_gyros_limit_is_missing_for_good() -> None:
 # --- without a filter ---------------------------------------------------------------------------------------
 
 
-def test_without_a_filter_its_answer_is_the_navigator_s() -> None:
+def test_without_a_filter_the_estimate_is_the_navigator_s() -> None:
     loaded = loader.load("afit_simsat", {"vehicle.imu": "{}"})
     vehicle = multibody.build(loaded.vehicle)
     mount = multibody.camera_mount(vehicle)
@@ -254,7 +254,7 @@ def test_without_a_filter_its_answer_is_the_navigator_s() -> None:
     np.testing.assert_allclose(navigation.attitude_wxyz("imu"), expected, rtol=0, atol=1e-15)
 
 
-def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
+def test_the_filter_gets_solutions_in_body_axes() -> None:
     """A camera that looks aside: lab_from_body of the solution is the vehicle's, its roll error about the boresight.
 
     The tracker's covariance is in the camera's axes, ten times larger about the boresight; the filter's stays so,
@@ -322,7 +322,7 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
         ),
     ],
 )
-def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(
+def test_a_dome_that_no_tracker_supports_is_refused_in_one_line(
     changes: dict[str, str], why: str
 ) -> None:
     """And it is rendered all the same: a lab may light one LED."""
@@ -349,19 +349,19 @@ def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
         ("{kind: flat, apex: 1.2 m, tilt_deg: [3, 0]}", False),
     ],
 )
-def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted: bool) -> None:
+def test_a_surface_that_is_no_upright_ellipsoid_is_warned_of(surface: str, doubted: bool) -> None:
     """Of a tilted ellipsoid by how much it misses: turned by e it moves (a - b) e at the most, along its normal."""
     lines = doubted_of("afit_simsat", {"light.surface": surface})
-    told = [line for line in lines if line.startswith("light.surface")]
-    assert len(told) == doubted
-    for line in told:
+    doubts = [line for line in lines if line.startswith("light.surface")]
+    assert len(doubts) == doubted
+    for line in doubts:
         missed_mm = float(re.search(r"differs by (\S+) mm rms", line)[1])  # type: ignore[index]
         assert 1 < missed_mm < 300 * np.radians(3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
-def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
+def test_a_camera_outside_of_the_dome_is_warned_of(scene: str) -> None:
     """Its frames would be black, without a word."""
     far = {
         "vehicle.camera": "[0 m, 1.3 m, 0 m]",
@@ -373,13 +373,13 @@ def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
 
 
 @pytest.mark.slow
-def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
+def test_a_sky_scene_has_no_surface_warning() -> None:
     assert doubted_of("shefex2", {}) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"light.led.disk_diameter": "8 mm"}, "tracker.detector: LED images are 87 px wide"),
         ({"camera.focus": "20 in"}, "tracker.detector: LED images are 54 px wide"),
@@ -389,17 +389,19 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
         ),
     ],
 )
-def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
+def test_conditions_beyond_every_tracker_are_warned_of(
+    changes: dict[str, str], message: str
+) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
     lines = dome_warnings.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
     assert len(lines) == 1
-    assert lines[0].startswith(told)
+    assert lines[0].startswith(message)
     assert lines[0] in check(lab).findings
 
 
 @pytest.mark.slow
-def test_a_doubt_is_one_line_before_the_run_which_goes_on(
+def test_a_warning_is_one_line_before_the_run_which_continues(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
@@ -415,27 +417,27 @@ def test_a_doubt_is_one_line_before_the_run_which_goes_on(
 # --- how long to expose ---------------------------------------------------------------------------------------
 
 
-def test_the_exposure_control_is_the_chart_s_unless_the_scene_says_otherwise() -> None:
+def test_exposure_control_has_the_chart_s_defaults() -> None:
     """The schema repeats the estimator's constants, as it may not ask it for them."""
     plain = factory.control_settings(
         loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 150}"})
     )
     assert plain == Control(mean_dn=150.0)
     part = "{mean_dn: 99, shortest: 1 ms, longest: 90 ms, step: 3 ms, min_stars: 5, overexposed_objects: 6,"
-    told = factory.control_settings(
+    control = factory.control_settings(
         loader.load("shefex2", {"tracker.exposure_control": part + " saturated_px: 7}"})
     )
-    assert told == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
+    assert control == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
     assert factory.control_settings(loader.load("shefex2")) is None
 
 
-def test_without_control_every_frame_is_exposed_for_as_long() -> None:
+def test_without_exposure_control_every_frame_has_the_same_exposure() -> None:
     meter = ExposureController(loader.load("shefex2"))
     meter.update(Frame(0, np.full((493, 659), 4000, np.uint16), 0.0, 0.04, 4080.0))
     assert meter.exposure_s == 0.04
 
 
-def test_a_defect_is_no_star_and_lengthens_the_exposure() -> None:
+def test_defective_pixels_are_no_stars_so_the_exposure_grows() -> None:
     """Five stars are enough; five bright pixels, sharper than any optics, are none."""
     meter = ExposureController(
         loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"} | SINGLE)

@@ -1,4 +1,4 @@
-"""Trackers of somebody else's: asked as ours is, scored as ours is, and never able to stop a run."""
+"""External trackers: called and scored as ours is, and never able to stop a run."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
 
 
 @pytest.mark.parametrize(
-    ("answer", "told"),
+    ("answer", "message"),
     [
         ({"status": "solved"}, "without cam_from_ref_xyzw"),
         (Answer("solved"), "without cam_from_ref_xyzw"),
@@ -69,31 +69,31 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (None, "allowed: Answer"),
     ],
 )
-def test_what_is_no_answer_is_told_in_one_line(answer: object, told: str) -> None:
+def test_an_invalid_answer_is_refused_in_one_line(answer: object, message: str) -> None:
     with pytest.raises(
-        ValueError, match=told if isinstance(answer, Answer) else "allowed: Answer"
+        ValueError, match=message if isinstance(answer, Answer) else "allowed: Answer"
     ) as raised:
         check_answer(answer)
     assert "\n" not in str(raised.value)
 
 
-def test_an_answer_of_single_precision_is_made_a_unit() -> None:
-    told = check_answer(
+def test_an_answer_in_single_precision_is_normalized() -> None:
+    checked = check_answer(
         Answer("solved", np.array(UNIT, np.float32) * np.float32(1.0005), np.eye(3) * 1e-9)
     )
-    np.testing.assert_allclose(told.cam_from_ref_xyzw, UNIT, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(checked.cam_from_ref_xyzw, UNIT, rtol=0, atol=1e-15)
     assert check_answer(Answer("no\nstars")).status == "no stars"
 
 
-def test_a_set_up_comes_through_json_as_it_was() -> None:
+def test_a_setup_round_trips_through_json() -> None:
     stars = Stars(np.array([5, 9]), np.eye(3)[:2], np.array([1.25, 3.0]))
     leds = Leds(np.array([1]), np.ones((1, 3)), np.array([0.1, 0, 0.2]), np.array(UNIT))
-    for told in (
+    for setup in (
         replace(SETUP, stars=stars, options={"a": 1.5}),
         replace(SETUP, reference="lab", leds=leds),
     ):
-        again = Setup.of_tree(json.loads(json.dumps(told.as_tree())))
-        assert again.as_tree() == told.as_tree()
+        again = Setup.of_tree(json.loads(json.dumps(setup.as_tree())))
+        assert again.as_tree() == setup.as_tree()
     np.testing.assert_array_equal(
         Setup.of_tree(replace(SETUP, stars=stars).as_tree()).stars.direction, np.eye(3)[:2]
     )
@@ -112,21 +112,21 @@ def program(
     return tracker_interface.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
 
-def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
+def test_a_program_gets_the_pixels_and_its_answer_is_returned() -> None:
     """The sum of the pixels of its lower right corner and the header come back as centroids."""
     text = (
         FRAMES + "import array; a = array.array('H', p); w = h['width_px']\n"
         "    print(json.dumps({'frame': h['frame'], 'status': 'solved', 'cam_from_ref_xyzw': [0, 0, 0, 1],"
         " 'centroids_px': [[a[-1], a[w]], [h['t_s'], h['exposure_s']]], 'seconds': 1e-6}), flush=True)"
     )
-    told = program(text).solve(PICTURE)
-    assert told.status == "solved"
-    np.testing.assert_array_equal(told.centroids_px, [[47, 8], [0.5, 0.04]])
-    assert told.seconds == 1e-6
+    solution = program(text).solve(PICTURE)
+    assert solution.status == "solved"
+    np.testing.assert_array_equal(solution.centroids_px, [[47, 8], [0.5, 0.04]])
+    assert solution.seconds == 1e-6
 
 
 @pytest.mark.parametrize("kind", ["png", "fits"])
-def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
+def test_the_frame_s_folder_is_removed_with_the_program(kind: str) -> None:
     """The frame alone: the truth that a run's own files carry is not in it."""
     text = "for line in g:\n    h = json.loads(line); print(json.dumps({'frame': 7, 'status': h['file']}), flush=True)"
     runs = program(READY + text, kind=kind)
@@ -142,7 +142,7 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("time.sleep(60)", "no answer within 0.5 s"),
         (
@@ -166,10 +166,12 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
         ("sys.stdout.write('x' * 17_000_000)", "more than 16000000 bytes"),
     ],
 )
-def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told: str) -> None:
+def test_every_fault_of_a_program_is_one_line_within_the_time_limit(
+    text: str, message: str
+) -> None:
     runs = program(FRAMES + text, 0.5 if "sleep" in text else 5.0)
     begin_s = time.monotonic()
-    with pytest.raises(ProgramError, match=told) as raised:
+    with pytest.raises(ProgramError, match=message) as raised:
         runs.solve(PICTURE)
     assert "\n" not in str(raised.value)
     assert time.monotonic() - begin_s < 4
@@ -178,33 +180,35 @@ def test_whatever_a_program_does_is_told_in_one_line_and_in_time(text: str, told
 
 @pytest.mark.parametrize("kind", ["png", "fits"])
 @pytest.mark.parametrize(
-    ("harm", "told"),
+    ("harm", "reason"),
     [
         ("shutil.rmtree(sys.argv[1])", "No such file or directory"),
         ("os.remove(h['file']); os.mkdir(h['file'])", r"Is a directory|Operation not permitted"),
     ],
 )
-def test_a_program_that_harms_its_folder_is_blamed_and_begun_anew(
-    kind: str, harm: str, told: str
+def test_a_program_that_damages_its_folder_is_reported_and_restarted(
+    kind: str, harm: str, reason: str
 ) -> None:
     answer = 'print(\'{"frame": 7, "status": "x"}\', flush=True)'
     text = f"import shutil\nfor line in g:\n    h = json.loads(line); {harm}; {answer}"
     runs = program(READY + text, kind=kind)
     assert runs.solve(PICTURE).status == "x"
-    with pytest.raises(ProgramError, match=f"the program's folder takes no frame: ({told})$"):
+    with pytest.raises(ProgramError, match=f"the program's folder takes no frame: ({reason})$"):
         runs.solve(PICTURE)
     assert runs.solve(PICTURE).status == "x"
     runs.close()
 
 
-def test_a_program_that_does_not_read_is_not_waited_for() -> None:
+def test_a_program_that_does_not_read_times_out() -> None:
     """A frame larger than any pipe's buffer."""
     large = replace(PICTURE, image_dn=np.zeros((2000, 2000), np.uint16))
     with pytest.raises(ProgramError, match=r"no answer within 0\.5 s"):
         program(READY + "time.sleep(60)", 0.5).solve(large)
 
 
-def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: Path) -> None:
+def test_a_program_is_restarted_and_abandoned_after_three_successive_failures(
+    tmp_path: Path,
+) -> None:
     """The first dies once; of the other every one does."""
     mark = str(tmp_path / "mark")
     answer = 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
@@ -222,7 +226,7 @@ def test_it_is_begun_anew_and_given_up_after_three_failures_in_a_row(tmp_path: P
         hopeless.solve(PICTURE)
 
 
-def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
+def test_child_processes_of_a_program_end_with_it(tmp_path: Path) -> None:
     beat = tmp_path / "beat"
     child = f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
     runs = program(
@@ -241,7 +245,7 @@ def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             'print(\'{"ready": false, "status": "no LEDs please"}\')',
@@ -250,17 +254,18 @@ def test_all_that_a_program_started_ends_with_it(tmp_path: Path) -> None:
         ("import sys; sys.exit('no licence')", r"ended \(code 1\): no licence"),
     ],
 )
-def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_a_program_that_does_not_start_is_refused_with_the_reason(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         program(text)
 
 
 @pytest.mark.parametrize(
-    "told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"]
+    "program_text",
+    ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"],
 )
-def test_a_program_s_name_and_command_are_checked(told: str) -> None:
+def test_a_program_s_name_and_command_are_checked(program_text: str) -> None:
     with pytest.raises(InputError, match=r"^programs"):
-        tracker_interface.program_commands([told])
+        tracker_interface.program_commands([program_text])
 
 
 # --- runs ---------------------------------------------------------------------------------------------------
@@ -271,11 +276,11 @@ from scipy.spatial.transform import Rotation
 from skysim.tracking.tracker_interface import Answer
 
 class Offset:
-    '''Told each frame's truth by hand, it answers with an error that is known.'''
+    '''Its options hold each frame's truth; it answers with a known error.'''
     def __init__(self, setup):
         assert setup.reference == 'icrs' and len(setup.stars.id) > 1000 and setup.stars.magnitude.max() <= 5.75
-        self.told, self.frames = setup.options, 0
-        print('what it prints is in nobody\\'s way')
+        self.options, self.frames = setup.options, 0
+        print('what it prints disturbs nothing')
 
     def solve(self, picture):
         assert picture.frame == self.frames, 'every frame comes once, in order'
@@ -283,8 +288,8 @@ class Offset:
         if picture.frame == 1:
             raise RuntimeError('cloudy\\ntoday')
         n = picture.frame
-        truth = Rotation.from_quat([self.told[f'q{n}_{i}'] for i in range(4)])
-        error = Rotation.from_rotvec(np.radians([0.01, 0.0, self.told['roll_deg'] * (n == 2)]))
+        truth = Rotation.from_quat([self.options[f'q{n}_{i}'] for i in range(4)])
+        error = Rotation.from_rotvec(np.radians([0.01, 0.0, self.options['roll_deg'] * (n == 2)]))
         return Answer('solved', (error * truth).as_quat(), np.eye(3) * 1e-8, [[1.0, 2.0]])
 """
 
@@ -300,31 +305,31 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
-def test_a_trial_of_another_release_of_a_tracker_is_another(
+def test_another_release_of_a_tracker_changes_the_trial_s_hash(
     installed: None, tmp_path: Path
 ) -> None:
-    told = loader.load("shefex2", {"tracker.name": "offset"})
-    before = setups.scene_hash(told)
+    scene = loader.load("shefex2", {"tracker.name": "offset"})
+    before = setups.scene_hash(scene)
     assert tracker_interface.TRACKERS.release("offset") == "offset 1.0"
     (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
     )
     assert tracker_interface.TRACKERS.release("offset") == "offset 1.1"
-    assert setups.scene_hash(told) != before
+    assert setups.scene_hash(scene) != before
 
 
 @pytest.mark.slow
-def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
+def test_a_package_s_tracker_is_scored_by_its_error(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
-    told = loader.load("shefex2", {"exposure.frames": "3"})
-    truths = [shot.truth.cam_from_lab for shot in open_flight(told).shots(solves=False)]
+    scene = loader.load("shefex2", {"exposure.frames": "3"})
+    truths = [shot.truth.cam_from_lab for shot in open_flight(scene).shots(solves=False)]
     options = {
         f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())
     }
-    config = told.tracker.model_copy(
+    config = scene.tracker.model_copy(
         update={"name": "offset", "options": options | {"roll_deg": 0.2}}
     )
-    lab = build_lab(told.model_copy(update={"tracker": config}))
+    lab = build_lab(scene.model_copy(update={"tracker": config}))
     trackers = tracker_comparison.build_trackers(lab, ["offset", "own"], {})
     shots = tracker_comparison.compare_frames(Flight(lab), trackers)
     both = [answers for _, _, answers in shots]
@@ -352,7 +357,7 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
     assert summed.cross_arcsec_worst == pytest.approx(36, abs=1e-6)  # of the right ones
 
 
-def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_list_of_trackers_states_requirements(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, needs in ((None, "skysim[oracle]"), (object(), "")):
         monkeypatch.setattr(tracker_interface, "find_spec", lambda name, there=there: there)
         listed = json.loads(CliRunner().invoke(main.app, ["trackers", "--json"]).stdout)
@@ -361,11 +366,11 @@ def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:
-    told = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
+    scene = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
     with pytest.raises(
         InputError, match=r"tracker\.name: unknown tracker 'mine'; .*a program as mine=COMMAND"
     ):
-        build_lab(told)
+        build_lab(scene)
     for key in ("tracker.command", "tracker.program"):
         with pytest.raises(InputError, match="unknown key"):
             loader.load("shefex2", {key: "x"})
@@ -382,7 +387,7 @@ responses: [identified, refused]
 """
 
 
-def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
+def test_a_tracker_can_be_a_study_s_factor(tmp_path: Path) -> None:
     path = tmp_path / "who.yaml"
     path.write_text(STUDY)
     with pytest.raises(
@@ -397,10 +402,10 @@ def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="needs frames; allowed: own"):
         study_loader.load(path, {"trial.kind": "centroids"}, commands)
-    told = study_loader.load(path, programs=commands)
+    study_plan = study_loader.load(path, programs=commands)
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.prepare_store(told, kept, resume=False)
-        runner.run(told, kept, Serial())
+        runner.prepare_store(study_plan, kept, resume=False)
+        runner.run(study_plan, kept, Serial())
         assert [kept.trial(n)["status"] for n in range(2)] == ["solved", "cloudy"]
 
 
@@ -452,13 +457,13 @@ def said(folder: Path, words: list[str]) -> str:
 @pytest.mark.long
 @pytest.mark.parametrize("words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join)
 def test_the_page_s_commands_do_what_it_says(folder: Path, words: list[str]) -> None:
-    told = said(folder, words)
-    wrong = re.search(r"(\d+) wrong", told)
+    page = said(folder, words)
+    wrong = re.search(r"(\d+) wrong", page)
     assert wrong is None or wrong[1] == "0"
-    assert "failed:" not in told
+    assert "failed:" not in page
 
 
-def test_the_page_s_json_is_of_the_protocol() -> None:
+def test_the_page_s_json_follows_the_protocol() -> None:
     header, *answers = [json.loads(block) for block in blocks("json")]
     said = json.loads(program(FRAMES + "pass").frame_message(PICTURE)[0])
     assert list(header) == list(said)
@@ -472,12 +477,12 @@ def test_the_page_s_json_is_of_the_protocol() -> None:
 # What stands where the page has LOST: of the frame it sees one pixel, which says what it is to print.
 LOST = """#!{python}
 import shutil, sys, cv2
-told = dict(zip(sys.argv[2::2], sys.argv[3::2]))
-image = cv2.imread(told["--png"], cv2.IMREAD_UNCHANGED)
+options = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+image = cv2.imread(options["--png"], cv2.IMREAD_UNCHANGED)
 assert sys.argv[1] == "pipeline" and image.dtype == "uint8" and image.shape == (6, 8)
-assert float(told["--focal-length"]) * 1000 / float(told["--pixel-size"]) == 100  # FocalLengthFromOptions
+assert float(options["--focal-length"]) * 1000 / float(options["--pixel-size"]) == 100  # FocalLengthFromOptions
 print("PNG Read status: no error has occurred")
-shutil.copy(str(image[0, 0]), told["--print-attitude"])
+shutil.copy(str(image[0, 0]), options["--print-attitude"])
 """
 # RA, Dec, roll in degrees; LOST's own example of a solved picture is the first.
 POINTED = [(225.102, 28.9928, 81.3329), (0, 0, 0), (10, -70, 200), (359, 89, 300), (83, 2, 20)]

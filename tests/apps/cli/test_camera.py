@@ -77,7 +77,7 @@ def test_a_calibration_is_written_and_shown(camera: Command, tmp_path: Path) -> 
         (["new", "--pixels", "99x99"], "--pitch: missing; Pixel pitch"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_wrong_camera_input_is_refused_in_one_line(
     camera: Command, words: list[str], message: str, tmp_path: Path
 ) -> None:
     done = camera(*words)
@@ -144,7 +144,7 @@ def test_questions_are_asked_again_after_a_wrong_answer(camera: Command, tmp_pat
     assert written["detector"]["full_well_e"] == 32513
 
 
-def test_the_end_of_the_answers_writes_nothing(camera: Command, tmp_path: Path) -> None:
+def test_ending_the_questions_early_writes_no_file(camera: Command, tmp_path: Path) -> None:
     done = camera("new", answers="1936x1216\n")
     assert done.returncode == 130
     assert list(tmp_path.iterdir()) == []

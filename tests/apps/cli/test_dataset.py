@@ -31,11 +31,18 @@ WORDS = (
 
 
 @pytest.mark.slow
-def test_it_writes_the_frames_and_says_where(command: Command, tmp_path: Path) -> None:
+def test_the_dataset_command_writes_frames_and_prints_their_folder(
+    command: Command, tmp_path: Path
+) -> None:
     done = command(*WORDS, "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["out"], told["frames"], told["shards"], told["failed"]) == ("frames", 3, 2, 0)
+    report = json.loads(done.stdout)
+    assert (report["out"], report["frames"], report["shards"], report["failed"]) == (
+        "frames",
+        3,
+        2,
+        0,
+    )
     assert sorted(path.name for path in (tmp_path / "frames" / "shards").iterdir()) == [
         "000000.tar",
         "000001.tar",
@@ -47,7 +54,7 @@ def test_it_writes_the_frames_and_says_where(command: Command, tmp_path: Path) -
     assert "contains another dataset" in other.stderr
 
 
-def test_frames_that_are_missing_end_it_with_an_error(
+def test_missing_frames_end_the_dataset_command_with_an_error(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def dead(self: dataset_run.DatasetJob, chunk: engines.Chunk) -> list[ShardResult]:

@@ -40,7 +40,7 @@ def command_of(words: list[str]) -> tuple[str, Any, list[str]]:
     return path, command, words
 
 
-def test_there_are_examples_of_every_command_and_of_no_other() -> None:
+def test_exactly_the_existing_commands_have_examples() -> None:
     assert set(EXAMPLES) == set(commands(ROOT))
 
 

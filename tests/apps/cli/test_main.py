@@ -119,9 +119,7 @@ def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
 
 
 @pytest.mark.slow
-def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(
-    skysim: Skysim, tmp_path: Path
-) -> None:
+def test_export_writes_a_scene_that_mujoco_loads(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "made" / "lab.xml"
     done = skysim("scenes", "export", "simsat_cmg", "--out", path)
     assert (done.code, done.err) == (0, "")
@@ -132,7 +130,7 @@ def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(
 
 
 @pytest.mark.slow
-def test_export_writes_the_list_of_leds_that_a_scene_takes(skysim: Skysim, tmp_path: Path) -> None:
+def test_export_writes_a_list_of_leds_that_a_scene_reads(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "leds.csv"
     done = skysim("scenes", "export", "afit_simsat", "--out", path)
     layout = f"{{kind: listed, cap_deg: 28, file: {path}}}"
@@ -142,7 +140,7 @@ def test_export_writes_the_list_of_leds_that_a_scene_takes(skysim: Skysim, tmp_p
 
 
 @pytest.mark.long
-def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
+def test_without_opengl_the_run_continues_and_reports_the_missing_picture(
     skysim: Skysim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
@@ -166,9 +164,7 @@ def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) 
 
 
 @pytest.mark.slow
-def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(
-    skysim: Skysim, tmp_path: Path
-) -> None:
+def test_an_error_at_the_first_frame_keeps_earlier_results(skysim: Skysim, tmp_path: Path) -> None:
     words = ["render", "afit_simsat", "--frames", "1", "--out", str(tmp_path)]
     assert skysim(*words).code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -179,16 +175,16 @@ def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(
+def test_a_black_frame_of_a_camera_outside_of_the_dome_has_a_warning(
     skysim: Skysim, tmp_path: Path
 ) -> None:
     words = ["render", "apl_dome", "--frames", "1", "--out", str(tmp_path)]
-    told = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
-    assert told.code == 0
-    assert told.err.startswith(
+    result = skysim(*words, "--set", "vehicle.camera=[0 m, 0 m, 5 m]")
+    assert result.code == 0
+    assert result.err.startswith(
         "skysim: vehicle.camera: 5 m from the bearing, outside of light.surface"
     )
-    assert told.err.count("\n") == 1
+    assert result.err.count("\n") == 1
 
 
 @pytest.mark.slow
@@ -230,9 +226,7 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
 
 
 @pytest.mark.slow
-def test_solve_takes_a_picture_of_which_nothing_is_told(
-    skysim: Skysim, rendered: Path, tmp_path: Path
-) -> None:
+def test_solve_needs_no_hint(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     """2 atan(658 x 9.9 um / 50 mm) between the middles of the edge columns, where the scene points."""
     ran = skysim("solve", rendered / "frame_0000.fits", "--json", "--out", tmp_path)
     (answer,) = json.loads(ran.out)
@@ -243,7 +237,7 @@ def test_solve_takes_a_picture_of_which_nothing_is_told(
 
 
 @pytest.mark.slow
-def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
+def test_solve_ignores_an_impossible_header_date_with_a_warning(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
     """As if there were none, when aberration is left out."""
@@ -266,8 +260,8 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
     for key in ("ra_deg", "dec_deg", "roll_deg"):
         assert late[key] == none[key]
         assert late[key] != good[key]
-    told = ["--time", "2012-06-22T21:00:00", "--json", "--out", tmp_path / "out"]
-    ran = skysim("solve", frames["late"], "--camera", SHEFEX, *told)
+    options = ["--time", "2012-06-22T21:00:00", "--json", "--out", tmp_path / "out"]
+    ran = skysim("solve", frames["late"], "--camera", SHEFEX, *options)
     assert ran.err == ""
     assert json.loads(ran.out)[0]["ra_deg"] == good["ra_deg"]
 
@@ -284,7 +278,7 @@ def test_solve_writes_what_it_prints_and_a_picture(
 
 
 @pytest.mark.slow
-def test_solve_takes_a_folder_and_says_why_a_picture_is_refused(
+def test_solve_takes_a_folder_and_states_why_an_image_is_refused(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "night"
@@ -326,11 +320,11 @@ def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_pa
 def test_a_run_s_json_parses_and_counts(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("run", "shefex2", "--frames", "2", "--json", "--out", tmp_path)
     assert (ran.code, ran.err) == (0, "")
-    told = json.loads(ran.out)
-    assert (told["scene"], told["frames"], len(told["rows"])) == ("shefex2", 2, 2)
-    assert told["solved"] == sum(row["status"] == "solved" for row in told["rows"])
-    assert told["wrong"] == 0
-    page = Path(told["report"]).read_text()
+    report = json.loads(ran.out)
+    assert (report["scene"], report["frames"], len(report["rows"])) == ("shefex2", 2, 2)
+    assert report["solved"] == sum(row["status"] == "solved" for row in report["rows"])
+    assert report["wrong"] == 0
+    page = Path(report["report"]).read_text()
     assert "<html" in page
     assert 'src="http' not in page
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
@@ -401,7 +395,7 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
+def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
     """By a run and by a rendering, which are of the same frames."""
     growing = "tracker.exposure_control={mean_dn: 500, min_stars: 1000}"
     words = ["shefex2", "--frames", "2", "--out", tmp_path, "--set", growing]
@@ -409,8 +403,8 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
     assert ran["exposures_ms"] == pytest.approx([40, 42], abs=1e-9)
     solved = [images.read_image(tmp_path / f"frame_000{n}.fits") for n in (0, 1)]
     assert skysim("render", *words).code == 0
-    told = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
-    assert told == pytest.approx([0.040, 0.042], abs=1e-12)
+    exposures_s = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
+    assert exposures_s == pytest.approx([0.040, 0.042], abs=1e-12)
     for n in (0, 1):
         np.testing.assert_array_equal(images.read_image(tmp_path / f"frame_000{n}.fits"), solved[n])
 
@@ -508,14 +502,14 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
     ],
 )
 @pytest.mark.parametrize("command", ["run", "render"])
-def test_a_bad_scene_is_one_line_and_leaves_nothing(
+def test_a_bad_scene_is_refused_in_one_line_and_leaves_no_file(
     skysim: Skysim, tmp_path: Path, command: str, words: list[str], says: str
 ) -> None:
     assert says in skysim(command, *words, "--out", tmp_path / "out").one_line()
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Path) -> None:
+def test_an_error_in_a_scene_file_is_reported_with_its_line(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text((SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic"))
     line = path.read_text()[: path.read_text().index("falloff:")].count("\n") + 1
@@ -526,23 +520,25 @@ def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Pat
     )
 
 
-def test_what_is_not_yaml_is_one_line(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_file_that_is_not_yaml_is_refused_in_one_line(skysim: Skysim, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("a: [1, 2\nb: {")
     assert "not YAML" in skysim("render", tmp_path / "mine.yaml").one_line()
 
 
-def test_an_unknown_command_is_one_line(skysim: Skysim) -> None:
+def test_an_unknown_command_is_refused_in_one_line(skysim: Skysim) -> None:
     assert "nosuch" in skysim("nosuch").one_line()
     assert "nosuch" in skysim("catalog", "info", "nosuch").one_line()
 
 
-def test_no_command_at_all_shows_the_help(skysim: Skysim) -> None:
+def test_without_a_command_the_help_is_shown(skysim: Skysim) -> None:
     ran = skysim()
     assert "Usage" in ran.out + ran.err
     assert "Traceback" not in ran.out + ran.err
 
 
-def test_a_folder_that_cannot_be_made_is_one_line(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_refused_in_one_line(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     (tmp_path / "file").write_text("")
     said = skysim(
         "render", "shefex2", "--frames", "1", "--out", tmp_path / "file" / "out"
@@ -575,9 +571,9 @@ def text_as_png(folder: Path) -> Path:
 
 
 def with_nan(image: np.ndarray) -> np.ndarray:
-    spoilt = image.astype(np.float32)
-    spoilt[100, 200] = np.nan
-    return spoilt
+    changed = image.astype(np.float32)
+    changed[100, 200] = np.nan
+    return changed
 
 
 BAD_IMAGES: dict[str, tuple[Any, str]] = {
@@ -611,7 +607,7 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", list(BAD_IMAGES))
-def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
+def test_a_bad_image_is_refused_in_one_line_and_leaves_no_partial_file(
     skysim: Skysim, rendered: Path, tmp_path: Path, kind: str
 ) -> None:
     make, says = BAD_IMAGES[kind]
@@ -628,7 +624,7 @@ def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
 
 
 @pytest.mark.slow
-def test_a_bad_image_does_not_stop_the_good_one_behind_it(
+def test_a_bad_image_does_not_stop_the_next_one(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
     good = rendered / "frame_0000.fits"
@@ -647,7 +643,7 @@ def test_a_bad_image_does_not_stop_the_good_one_behind_it(
 
 
 @pytest.mark.slow
-def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Path) -> None:
+def test_an_image_of_noise_is_refused(skysim: Skysim, tmp_path: Path) -> None:
     noise = 64 + 2 * np.random.default_rng(3).standard_normal((493, 659))
     path = as_fits(tmp_path, np.rint(noise).astype(np.uint16))
     ran = skysim("solve", path, "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
@@ -681,7 +677,7 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
         (["--solver", "magic"], "--solver: unknown solver 'magic'; allowed: default, quest, "),
     ],
 )
-def test_a_wrong_option_of_solve_is_one_line(
+def test_a_wrong_option_of_solve_is_refused_in_one_line(
     skysim: Skysim, rendered: Path, tmp_path: Path, words: list[object], says: str
 ) -> None:
     ran = skysim("solve", rendered / "frame_0000.fits", *words, "--out", tmp_path / "out")
@@ -690,7 +686,7 @@ def test_a_wrong_option_of_solve_is_one_line(
 
 
 @pytest.mark.slow
-def test_a_camera_file_with_a_slip_is_one_line(
+def test_a_faulty_camera_file_is_refused_in_one_line(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
     camera = tmp_path / "camera.yaml"
@@ -726,16 +722,16 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
 
 
 def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
-    told = json.loads(
+    report = json.loads(
         skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out
     )
-    assert told["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
-    assert told["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
-    assert any(line.startswith("light.layout.cap_deg: ") for line in told["findings"])
+    assert report["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
+    assert report["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
+    assert any(line.startswith("light.layout.cap_deg: ") for line in report["findings"])
 
 
 @pytest.mark.slow
-def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(
+def test_a_run_shows_the_check_s_findings_before_its_frames_and_in_its_report(
     skysim: Skysim, tmp_path: Path
 ) -> None:
     words = ("--frames", 1, "--set", "light.led.intensity=60 mcd", "--out", tmp_path)
@@ -759,7 +755,7 @@ def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(
         assert name in page[page.index("<h2>Scene") : page.index("<h2>Frames")]
 
 
-def test_validate_carries_the_findings(skysim: Skysim, tmp_path: Path) -> None:
+def test_validate_shows_the_check_s_findings(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\nlight:\n  led: {intensity: 60 mcd}\n")
     out = skysim("validate", path).out
@@ -781,7 +777,7 @@ def test_scenes_show_prints_keys_with_their_origin(skysim: Skysim) -> None:
     assert "nothing: no such scene" in skysim("scenes", "show", "nothing").one_line()
 
 
-def test_an_option_without_effect_is_one_line(skysim: Skysim) -> None:
+def test_an_option_without_effect_is_refused_in_one_line(skysim: Skysim) -> None:
     for words in (
         ("check", "afit_simsat"),
         ("run", "afit_simsat"),

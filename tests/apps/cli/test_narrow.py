@@ -48,7 +48,7 @@ def score(name: str) -> TrackerScore:
 
 
 @pytest.mark.parametrize("width", [80, 100, 240])
-def test_a_scoreboard_fits_the_terminal_and_keeps_what_counts(
+def test_a_scoreboard_fits_the_terminal_and_keeps_its_main_columns(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(as_text, "terminal_width", lambda: width)

@@ -97,7 +97,7 @@ def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
         (InputError("", "no image"), "no image"),
     ],
 )
-def test_an_error_names_what_was_typed(error: InputError, line: str) -> None:
+def test_an_error_names_the_typed_option(error: InputError, line: str) -> None:
     assert str(as_typed(error)) == line
 
 

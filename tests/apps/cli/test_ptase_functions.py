@@ -55,7 +55,7 @@ from skysim.simulation import run
 from skysim.apps.cli.main import main
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 fly = run.simulate_motion
-run.simulate_motion = lambda *told: (signal.raise_signal(signal.SIGINT), fly(*told))[1]
+run.simulate_motion = lambda *arguments: (signal.raise_signal(signal.SIGINT), fly(*arguments))[1]
 sys.argv = ["skysim", "run", "shefex2", "--out", sys.argv[1]]
 main()
 """
@@ -141,19 +141,19 @@ def drawn_at(folder: Path, *sets: str) -> Floats:
     asked(
         "render", *SCENE, "--out", str(folder), *(word for one in sets for word in ("--set", one))
     )
-    told = [
+    lines = [
         line
         for line in (folder / "frame_0000.ecsv").read_text("utf-8").splitlines()
         if "cam_from_lab" in line
     ]
-    xyzw = np.array(json.loads(told[0][told[0].index("[") : told[0].index("]") + 1]))
+    xyzw = np.array(json.loads(lines[0][lines[0].index("[") : lines[0].index("]") + 1]))
     return np.degrees(ra_dec_roll_rad(Rotation.from_quat(xyzw)))
 
 
 def moved(folder: Path) -> bool:
     """A step up and one to the left."""
-    told = drawn_at(folder, "motion.start.dec_deg=7", "motion.start.ra_deg=88")
-    return bool(np.abs(told - [88, 7, 20]).max() < 1e-3)
+    drawn_deg = drawn_at(folder, "motion.start.dec_deg=7", "motion.start.ra_deg=88")
+    return bool(np.abs(drawn_deg - [88, 7, 20]).max() < 1e-3)
 
 
 def rolled(folder: Path) -> bool:
@@ -190,10 +190,10 @@ def studied(folder: Path, *words: str) -> Any:
     """A small study's table."""
     path = folder / "monte_carlo.yaml"
     files.write_text(path, STUDY)
-    told = asked(
+    report = asked(
         "study", "run", str(path), "--engine", "serial", "--out", str(folder / "study"), *words
     )
-    return told["points"]
+    return report["points"]
 
 
 def identifiers(folder: Path) -> bool:
@@ -228,8 +228,8 @@ def monte_carlo(folder: Path) -> bool:
 def how_many(folder: Path) -> bool:
     """Half as many runs, and a field of twice the width."""
     sets = ("--set", "replicates=20", "--set", "factors.field.values=['12 mm']")
-    told = studied(folder, *sets)
-    return told["identified_trials"] == [20, 20] and told["field"] == ["12 mm"] * 2
+    points = studied(folder, *sets)
+    return points["identified_trials"] == [20, 20] and points["field"] == ["12 mm"] * 2
 
 
 def log_file(folder: Path) -> bool:
@@ -282,12 +282,12 @@ def proc_cat(folder: Path) -> bool:
     """Doubles merged, growing magnitude, the log with its histogram and every star."""
     plain = published_catalogs.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", 5.0)
     done = published_catalogs.proc_cat(plain, 60 * ARCSEC_RAD)
-    told = published_catalogs.log(done)
+    log_text = published_catalogs.log(done)
     return bool(
         len(done) < len(plain)
         and done.components.sum() == len(plain)
         and (np.diff(done.magnitude) >= 0).all()
-        and len(told.splitlines()) > len(done)
+        and len(log_text.splitlines()) > len(done)
     )
 
 
@@ -302,13 +302,13 @@ def attitudes(folder: Path) -> bool:
 
 def true_sky(folder: Path) -> bool:
     asked("render", *SCENE, "--out", str(folder))
-    told = asked(
+    solution = asked(
         "solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved")
     )[0]
     return (
-        told["status"] == "solved"
-        and abs(told["ra_deg"] - 83) < 0.2
-        and abs(told["dec_deg"] - 2) < 0.2
+        solution["status"] == "solved"
+        and abs(solution["ra_deg"] - 83) < 0.2
+        and abs(solution["dec_deg"] - 2) < 0.2
     )
 
 
@@ -323,13 +323,13 @@ def from_a_camera(folder: Path) -> bool:
     )
     video.write(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
     video.release()
-    told = asked(
+    solution = asked(
         "solve", "--live", str(folder / "camera.avi"), "--fov", "14.87", "--out", str(folder)
     )[0]
     return (
-        told["status"] == "solved"
-        and abs(told["ra_deg"] - 83) < 0.2
-        and abs(told["dec_deg"] - 2) < 0.2
+        solution["status"] == "solved"
+        and abs(solution["ra_deg"] - 83) < 0.2
+        and abs(solution["dec_deg"] - 2) < 0.2
     )
 
 
@@ -338,11 +338,11 @@ def estimate(folder: Path) -> bool:
     one = field()
     known = catalog(5.1)
     axis = one.seen.mean(axis=0) / np.linalg.norm(one.seen.mean(axis=0))
-    told = {"magnitude": one.magnitude, "epsilon_mag": SIGMA_MAG, "within_rad": np.radians(15)}
-    right = fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=axis, **told)
+    options = {"magnitude": one.magnitude, "epsilon_mag": SIGMA_MAG, "within_rad": np.radians(15)}
+    right = fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=axis, **options)
     return (
         identified(right, one)
-        and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **told) is None
+        and fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=-axis, **options) is None
     )
 
 
@@ -358,10 +358,10 @@ def false_stars(folder: Path) -> bool:
     )
     seen = np.vstack([false / np.linalg.norm(false, axis=1, keepdims=True), one.seen])
     light = np.append([-1.5, -1.4, -1.3], one.magnitude)
-    told = {"magnitude": light, "epsilon_mag": SIGMA_MAG}
+    options = {"magnitude": light, "epsilon_mag": SIGMA_MAG}
     with_false = Field(seen, light, np.append([-1, -1, -1], one.rows))
-    return identified(fialho_4(seen, known, TOLERANCE_RAD, **told), with_false) and (
-        fialho_2(seen, known, TOLERANCE_RAD, **told) is None
+    return identified(fialho_4(seen, known, TOLERANCE_RAD, **options), with_false) and (
+        fialho_2(seen, known, TOLERANCE_RAD, **options) is None
     )
 
 
@@ -370,8 +370,8 @@ def magnitude_errors(folder: Path) -> bool:
     one = field()
     known = catalog(5.1)
     off = 0.1 + 0.05 * (-1.0) ** np.arange(len(one.rows))
-    told = {"magnitude": one.magnitude + off, "epsilon_mag": SIGMA_MAG}
-    found = fialho_4(one.seen, known, TOLERANCE_RAD, **told)
+    options = {"magnitude": one.magnitude + off, "epsilon_mag": SIGMA_MAG}
+    found = fialho_4(one.seen, known, TOLERANCE_RAD, **options)
     return isinstance(found, MagnitudeMatch) and (
         abs(found.offset_mag - 0.1) < 0.01 and abs(found.variance_mag2 - 0.05**2) < 0.001
     )
@@ -408,5 +408,5 @@ CHECKS: dict[str, Check] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CHECKS)
-def test_function_of_2005_has_a_counterpart(name: str, tmp_path: Path) -> None:
+def test_every_function_of_the_2005_program_has_a_counterpart(name: str, tmp_path: Path) -> None:
     assert CHECKS[name](tmp_path)

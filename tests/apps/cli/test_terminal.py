@@ -48,7 +48,9 @@ def test_bars_show_a_title_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
         assert name + HOSTILE in screen.getvalue()
 
 
-def test_what_a_tracker_says_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_of_a_tracker_s_text_are_escaped(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert (
         check_answer(Answer("lost \x1b[2J\x07\ud800 in\u202e space")).status
         == "lost ?[2J?? in? space"

@@ -43,7 +43,7 @@ class Hand:
         self.alive.discard(self)
 
 
-def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
+def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
@@ -52,12 +52,12 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
     monkeypatch.setattr(Hand, "alive", set())
     workers = session.Workers(WORKERS)
     served = list[tuple[int, Hand | None]]()
-    told = dict[int, str]()
+    status_texts = dict[int, str]()
     gone = set[int]()
 
     async def tab(number: int) -> None:
         got = await workers.wait(
-            lambda: number not in gone, lambda text: told.update({number: text})
+            lambda: number not in gone, lambda text: status_texts.update({number: text})
         )
         served.append((number, got))
 
@@ -67,8 +67,8 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
             await asyncio.sleep(0)
         assert [number for number, _ in served] == [0, 1]
         await asyncio.sleep(0.02)
-        assert told[2] == "2 of 2 workers in use."
-        assert told[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
+        assert status_texts[2] == "2 of 2 workers in use."
+        assert status_texts[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
         gone.add(2)  # it is closed while it waits
         await tabs[2]
         assert served[-1] == (2, None)
@@ -92,7 +92,7 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
+def test_twenty_tabs_share_two_workers(browser: Any, tmp_path: Path) -> None:
     with (
         Server(tmp_path, "--workers", str(WORKERS)) as server,
         opened(browser, server.login, NARROW) as first,
@@ -109,7 +109,7 @@ def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
                 page.set_default_timeout(QUICK_MS)
                 page.get_by_text("This page opens when another one has been closed.").wait_for()
             assert come(lambda: sorted(map(place, waiting)) == list(range(TABS - WORKERS)))
-            pictured(waiting[-1], "test_twenty_tabs_on_two_workers")
+            pictured(waiting[-1], "test_twenty_tabs_share_two_workers")
             for page in waiting:  # an animation would take the processor from those who work
                 assert page.evaluate("document.getAnimations().length") == 0
                 assert page.locator(".lab-waited").inner_text().endswith(" s")

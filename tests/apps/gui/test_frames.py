@@ -107,7 +107,7 @@ def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str | tuple[flo
     ]
 
 
-def test_all_pixels_come_from_the_worker_if_it_still_has_them() -> None:
+def test_all_pixels_are_served_while_the_worker_keeps_them() -> None:
     display = Display(SCREEN)
     image = sky(2)
     frame = served(image, display)
@@ -132,7 +132,7 @@ def reduced(image: np.ndarray, columns: int) -> np.ndarray:
     return np.where(found == SATURATED, np.inf, found * 10.0)
 
 
-def test_a_shade_is_that_of_the_mean_over_its_area() -> None:
+def test_a_shade_is_the_mean_over_its_area() -> None:
     image = np.random.default_rng(3).integers(0, 2541, (120, 160)).astype(np.uint16)
     np.testing.assert_allclose(
         reduced(image, 40), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=5.6
@@ -186,12 +186,14 @@ def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
         ({"curve": "other"}, None),
     ],
 )
-def test_a_query_is_a_display_or_refused(query: dict[str, str], display: Display | None) -> None:
+def test_a_query_gives_display_settings_or_is_refused(
+    query: dict[str, str], display: Display | None
+) -> None:
     assert display_of(query) == display
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_zscale_is_astropy_s_and_the_others_are_those_of_pictures(seed: int) -> None:
+def test_zscale_matches_astropy_and_other_limits_match_pictures(seed: int) -> None:
     image = sky(seed, (70, 90 + seed))
     levels = levels_of(image)
     np.testing.assert_allclose(
@@ -225,7 +227,7 @@ def test_the_loupe_s_pixels_come_unchanged_with_a_reduced_frame() -> None:
     assert near["levels"] == image[40:51, 155:].tolist()  # as far as the frame reaches
 
 
-def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.MonkeyPatch) -> None:
     async def nothing(*_: object) -> None:
         raise AssertionError("not a frame")
 
@@ -271,7 +273,7 @@ def split(message: bytes) -> tuple[int, np.ndarray]:
     return int(number), decoded(message[8:])[1]
 
 
-def test_a_frame_goes_over_the_stream_or_is_announced() -> None:
+def test_a_frame_is_sent_over_the_stream_or_announced() -> None:
     async def story() -> tuple[list[int], list[bytes]]:
         announced = list[int]()
         got = list[bytes]()
@@ -340,7 +342,7 @@ def test_a_frame_of_a_lost_stream_is_announced() -> None:
     assert asyncio.run(story()) == [KEPT_FRAMES + 2]
 
 
-def test_an_idle_stream_announces_what_was_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_idle_stream_announces_undrawn_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """The connection was lost, and the server has not noticed."""
     monkeypatch.setattr(served_module, "IDLE_S", 0.02)
 
@@ -385,7 +387,7 @@ def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
     assert again[3].x == lights.xy_px[3, 0]
 
 
-def test_contents_go_with_the_next_frame_or_else_by_themselves() -> None:
+def test_page_contents_are_sent_with_the_next_frame_or_separately() -> None:
     async def story() -> list[dict[int, dict[str, str]]]:
         contents = Contents()
         sent = []
@@ -456,7 +458,7 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
-def test_frames_that_follow_one_another_come_over_one_request(square: Any) -> None:
+def test_successive_frames_come_over_one_request(square: Any) -> None:
     square.mouse.move(5, 5)
     asked = list[str]()
     square.on("request", lambda request: asked.append(request.url))
@@ -491,7 +493,7 @@ def test_a_zoomed_frame_has_all_pixels_at_once(square: Any) -> None:
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
-def test_playing_a_flight_does_not_render_the_page_again(square: Any) -> None:
+def test_playing_a_flight_does_not_rebuild_the_page(square: Any) -> None:
     """The texts change with the frames, and NiceGUI's updates, each of which renders the whole page, do not come."""
     panel(square, "Run")
     square.get_by_role("button", name="Simulate").click()

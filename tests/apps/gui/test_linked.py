@@ -60,7 +60,7 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
 
 
 @pytest.mark.slow
-def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> None:
+def test_an_led_without_current_is_dark_and_the_views_have_their_directions() -> None:
     lab = build_lab(loader.load("afit_simsat", {}))
     strength = lab.camera.sources.strength.copy()
     strength[5] = 0.0
@@ -102,7 +102,7 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     )  # a chart that is drawn again does not send them again
 
 
-def test_of_too_many_residuals_whole_frames_are_left_out() -> None:
+def test_too_many_residuals_are_thinned_by_whole_frames() -> None:
     residuals = [(t / 10, id, 0.1) for t in range(700) for id in range(60)]
     dots = strips.thinned(residuals)
     assert len(dots) <= strips.MAX_DOTS
@@ -158,9 +158,7 @@ def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(
 
 @pytest.mark.browser
 @in_browser
-def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(
-    dome: Any, tmp_path: Path
-) -> None:
+def test_hovering_a_light_highlights_it_in_all_views(dome: Any, tmp_path: Path) -> None:
     """From the star camera the 3-D view shows each LED where the frame does."""
     spots = identified(dome, tmp_path)
     one, (x, y) = next(iter(spots.items()))
@@ -208,9 +206,7 @@ DOT = """() => { const canvas = document.querySelector(".lab-dots"), dots = getE
 
 @pytest.mark.browser
 @in_browser
-def test_a_dot_of_a_strip_lights_up_its_light_and_a_light_its_dots(
-    browser: Any, server: Server
-) -> None:
+def test_hovering_links_a_residual_s_dot_and_its_light(browser: Any, server: Server) -> None:
     with opened(browser, server.login, NARROW) as page:
         simulate(page, 5)
         page.get_by_text(re.compile(r"5/5$")).wait_for()

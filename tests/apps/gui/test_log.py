@@ -67,7 +67,7 @@ def test_a_csv_file_reads_back_with_commas_and_unknown_values() -> None:
     assert table["count"].mask.tolist() == [True, False]
 
 
-def test_a_field_of_view_is_made_by_the_focal_length() -> None:
+def test_a_field_of_view_sets_the_focal_length() -> None:
     changes = forms.field_override("shefex2", {}, 20.0)
     camera = loader.load("shefex2", changes).camera
     assert 2 * np.degrees(np.arctan(camera.width_px / 2 / camera.focal_px)) == pytest.approx(
@@ -79,7 +79,7 @@ def test_a_field_of_view_is_made_by_the_focal_length() -> None:
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_key_1_identifies_with_noise_and_without(page: Any, tmp_path: Path) -> None:
+def test_key_1_identifies_with_and_without_noise(page: Any, tmp_path: Path) -> None:
     """Without noise every frame of an attitude is the same; the noisy ones scatter about it."""
 
     def frames() -> list[np.ndarray]:

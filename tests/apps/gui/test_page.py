@@ -64,14 +64,14 @@ pytestmark = [
 ]
 
 
-def test_it_shows_a_solved_frame_with_names_and_a_map_of_keys(page: Any) -> None:
+def test_the_page_shows_a_solved_frame_with_names_and_key_help(page: Any) -> None:
     assert re.match(r"solved; \d+ of \d+ lights identified", status(page, "solved"))
     page.get_by_role("img", name="Mintaka").wait_for()  # of Orion's belt
     shown = page.locator(".lab-keys").first.inner_text()
     assert all(name in shown for name in ("F1", "F5", "F6", "F7", "F8", "F10", "E R", "1", "2"))
 
 
-def test_nothing_is_cut_off_or_scrolls_at_either_size(page: Any) -> None:
+def test_at_either_window_size_nothing_is_cut_off_or_scrolls(page: Any) -> None:
     for size in (WIDE, NARROW):
         page.set_viewport_size(size)
         page.wait_for_timeout(300)
@@ -131,7 +131,7 @@ def test_the_marks_are_drawn_on_their_stars(page: Any) -> None:
     page.wait_for_function(f"() => ({green})() > 500")
 
 
-def test_an_attitude_is_typed_and_1_identifies_it(page: Any) -> None:
+def test_a_typed_attitude_is_identified_by_key_1(page: Any) -> None:
     page.keyboard.press("F5")
     for n, angle in enumerate(("120", "-30", "0"), 1):
         page.get_by_label(f"angle {n}").fill(angle)
@@ -154,11 +154,11 @@ def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(gray, frame)
     truth = Table.read(kept["truth"])
-    told = json.loads(kept["solution"].read_text())
+    solution = json.loads(kept["solution"].read_text())
     assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute(
         "aria-label"
     )
-    np.testing.assert_allclose(told["angles_deg"], angles(page), rtol=0, atol=0.01)
+    np.testing.assert_allclose(solution["angles_deg"], angles(page), rtol=0, atol=0.01)
     assert cv2.imread(str(kept["figure"])).shape[2] == 3
     assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load(
         "shefex2"
@@ -170,7 +170,7 @@ def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
         assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
 
 
-def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: Path) -> None:
+def test_hovering_shows_a_star_s_data_and_a_click_enlarges_it(page: Any, tmp_path: Path) -> None:
     spots = json.loads(exported(page, "solution", tmp_path).read_text())["spots"]
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     spot = max((one for one in spots if one["id"] >= 0), key=lambda one: one["flux"])
@@ -180,12 +180,12 @@ def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: 
     assert len(enlarged) == 7 * 11
     assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
     page.locator(".lab-under .mono", has_text="residual").wait_for()
-    told = page.locator(".lab-under .mono").inner_text()
-    assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(
+    readout = page.locator(".lab-under .mono").inner_text()
+    assert float(re.search(r"residual ([\d.]+) px", readout)[1]) == pytest.approx(
         spot["residual_px"], abs=6e-4
     )
-    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
-    assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
+    assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", readout)
+    assert float(re.search(r"V (-?[\d.]+)", readout)[1]) < 5
 
 
 def limits(page: Any) -> list[float]:
@@ -195,7 +195,7 @@ def limits(page: Any) -> list[float]:
     ]
 
 
-def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(
+def test_limits_are_set_by_zscale_or_dragging_and_curves_brighten_faint_pixels(
     page: Any, tmp_path: Path
 ) -> None:
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
@@ -243,23 +243,23 @@ def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_fr
     assert canvas.get_attribute("data-placement") == whole
 
 
-def test_the_readout_has_the_pixel_s_value_and_where_it_points(page: Any, tmp_path: Path) -> None:
+def test_the_readout_has_the_pixel_s_value_and_direction(page: Any, tmp_path: Path) -> None:
     """Right ascension and declination as the exported frame's WCS, by astropy."""
     path = exported(page, "frame, FITS", tmp_path)
     frame = fits.getdata(path)
     sky = WCS(fits.getheader(path))
     for x, y in ((100, 80), (500, 400)):
         page.mouse.move(*screen(page, x, y))
-        told = page.locator(".lab-readout .mono").inner_text()
-        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", told).groups()]
-        assert int(re.search(r"(\d+) DN", told)[1]) == frame[y, x]
+        readout = page.locator(".lab-readout .mono").inner_text()
+        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", readout).groups()]
+        assert int(re.search(r"(\d+) DN", readout)[1]) == frame[y, x]
         ra_deg, dec_deg = sky.pixel_to_world_values(*place)
-        assert float(re.search(r"RA ([\d.]+)°", told)[1]) == pytest.approx(
+        assert float(re.search(r"RA ([\d.]+)°", readout)[1]) == pytest.approx(
             float(ra_deg), abs=6e-3
         )  # a place's 0.05 px
-        shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", told)[1].replace("−", "-"))
+        shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", readout)[1].replace("−", "-"))
         assert shown_dec == pytest.approx(float(dec_deg), abs=6e-3)
-        hours = Angle(re.search(r"\d+h\d+m[\d.]+s", told)[0]).degree
+        hours = Angle(re.search(r"\d+h\d+m[\d.]+s", readout)[0]).degree
         assert hours == pytest.approx(float(ra_deg), abs=6e-3)
 
 
@@ -395,7 +395,7 @@ def focused(page: Any, name: str) -> None:
     )
 
 
-def test_another_identifier_by_f7_and_the_keys_are_the_camera_s_again(page: Any) -> None:
+def test_f7_selects_an_identifier_and_returns_the_keys_to_the_camera(page: Any) -> None:
     page.keyboard.press("F7")
     focused(page, "tracker.identifier")
     page.keyboard.press("Enter")
@@ -451,7 +451,7 @@ def test_the_sensor_model_s_noise_is_set_in_arcseconds(page: Any) -> None:
     onto_the_page(page)
 
 
-def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None:
+def test_f8_sets_the_field_and_an_arrow_moves_a_fiftieth_of_it(page: Any) -> None:
     page.keyboard.press("F8")
     page.locator("input[aria-label='runs, F8']:focus").wait_for()
     set_to(page, "field, °", "8")
@@ -468,7 +468,7 @@ def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None
     set_to(page, "field, °", "14.868")
 
 
-def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: Server) -> None:
+def test_monte_carlo_of_200_by_2_runs_and_its_report_is_private(page: Any, server: Server) -> None:
     frame = source(page)
     page.keyboard.press("n")  # the camera's noise, which trials of centroids do not have
     changed(page, frame)
@@ -477,8 +477,8 @@ def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: S
         has_text="trials of centroids do not use camera.detector.noise"
     ).wait_for()
     page.get_by_text("200 of 200 trials").wait_for()
-    told = page.get_by_text("identified", exact=False).last.inner_text()
-    assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
+    summary = page.get_by_text("identified", exact=False).last.inner_text()
+    assert float(re.search(r"identified\s+([\d.]+)", summary)[1]) > 0.9
     report = page.locator("a[href^='/report/']").first
     path = str(report.get_attribute("href")).removeprefix("/")
     assert (
@@ -504,7 +504,7 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     identifier = page.get_by_text(re.compile("^stages")).inner_text().split(" · ")[2]
     stage = "" if identifier == "default" else f"; identifier {identifier}"
     assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
-    assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
+    assert page.get_by_label("angle 1").input_value() == ""  # its attitude is unknown
     page.mouse.click(*screen(page, 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
         assert abs(dn - int(photo[y, x])) <= 2
@@ -591,13 +591,13 @@ def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> N
         identified(page)
 
 
-def test_without_a_list_of_cameras_the_page_opens_none(page: Any) -> None:
+def test_without_a_list_of_cameras_no_camera_can_be_opened(page: Any) -> None:
     panel(page, "Image")
     page.get_by_text("No live camera is offered here").wait_for()
     assert page.get_by_role("button", name="Watch").count() == 0
 
 
-def test_an_export_is_of_the_image_on_the_page(page: Any, tmp_path: Path) -> None:
+def test_an_export_contains_the_image_on_the_page(page: Any, tmp_path: Path) -> None:
     """A photograph's pixels and solution, no truth; then the scene's again."""
     panel(page, "Image")
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
@@ -626,7 +626,7 @@ def test_starting_twice_starts_one_study(page: Any, server: Server) -> None:
     assert server.come_to("study", 0) == 0
 
 
-def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
+def test_bad_input_is_refused_at_its_field(page: Any) -> None:
     page.get_by_label("angle 2").fill("95")
     page.get_by_label("angle 2").press("Enter")
     page.get_by_text("Dec: 95 deg is not allowed").first.wait_for()
@@ -658,14 +658,14 @@ def test_another_shutter_is_chosen_in_the_form(page: Any) -> None:
     onto_the_page(page)
 
 
-def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Server) -> None:
+def test_a_scene_is_saved_reopened_and_not_overwritten(page: Any, server: Server) -> None:
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("focal_length")
     set_to(page, "camera.focal_length", "45 mm")
-    for told in ("saved as mine.yaml", "mine.yaml: file exists"):
+    for message in ("saved as mine.yaml", "mine.yaml: file exists"):
         page.get_by_placeholder("new-name").fill("mine")
         page.get_by_role("button", name="Save as").click()
-        page.get_by_role("status").filter(has_text=told).wait_for()
+        page.get_by_role("status").filter(has_text=message).wait_for()
     assert loader.load(server.folder / "mine.yaml").camera.focal_length_m == 0.045
     frame = source(page)
     chosen(page, "Scene", "mine.yaml")

@@ -51,7 +51,7 @@ from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.sources import catalog, stars
 
 
-def test_a_body_has_its_name_and_magnitude() -> None:
+def test_a_solar_system_body_is_listed_with_name_and_magnitude() -> None:
     """In the sensor's labels and in what the page says of a true light."""
     sensor = SimpleNamespace(prefix="HIP")
     assert [SensorView.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
@@ -87,7 +87,7 @@ def test_typed_angles_are_the_camera_s_under_the_stars() -> None:
 
 
 @pytest.mark.parametrize("dec_deg", [0.0, 60.0, 89.9])
-def test_an_arrow_moves_stars_the_other_way_by_its_share_of_the_field_even_at_the_pole(
+def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
     dec_deg: float,
 ) -> None:
     """A star in the image's middle stands, after a key to the right, a fiftieth of the field to the left of it."""
@@ -107,7 +107,7 @@ def test_an_arrow_moves_stars_the_other_way_by_its_share_of_the_field_even_at_th
     )  # down: y is down
 
 
-def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None:
+def test_key_r_rolls_the_camera_clockwise_and_stars_counterclockwise() -> None:
     """PTASE's sign: positive when the sensor moves clockwise, stars appear counter-clockwise."""
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
     before = geometry.from_angles(STARS, mount, (83.0, 2.0, 0.0))
@@ -118,7 +118,7 @@ def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None
     np.testing.assert_allclose(np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9)  # to the left of up
 
 
-def test_a_tilt_beyond_the_stop_is_refused_and_angles_out_of_range_too() -> None:
+def test_a_tilt_beyond_the_stop_and_angles_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match=r"tilt of 40\.0 deg: the bearing stops at 30 deg"):
         geometry.from_angles(DOME, UPRIGHT, (40.0, 0.0, 0.0))
     for angles in ((400.0, 0.0, 0.0), (10.0, 95.0, 0.0), (float("nan"), 0.0, 0.0)):
@@ -126,7 +126,7 @@ def test_a_tilt_beyond_the_stop_is_refused_and_angles_out_of_range_too() -> None
             geometry.from_angles(STARS, UPRIGHT, angles)
 
 
-def test_every_key_of_the_2005_program_is_on_the_map() -> None:
+def test_every_key_of_the_2005_program_is_in_the_key_help() -> None:
     """Fialho & Saotome 2005, section 3.1: arrows, E, R, 1, 2, F1, F5, F6, F7, F8, F10, ESC."""
     theirs = {"ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "e", "r", "1", "2", "Escape"}
     assert theirs | {f"F{n}" for n in (1, 5, 6, 7, 8, 10)} <= set(keys.ACTION_BY_KEY)
@@ -137,7 +137,7 @@ def test_every_key_of_the_2005_program_is_on_the_map() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.yaml")))
-def test_a_form_s_own_values_make_the_same_scene(name: str) -> None:
+def test_a_form_s_unchanged_values_give_the_same_scene(name: str) -> None:
     """What stands in the fields, put over the file, changes nothing: units, defaults and lists come back."""
     values = forms.fields(name, {})
     again = {one.key: one.text for one in values if not one.is_set and one.text != "null"}
@@ -166,7 +166,7 @@ def test_fields_know_their_unit_and_their_choices() -> None:
     assert not values["camera.detector.bits"].is_set
 
 
-def test_another_kind_of_a_section_brings_its_keys_and_keeps_those_of_both() -> None:
+def test_changing_a_section_s_kind_shows_its_keys_and_keeps_common_ones() -> None:
     """The file's own kind comes back as the file has it; edits of the section go with its kind."""
     at_first = {one.key: one for one in forms.fields("shefex2", {})}
     assert at_first["camera.shutter.kind"].allowed_values == (
@@ -198,7 +198,7 @@ def test_another_kind_of_a_section_brings_its_keys_and_keeps_those_of_both() -> 
     assert back == {"tracker.limit_mag": "5.5"}
 
 
-def test_a_section_that_is_left_out_can_be_had_and_left_out_again() -> None:
+def test_an_optional_section_can_be_added_and_removed() -> None:
     assert {one.key: one for one in forms.fields("shefex2", {})}[
         "camera.vignetting.kind"
     ].shown == "none"
@@ -208,7 +208,7 @@ def test_a_section_that_is_left_out_can_be_had_and_left_out_again() -> None:
 
 
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "simsat_slew"])
-def test_every_offered_kind_makes_a_scene(name: str) -> None:
+def test_every_offered_kind_gives_a_valid_scene(name: str) -> None:
     fields = [field for field in forms.fields(name, {}) if field.key.endswith(".kind")]
     offered = [(field.key, kind) for field in fields for kind in field.allowed_values]
     assert len(offered) > 10
@@ -218,7 +218,7 @@ def test_every_offered_kind_makes_a_scene(name: str) -> None:
         assert getattr(value, "kind", "none") == kind
 
 
-def test_an_edit_that_makes_another_one_useless_takes_it_back() -> None:
+def test_an_edit_removes_earlier_edits_that_it_makes_useless() -> None:
     """The detector thesis has thresholds of its own."""
     before = {"tracker.threshold_sigma": "6", "camera.f_number": "2"}
     assert forms.with_value("shefex2", before, "tracker.detector", "thesis") == {
@@ -229,7 +229,7 @@ def test_an_edit_that_makes_another_one_useless_takes_it_back() -> None:
         forms.with_value("shefex2", {}, "tracker.threshold_sigma", "-1")
 
 
-def test_keys_without_effect_are_told() -> None:
+def test_keys_without_effect_are_reported() -> None:
     stars, dome = (
         {one.key: one for one in forms.fields(name, {})} for name in ("shefex2", "afit_simsat")
     )
@@ -247,7 +247,7 @@ def test_keys_without_effect_are_told() -> None:
 
 
 @pytest.mark.slow
-def test_the_loop_is_closed_by_something_else_whether_the_scene_has_a_word_or_a_section() -> None:
+def test_the_feedback_can_be_changed_for_both_forms_of_the_control_section() -> None:
     for name in ("afit_simsat", "simsat_bump", "simsat_slew"):
         values = forms.loop_overrides(name, {}, "truth")
         assert loader.load(name, values).motion.control.feedback == "truth"
@@ -264,7 +264,7 @@ def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:
         forms.validated_scene("afit_simsat_ideal", {"tracker.map": str(outside)})
 
 
-def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_a_scene_is_saved_as_its_differences_without_overwriting(tmp_path: Path) -> None:
     path = forms.save(tmp_path, "mine", "shefex2", {"camera.f_number": "2"}, "Mine")
     assert loader.load(path).camera.f_number == 2
     assert loader.load(path).light == STARS.light
@@ -283,7 +283,7 @@ LIGHTS = LightColumns(
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 
 
-def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> None:
+def test_each_kind_of_mark_has_its_position_and_can_be_switched_off() -> None:
     result = TrackerResult("solved", SPOTS, 1.0, (0.0, 0.0, 0.0), windows_px=((50.0, 60.0),))
     drawn = {kind: overlay.marks(LIGHTS, result, {kind}, str) for kind in overlay.KINDS}
     points = {
@@ -319,7 +319,7 @@ def test_a_faint_light_beside_a_detection_of_noise_gets_no_tick() -> None:
     assert ticks == {"truth": [[10.0, 20.0], [50.0, 60.0]]}
 
 
-def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> None:
+def test_the_cursor_finds_lights_and_detections_independent_of_marks() -> None:
     found = overlay.marks(LIGHTS, TrackerResult("solved", SPOTS, 1.0), (), str)["lights"]
     assert found == [
         (10.0, 20.0, 1, 0),
@@ -333,7 +333,7 @@ def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> Non
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_whole_numbers_reach_the_browser_unchanged(dtype: type) -> None:
+def test_integers_reach_the_browser_unchanged(dtype: type) -> None:
     image = np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, (7, 9)).astype(dtype)
     data = pixels.levels_of(image).data()
     assert np.frombuffer(data, float, 2).tolist() == [0.0, 1.0]
@@ -352,7 +352,7 @@ def test_other_numbers_are_rounded_to_a_65535th_of_their_range() -> None:
     )
 
 
-def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> None:
+def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None:
     """Under the dome by the depth at which its ray meets the surface; under the stars by the rotation alone."""
     for scene, within_rad in (("afit_simsat", 2e-4), ("shefex2", 2e-5)):
         flight = simulate_motion(
@@ -433,7 +433,7 @@ async def page(scope: dict, receive: object, send) -> None:
         ({"host": "localhost", "content-length": str(10**9)}, "token=right", 413),
     ],
 )
-def test_the_guard_of_a_page_of_this_machine(
+def test_a_local_page_requires_token_host_and_origin(
     headers: dict[str, str], query: str, status: int
 ) -> None:
     guard = Guard(page, ("127.0.0.1", "localhost"), "right", 8080)
@@ -450,9 +450,7 @@ def test_the_guard_of_a_page_of_this_machine(
         ({"host": "lab", "cookie": "skysim_gui_8080=wrong"}, "", 401),
     ],
 )
-def test_the_guard_of_a_page_for_others_wants_the_token(
-    headers: dict[str, str], query: str, status: int
-) -> None:
+def test_a_shared_page_requires_its_token(headers: dict[str, str], query: str, status: int) -> None:
     guard = Guard(page, ("*",), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
@@ -530,7 +528,7 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
 
 
 @pytest.mark.slow
-def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(
+def test_closed_pages_are_collected_once_while_no_frame_is_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
@@ -559,7 +557,7 @@ def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(
     asyncio.run(close_while_another_plays())
 
 
-def test_closed_pages_are_collected_in_the_end_though_frames_go_on(
+def test_closed_pages_are_eventually_collected_while_frames_are_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     collected = list[bool]()
@@ -579,7 +577,7 @@ def test_closed_pages_are_collected_in_the_end_though_frames_go_on(
     assert collected == [True]
 
 
-def test_every_response_has_a_policy_that_no_other_site_frames() -> None:
+def test_every_response_forbids_framing_by_other_sites() -> None:
     """A report keeps its own, stricter one."""
     sent: list[dict] = []
 
@@ -612,7 +610,7 @@ def test_every_response_has_a_policy_that_no_other_site_frames() -> None:
 
 
 @pytest.mark.parametrize("name", ["..", "../out", "\0", "x" * 5000, "none", ""])
-def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: Path) -> None:
+def test_a_report_outside_the_folder_is_not_found(name: str, tmp_path: Path) -> None:
     (tmp_path / "out" / "study").mkdir(parents=True)
     for folder in (tmp_path, tmp_path / "out" / "study"):
         (folder / "report.html").write_text("report")
@@ -620,7 +618,7 @@ def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: P
     assert report_path(tmp_path / "out", "study") is not None
 
 
-def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> None:
+def test_a_study_s_report_is_visible_only_to_its_user(tmp_path: Path) -> None:
     mine = "0123456789abcdef"
     other = "fedcba9876543210"
     names = f"monte_carlo_{mine}_tab_1", f"monte_carlo_{other}_tab_1", "afit_sensitivity"
@@ -634,7 +632,7 @@ def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> 
     assert user_of({"skysim_user": "../x"}) == user_of({}) == ""
 
 
-def test_a_host_is_told_with_or_without_its_port() -> None:
+def test_the_port_is_removed_from_a_host() -> None:
     assert [host_of(one) for one in ("a:1", "a", "[::1]:8", "[::1]")] == [
         "a",
         "a",
@@ -671,7 +669,7 @@ def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothin
 
 
 @pytest.mark.slow
-def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(
+def test_kept_frames_of_a_flight_equal_rerendered_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     worker = tasks.Worker()
@@ -695,7 +693,7 @@ def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(
 
 
 @pytest.mark.long
-def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
+def test_a_session_answers_refuses_bad_input_and_ends_with_its_tab() -> None:
     async def story() -> None:
         session = Session()
         try:
@@ -723,7 +721,7 @@ def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
 
 
 @pytest.mark.long
-def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
+def test_a_flight_equals_that_of_the_command_line_and_keeps_its_frames() -> None:
     async def story() -> None:
         session = Session()
         try:
@@ -790,7 +788,7 @@ def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.long
-def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_path: Path) -> None:
+def test_monte_carlo_runs_a_study_and_shows_the_store_s_results(tmp_path: Path) -> None:
     trial = {"kind": "centroids", "noise_px": 0.2}
     text = study_process.monte_carlo("shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7)
     path = tmp_path / "monte_carlo.yaml"
@@ -832,7 +830,7 @@ def test_a_saved_scene_names_its_base_first() -> None:
     )
 
 
-def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
+def test_frame_statistics_measure_the_sky_despite_stars() -> None:
     """The scatter of whole numbers has the rounding's 1/12 on top; 2 % of the pixels are stars."""
     random = np.random.default_rng(7)
     for sigma_dn in (0.6, 3.0, 20.0):
@@ -847,7 +845,7 @@ def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
         assert (values.peak_dn, values.saturated) == (4095, 6)
 
 
-def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> None:
+def test_wrong_and_refused_trials_are_distinguished_from_solved_ones() -> None:
     columns = {
         "trial": np.array([3, 5, 8]),
         "frames": np.array([1, 2, 1]),
@@ -858,7 +856,7 @@ def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> 
     assert study_process.unsolved(columns) == [(8, "wrong"), (5, "no match")]
 
 
-def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
+def test_a_constant_offset_does_not_change_the_displayed_frame() -> None:
     """Black and white are measured from the sky."""
     image = np.random.default_rng(2).poisson(20, (200, 200)).astype(np.uint16)
     image[50, 60] = 900
@@ -866,7 +864,7 @@ def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
     np.testing.assert_array_equal(*shown)
 
 
-def test_the_file_dialog_takes_the_end_of_every_image_s_name() -> None:
+def test_the_file_dialog_accepts_every_image_suffix() -> None:
     """A browser's `accept` knows one suffix: `.gz` of `.fits.gz`."""
     assert {".fits", ".gz", ".fz", ".png", ".jpg"} <= set(SUFFIXES)
     assert all(any(name.endswith(end) for end in SUFFIXES) for name in IMAGE_SUFFIXES)

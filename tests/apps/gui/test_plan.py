@@ -38,7 +38,7 @@ pytest_plugins = ["tests.helpers.labpage"]
 ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 
-def test_a_check_is_that_of_the_command() -> None:
+def test_a_check_equals_that_of_the_command() -> None:
     lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
     found = workbench.check(lab)
     expected = checks.check(lab)
@@ -155,7 +155,7 @@ def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
 
 
 @pytest.mark.slow
-def test_a_survey_goes_on_with_the_frames_flown() -> None:
+def test_a_survey_continues_with_the_frames_flown() -> None:
     """Its frames are those at the planned attitudes, and more of them measure more LEDs, with errors as estimated."""
     worker = Worker()
     bench = {"motion.control": "prescribed", "motion.maneuver": "[]"}
@@ -237,7 +237,7 @@ def test_a_survey_has_the_frames_of_its_flights_once() -> None:
         worker.adjust_survey(4)
 
 
-def test_a_survey_that_determines_nothing_says_so() -> None:
+def test_a_survey_that_determines_nothing_is_reported() -> None:
     plan = SurveyPlan(ANGLES, (30, 31), 1465, ((4, 0, None), (6, 50, 0.46)))
     few = {
         "sigma_mm": None,
@@ -272,7 +272,7 @@ def test_a_plan_needs_two_frames() -> None:
         survey.begin(loader.load("afit_simsat"), 1)
 
 
-def test_colors_are_told_apart_by_their_lightness() -> None:
+def test_colors_differ_in_lightness() -> None:
     """The scale's luminance rises all along, so that eyes that see fewer colors see it as well."""
     luminance = color_scale(np.linspace(0, 1, 64)) @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(luminance) > 0)
@@ -280,7 +280,7 @@ def test_colors_are_told_apart_by_their_lightness() -> None:
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_check_map_and_survey_in_the_page(page: Any) -> None:
+def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
     chosen(page, "Scene", "afit_simsat")
     page.wait_for_function("document.querySelector('.lab-title').innerText.includes('AFIT')")
     status(page, "solved")

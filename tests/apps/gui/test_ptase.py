@@ -28,7 +28,7 @@ PUBLISHED = {
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_table_1_of_ptase(page: Any) -> None:
+def test_all_functions_of_table_1_of_ptase_work_in_the_page(page: Any) -> None:
     panel(page, "Scene")  # step 1: of the scene shefex2
     for key, value in KEYS.items():
         page.get_by_placeholder("find a key").fill(key)

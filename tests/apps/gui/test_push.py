@@ -29,7 +29,7 @@ def free() -> Lab:
     return build_lab(loader.load("shefex2", {"light.limit_mag": "3"}))
 
 
-def test_a_small_pull_is_a_spring_and_a_long_one_has_a_limit() -> None:
+def test_the_pull_force_is_linear_up_to_a_limit() -> None:
     """A force k d at the lever r: the torque of a spring that swings at PULL_RAD_S, with J the mean moment."""
     turned = Rotation.from_rotvec([0.1, -0.4, 0.3])
     held = np.array([0.3, 0.0, 0.4])
@@ -47,7 +47,7 @@ def test_a_small_pull_is_a_spring_and_a_long_one_has_a_limit() -> None:
     np.testing.assert_array_equal(pull_torque_nm(None, turned, np.diag(INERTIA)), np.zeros(3))
 
 
-def test_a_free_vehicle_gains_the_torque_times_the_time_and_keeps_it(free: Lab) -> None:
+def test_a_pushed_free_vehicle_gains_and_keeps_torque_times_time(free: Lab) -> None:
     """L = int T dt in the lab, where T turns with the vehicle; then nothing changes L."""
     push = Push(free, Rotation.from_rotvec([0.2, 0.5, -0.3]))
     grip = Grip((0.5, 0.1, 0.2), (0.1, 0.6, 0.4))
@@ -70,7 +70,7 @@ def test_a_free_vehicle_gains_the_torque_times_the_time_and_keeps_it(free: Lab) 
     assert push.simulation.now_s == pytest.approx(2.0)
 
 
-def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Lab) -> None:
+def test_a_vehicle_without_gravity_oscillates_about_the_pulled_attitude(free: Lab) -> None:
     """A sphere held a little off its place is a pendulum of the angular frequency PULL_RAD_S."""
     push = Push(free, Rotation.identity())
     offset = math.radians(2)
@@ -102,7 +102,7 @@ def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:
 @pytest.mark.parametrize(
     ("scene", "reason"), [("collimated_display", "no vehicle"), ("two_heads", "prescribed")]
 )
-def test_what_is_no_moving_vehicle_is_not_pushed(scene: str, reason: str) -> None:
+def test_only_a_moving_vehicle_can_be_pushed(scene: str, reason: str) -> None:
     lab = build_lab(loader.load(scene, {}))
     with pytest.raises(InputError, match=reason):
         Push(lab, lab.start)
@@ -110,7 +110,7 @@ def test_what_is_no_moving_vehicle_is_not_pushed(scene: str, reason: str) -> Non
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-def test_a_drag_of_the_vehicle_moves_it_and_its_frames_and_reset_brings_it_back(page: Any) -> None:
+def test_dragging_the_vehicle_moves_it_and_reset_restores_it(page: Any) -> None:
     last = source(page)
     chosen(page, "Scene", "afit_simsat")
     page.get_by_text("AFIT SimSat under its measured dome").wait_for()

@@ -61,7 +61,7 @@ def test_every_parameter_of_a_photo_has_a_label() -> None:
     assert {key for key in OPTIONS if key.startswith("solve.")} <= LABELS.keys()
 
 
-def test_actions_are_found_by_their_words_in_any_order() -> None:
+def test_actions_are_found_by_words_in_any_order() -> None:
     commands = [
         Command("show the log", "F10", lambda: None),
         Command("show the next frame", ".", lambda: None),
@@ -127,7 +127,7 @@ def distance(colors: Iterable[str], eye: str) -> float:
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_colors_are_told_apart_by_every_eye(eye: str) -> None:
+def test_colors_are_distinguishable_with_color_blindness(eye: str) -> None:
     """Red and green of equal lightness would be 0.04 apart in deuteranopia."""
     assert distance(["#3f9a52", "#e05555"], "deuteranopia") < 0.04
     marks = [
@@ -139,7 +139,7 @@ def test_colors_are_told_apart_by_every_eye(eye: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_time_of_a_first_frame_is_not_that_of_compiling() -> None:
+def test_the_time_of_the_first_frame_excludes_compilation() -> None:
     """Also of a tracker that was chosen later: its first frame takes about as long as its second."""
     bench = Workbench.open("shefex2", {})
     for overrides in ({}, {"tracker.identifier": "pyramid"}):
@@ -202,7 +202,7 @@ def test_every_action_is_found_by_ctrl_k(tab_of_own: Any) -> None:
 
 @pytest.mark.browser
 @in_browser
-def test_texts_are_read_in_both_themes(tab_of_own: Any) -> None:
+def test_texts_have_sufficient_contrast_in_both_themes(tab_of_own: Any) -> None:
     """WCAG 2 demands a contrast of 4.5 for text of this size."""
     page = tab_of_own
     for _ in range(2):
@@ -263,7 +263,7 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
 @pytest.mark.browser
 @in_browser
 @pytest.mark.parametrize("size", [NARROW, WIDE], ids=["1280", "1920"])
-def test_frame_laboratory_and_panel_are_seen_together_in_sizes_of_the_user_s(
+def test_frame_laboratory_and_panel_are_visible_together_and_resizable(
     tab_of_own: Any, size: dict[str, int]
 ) -> None:
     page = tab_of_own
@@ -308,7 +308,7 @@ def test_frame_laboratory_and_panel_are_seen_together_in_sizes_of_the_user_s(
 
 @pytest.mark.browser
 @in_browser
-def test_a_closed_laboratory_is_not_drawn_and_one_that_does_not_change_neither(
+def test_a_closed_or_unchanged_laboratory_is_not_redrawn(
     tab_of_own: Any,
 ) -> None:
     page = tab_of_own

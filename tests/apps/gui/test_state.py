@@ -47,7 +47,7 @@ VIEWS = (
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.kind)
-def test_a_view_comes_back_from_its_address(view: PageView) -> None:
+def test_a_view_is_restored_from_its_url(view: PageView) -> None:
     assert PageView.from_query(view.query(), SCENES) == view
     assert re.fullmatch(r"\?[\w%.+&=-]+", view.query())
 
@@ -62,17 +62,17 @@ def test_a_view_comes_back_from_its_address(view: PageView) -> None:
         ("?scene=shefex2&view=flight&t=soon", "allowed: numbers"),
     ],
 )
-def test_an_address_of_elsewhere_is_refused_in_one_line(query: str, message: str) -> None:
+def test_an_invalid_view_url_is_refused_in_one_line(query: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         PageView.from_query(query, SCENES)
 
 
-def test_an_address_without_a_scene_names_no_view() -> None:
+def test_a_url_without_a_scene_gives_no_view() -> None:
     assert PageView.from_query("", SCENES) is None
     assert PageView.from_query("?token=x", SCENES) is None
 
 
-def test_steps_are_told_from_continuous_changes() -> None:
+def test_steps_are_distinguished_from_continuous_changes() -> None:
     view = VIEWS[2]
     assert view.same_step(replace(view, t_s=1.0, angles_deg=(1.0, 2.0, 3.0)))
     for other in (
@@ -83,7 +83,7 @@ def test_steps_are_told_from_continuous_changes() -> None:
         assert not view.same_step(other)
 
 
-def test_a_movement_is_one_step_and_replaces_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """However soon after a page's opening or an edit it begins."""
     sent: list[str] = []
     monkeypatch.setattr(history.ui, "run_javascript", sent.append)
@@ -131,7 +131,7 @@ def found_key(page: Any, key: str) -> Any:
 
 @pytest.mark.browser
 @in_browser
-def test_a_reload_a_link_and_back_show_the_same_again(browser: Any, server: Server) -> None:
+def test_reload_link_and_back_restore_the_view(browser: Any, server: Server) -> None:
     with opened(browser, server.login, NARROW) as page:
         assert written(page, "scene=shefex2", "at=")
         found_key(page, "camera.f_number")
@@ -215,9 +215,7 @@ def test_the_printed_link_returns_to_the_last_view_and_a_bad_one_is_refused(
 
 @pytest.mark.browser
 @in_browser
-def test_a_stopped_study_is_still_shown_after_a_reload_and_goes_on(
-    browser: Any, server: Server
-) -> None:
+def test_a_stopped_study_survives_a_reload_and_resumes(browser: Any, server: Server) -> None:
     with opened(browser, server.login, NARROW) as page:
         panel(page, "Monte Carlo")
         page.get_by_label("noise, px").fill("7")

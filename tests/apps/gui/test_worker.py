@@ -35,7 +35,7 @@ pytestmark = [
 ]
 
 
-def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
+def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> None:
     """Every frame is computed while keys move the camera; then it plays to its last frame at any speed."""
     chosen(page, "Scene", "simsat_slew")
     page.get_by_text("SimSat slews on its reaction wheels").wait_for()
@@ -94,9 +94,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     page.get_by_role("status").filter(has_text="filter requires the section filter").wait_for()
 
 
-def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(
-    second: Any, server: Server
-) -> None:
+def test_monte_carlo_stops_resumes_and_replays_a_failed_trial(second: Any, server: Server) -> None:
     panel(second, "Monte Carlo")
     second.get_by_label("noise, px").fill("8")
     second.get_by_label("runs, F8").fill("5000")
@@ -138,9 +136,7 @@ def test_closing_a_tab_ends_its_worker_and_its_study(
     assert server.come_to("gui.template", 2) == 2
 
 
-def test_a_worker_that_is_killed_is_told_and_another_takes_its_place(
-    page: Any, server: Server
-) -> None:
+def test_a_killed_worker_is_reported_and_replaced(page: Any, server: Server) -> None:
     for worker in server.children("gui.template"):
         worker.kill()
     page.keyboard.press("1")
@@ -152,7 +148,7 @@ def test_a_worker_that_is_killed_is_told_and_another_takes_its_place(
     changed(page, frame)
 
 
-def test_a_page_for_others_takes_its_token_and_no_other_site_s_word(
+def test_a_shared_page_requires_its_token_and_rejects_other_origins(
     browser: Any, server: Server, tmp_path: Path
 ) -> None:
     assert server.status(Host="evil.example") == 403

@@ -74,7 +74,7 @@ def test_images_move_as_the_rate_says(rng: np.random.Generator) -> None:
 
 @law(rate.at_middle_row, rate.error_gain, rate.covariance_of)
 @given(rng=SEEDS)
-def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(
+def test_correction_moves_rolling_shutter_lights_to_global_shutter_positions(
     rng: np.random.Generator,
 ) -> None:
     for sight in STARS, DOME:
@@ -155,7 +155,7 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
 
 
 @pytest.mark.slow
-def test_the_rate_of_streaks_errs_as_it_says() -> None:
+def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
     nees = []
     for seed in range(300):
         rng = np.random.default_rng([21, seed])
@@ -194,7 +194,7 @@ def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("seed", range(230, 240))
-def test_a_light_at_the_limit_of_the_outliers_does_not_keep_the_fit_from_its_end(seed: int) -> None:
+def test_a_light_at_the_outlier_limit_does_not_prevent_convergence(seed: int) -> None:
     """Errors with long tails: in 234 a light is an outlier with every second step, for ever."""
     rng = np.random.default_rng([23, seed])
     seen = moving(rng, np.radians(rng.normal(0, 1, 3)), 12)
@@ -211,7 +211,7 @@ def test_a_light_at_the_limit_of_the_outliers_does_not_keep_the_fit_from_its_end
 
 @law(rolling.rate_covariance_rad2)
 @given(rng=SEEDS)
-def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> None:
+def test_an_error_of_the_rate_rotates_the_attitude(rng: np.random.Generator) -> None:
     seen = moving(rng, any_rate(rng))
     error = rng.normal(0, 1e-5, 3)
     found = seen.centroids()
@@ -227,7 +227,7 @@ def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> No
 
 
 @pytest.mark.slow
-def test_a_rolling_frame_s_attitude_errs_as_it_says() -> None:
+def test_a_rolling_shutter_attitude_has_its_claimed_covariance() -> None:
     """Of the attitude that is solved after the rate, with the covariance of both."""
     nees = []
     for seed in range(300):
@@ -271,7 +271,7 @@ def moments_of(seen: Moving, variance_px2: float) -> Floats:
 
 @law(rate.from_moments)
 @given(rng=SEEDS)
-def test_disks_of_a_rolling_shutter_tell_the_rate(rng: np.random.Generator) -> None:
+def test_disks_of_a_rolling_shutter_determine_the_rate(rng: np.random.Generator) -> None:
     seen = moving(rng, any_rate(rng, 8.0), sight=DOME)
     disks = replace(
         seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments_of(seen, 30.0)
@@ -287,7 +287,7 @@ def test_disks_of_a_rolling_shutter_tell_the_rate(rng: np.random.Generator) -> N
 
 @law(classify.moments)
 @given(rng=SEEDS)
-def test_moments_of_an_ellipse_are_its_own(rng: np.random.Generator) -> None:
+def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generator) -> None:
     xx, yy = rng.uniform(12, 30, 2)
     xy = rng.uniform(-0.5, 0.5) * np.sqrt(xx * yy)
     offset = np.stack(np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5), axis=-1)
@@ -309,19 +309,19 @@ def test_moments_of_an_ellipse_are_its_own(rng: np.random.Generator) -> None:
 
 @law(RateEstimate.resolved)
 @given(rng=SEEDS)
-def test_another_rate_tells_the_sign(rng: np.random.Generator) -> None:
+def test_another_rate_resolves_the_sign(rng: np.random.Generator) -> None:
     true = rng.normal(0, 1, 3)
     spread = 0.01 * np.eye(3)
     unsigned = RateEstimate(-true, spread, sign_known=False)
-    told = unsigned.resolved(RateEstimate(true + rng.normal(0, 0.1, 3), spread))
+    resolved = unsigned.resolved(RateEstimate(true + rng.normal(0, 0.1, 3), spread))
     if true @ true > 1:
-        assert told.sign_known
-        assert_allclose(told.rate_rad_s, true, rtol=0, atol=0)
+        assert resolved.sign_known
+        assert_allclose(resolved.rate_rad_s, true, rtol=0, atol=0)
     assert unsigned.resolved(unsigned) is unsigned
     assert not unsigned.resolved(RateEstimate(true, 1e4 * np.eye(3))).sign_known
     known = RateEstimate(true, spread)
     assert known.resolved(RateEstimate(-true, spread)) is known
-    assert np.array_equal(told.covariance_rad2_s2, spread)
+    assert np.array_equal(resolved.covariance_rad2_s2, spread)
 
 
 def test_centroids_keep_their_streaks() -> None:

@@ -88,7 +88,7 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
 
 @law(systematic.with_focal)
 @given(rng=SEEDS)
-def test_a_fitted_focal_length_takes_a_change_of_scale_to_itself_and_no_rotation(
+def test_a_fitted_focal_length_absorbs_a_change_of_scale_without_rotation(
     rng: np.random.Generator,
 ) -> None:
     """And the covariances with it are those of the inverse of the whole information, a rotation's block of it."""
@@ -128,7 +128,7 @@ def test_the_weights_own_errors_have_the_inverse_of_the_information(
 
 @law(systematic.with_survey)
 @given(rng=SEEDS)
-def test_without_survey_errors_a_covariance_is_the_solver_s(rng: np.random.Generator) -> None:
+def test_without_survey_errors_the_covariance_equals_the_solver_s(rng: np.random.Generator) -> None:
     view = systematic.geometry(*places(rng))
     sigma = sigmas(rng)
     solver = (
@@ -176,7 +176,7 @@ def test_a_focal_length_s_error_grows_from_the_principal_point(rng: np.random.Ge
 
 @law(dome_tracker.led_sigma_rad)
 @given(rng=SEEDS)
-def test_round_errors_of_leds_on_a_sphere_are_angles_from_the_camera(
+def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     rng: np.random.Generator,
 ) -> None:
     """An error along the line from the bearing moves no direction. The least distance is the radius less the lever."""

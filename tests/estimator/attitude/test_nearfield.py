@@ -56,7 +56,7 @@ def angle_rad(a: Rotation, b: Rotation) -> float:
     return (a * b.inv()).magnitude()
 
 
-def test_a_light_s_pixel_by_hand() -> None:
+def test_the_pixel_of_a_light_matches_a_hand_calculation() -> None:
     # 1 m above a camera 0.4 m up, 50 mm along x and -20 mm along y: 1000 * .05 right, 1000 * .02 up.
     camera = Camera(640, 480, 1000.0, (320.0, 240.0))
     lever = Lever(np.array([0.0, 0.0, 0.4]), Rotation.identity())
@@ -69,7 +69,7 @@ def test_a_light_s_pixel_by_hand() -> None:
     np.testing.assert_allclose(yawed, [[300, 190]], rtol=0, atol=1e-10)
 
 
-def test_a_camera_tilted_about_the_bearing_sees_parallax_by_hand() -> None:
+def test_the_parallax_of_a_tilted_camera_matches_a_hand_calculation() -> None:
     # A light on the vertical at 1.4 m; the vehicle leans by t: in body axes it stands at 1.4 (0, sin t, cos t).
     camera = Camera(640, 480, 1000.0, (320.0, 240.0))
     lever = Lever(np.array([0.0, 0.0, 0.4]), Rotation.identity())
@@ -145,7 +145,7 @@ def test_a_ray_that_misses_has_no_point() -> None:
 
 
 @pytest.mark.parametrize("lever", [LEVER, ASKEW])
-def test_the_jacobian_is_the_projection_s_derivative(lever: Lever) -> None:
+def test_the_jacobian_is_the_derivative_of_the_projection(lever: Lever) -> None:
     rng = np.random.default_rng(53)
     truth = tilted(rng, 0.4)
     step = 1e-6
@@ -224,7 +224,7 @@ def monte_carlo(
         (ASKEW, MEASURED),
     ],
 )
-def test_the_covariance_is_true(lever: Lever, surface: tuple) -> None:
+def test_the_covariance_matches_the_scatter(lever: Lever, surface: tuple) -> None:
     errors, claimed = monte_carlo(lever, 5, surface, seed=55, trials=600)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)
     # Chi-square of three degrees: mean 3, deviation sqrt(6 / 600) = 0.1; three of them.
@@ -232,7 +232,7 @@ def test_the_covariance_is_true(lever: Lever, surface: tuple) -> None:
 
 
 @pytest.mark.long
-def test_five_lights_err_as_the_reference_says() -> None:
+def test_five_lights_have_the_reference_s_error() -> None:
     errors, _ = monte_carlo(LEVER, 5, SPHERE, seed=56, trials=1000)
     cross = np.degrees(np.sqrt(np.mean(errors[:, 0] ** 2 + errors[:, 1] ** 2)))
     roll = np.degrees(np.sqrt(np.mean(errors[:, 2] ** 2)))
@@ -281,7 +281,7 @@ def test_rays_on_the_true_ellipsoid_find_the_truth_too() -> None:
         assert angle_rad(found, truth) < 1e-9
 
 
-def test_rays_on_a_sphere_for_an_ellipsoid_err_by_the_surface() -> None:
+def test_rays_on_a_sphere_instead_of_an_ellipsoid_err_by_the_surface_difference() -> None:
     # Reference section 5, "ray-sphere corrected" on the ellipsoid: .003 degree at 30; the exact solve has none.
     rng = np.random.default_rng(59)
     errors = []
@@ -299,7 +299,9 @@ def test_rays_on_a_sphere_for_an_ellipsoid_err_by_the_surface() -> None:
 
 @pytest.mark.parametrize("lever", [LEVER, ASKEW], ids=["axial", "askew"])
 @pytest.mark.parametrize("count", [1, 3])
-def test_one_light_leaves_a_turn_unknown_however_often_it_is_seen(count: int, lever: Lever) -> None:
+def test_one_light_seen_repeatedly_leaves_one_rotation_undetermined(
+    count: int, lever: Lever
+) -> None:
     leds = LedMap(np.arange(count), np.tile([0.1, 0.05, 1.19], (count, 1)), *SPHERE)
     truth = Rotation.from_rotvec([0.1, 0.05, 0.3])
     with pytest.raises(ValueError, match=f"{count} rays do not determine a rotation"):
@@ -308,7 +310,7 @@ def test_one_light_leaves_a_turn_unknown_however_often_it_is_seen(count: int, le
         )
 
 
-def test_lights_that_the_rays_cannot_be_are_refused() -> None:
+def test_lights_that_contradict_the_rays_are_refused() -> None:
     # Lights on opposite sides of the dome and rays all about the boresight: no rotation brings them together.
     rng = np.random.default_rng(60)
     places = RADIUS_M * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.1]])

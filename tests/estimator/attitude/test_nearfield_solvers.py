@@ -66,13 +66,13 @@ def compare(method: str, surface: str, tilts: tuple[int, ...], trials: int) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "surface"), PUBLISHED, ids=" ".join)
-def test_the_reference_s_table(method: str, surface: str) -> None:
+def test_errors_match_rows_of_the_reference_s_table(method: str, surface: str) -> None:
     compare(method, surface, (30,), 60)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("method", "surface"), PUBLISHED, ids=" ".join)
-def test_the_reference_s_whole_table(method: str, surface: str) -> None:
+def test_errors_match_the_reference_s_whole_table(method: str, surface: str) -> None:
     compare(method, surface, (0, 10, 20, 30), 500)
 
 
@@ -97,7 +97,7 @@ def test_rays_on_the_true_sphere_are_exact_too() -> None:
     )
 
 
-def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
+def test_assuming_infinity_errs_by_the_parallax_of_the_pattern_s_center() -> None:
     """From M nearer, the pattern's middle at a tangent t is seen at t and stands at t (R - M) / R: t M / R too far.
 
     With N lights over a field of half-tangents (h, v) its rms is sqrt((h^2 + v^2) / 3 N).
@@ -113,7 +113,7 @@ def test_stars_at_infinity_err_by_the_pattern_s_middle() -> None:
         assert abs(rms - law_deg) < 3 * error + law_deg * (half @ half / 3)
 
 
-def test_nine_lights_under_the_nps_panel_err_as_the_reference_says() -> None:
+def test_nine_lights_under_the_nps_panel_have_the_reference_s_error() -> None:
     """Reference section 5: infinity 1.48-1.54, rays on a sphere .05 at 0 to .16 at 15 deg. NPS lit nine."""
     one = bench.GEOMETRIES["NPS flat at 1 m"]
     for method, tilt, low, high in (
@@ -164,7 +164,7 @@ def test_the_exact_solve_s_covariance_holds_within_ten_per_cent(trials: int) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", ["flat at 48 in", "NPS flat at 1 m"])
 @pytest.mark.parametrize("method", ["infinity", "thesis", "tappe", "ray_on_surface"])
-def test_every_covariance_is_that_of_the_noise(method: str, surface: str) -> None:
+def test_every_covariance_matches_the_noise(method: str, surface: str) -> None:
     errors, claimed = noise_alone(method, surface, 15, 80, seed=76)
     # Mean 3, deviation sqrt(6 / 80) = 0.27.
     assert nees(errors, claimed).mean() == pytest.approx(3, abs=0.8)
@@ -179,7 +179,7 @@ def test_every_covariance_holds_within_ten_per_cent(method: str, surface: str) -
     assert nees(errors, claimed).mean() == pytest.approx(3, rel=0.1)
 
 
-def test_the_place_unknown_costs_a_thousand_in_cross() -> None:
+def test_an_unknown_position_raises_the_cross_error_a_thousandfold() -> None:
     """Reference section 5: .206 deg against .00021, the median sigma on one axis, five lights, .1 px, 15 deg."""
     sigma_deg = {}
     for method in ("pnp", "rotation_only"):
@@ -194,13 +194,13 @@ def test_the_place_unknown_costs_a_thousand_in_cross() -> None:
     assert sigma_deg["rotation_only"] == pytest.approx(0.00021, rel=3 * 0.02)
 
 
-def test_the_six_dof_covariance_is_that_of_small_noise() -> None:
+def test_the_six_dof_covariance_matches_small_noise() -> None:
     # A hundredth of the noise claimed, so that the turned-over fit stays out of reach: first order is put to the test.
     errors, claimed = noise_alone("pnp", "measured ellipsoid", 15, 120, seed=79, noise_px=1e-3)
     assert nees(errors, claimed * 1e-4).mean() == pytest.approx(3, abs=3 * np.sqrt(6 / 120))
 
 
-def test_an_update_of_the_distances_leaves_a_small_share_of_the_error(
+def test_one_update_of_the_distances_removes_most_of_the_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The share that Tappe's first update leaves: the off-axis angle of a light times M / R times the same again."""
@@ -216,7 +216,7 @@ def test_an_update_of_the_distances_leaves_a_small_share_of_the_error(
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_an_askew_camera_and_its_body_axes(method: str) -> None:
+def test_a_camera_mounted_askew_gives_the_body_attitude(method: str) -> None:
     """A camera turned on its mount sees the same: its body is the straight one's, turned, and so is the covariance."""
     rng = np.random.default_rng(81)
     one = bench.GEOMETRIES["measured ellipsoid"]
@@ -236,7 +236,7 @@ def test_an_askew_camera_and_its_body_axes(method: str) -> None:
     np.testing.assert_allclose(in_camera, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max())
 
 
-def test_what_a_method_cannot_do_is_refused() -> None:
+def test_unsupported_input_of_a_method_is_refused() -> None:
     one = bench.GEOMETRIES["sphere"]
     clean = bench.trial(one, 10, np.random.default_rng(82))
     rays = one.camera.rays(clean.pixels)

@@ -47,7 +47,7 @@ def error_rad(a: Rotation, b: Rotation) -> float:
 @pytest.mark.slow
 @every_optimal
 @pytest.mark.parametrize("count", [2, 3, 5, 20])
-def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
+def test_each_solver_gives_the_svd_s_rotation(count: int, solve: Solver) -> None:
     rng = np.random.default_rng(40)
     for _ in range(100):
         ref = unit(rng.normal(size=(count, 3)))
@@ -60,7 +60,7 @@ def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 5, 15])
-def test_quest_is_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> None:
+def test_quest_gives_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> None:
     rng = np.random.default_rng(41)
     for _ in range(100):
         truth = Rotation.random(rng=rng)
@@ -75,7 +75,7 @@ def test_quest_is_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> No
 @pytest.mark.slow
 @every_solver
 @pytest.mark.parametrize("half_rad", [0.1, 0.01, 1e-3, 2e-4])
-def test_directions_close_together_keep_their_digits(half_rad: float, solve: Solver) -> None:
+def test_close_directions_keep_full_precision(half_rad: float, solve: Solver) -> None:
     # Noise-free, roll can be known to the rounding over the spread. (The bare quartic errs by 3 rad at 2e-4.)
     rng = np.random.default_rng(42)
     for _ in range(100):
@@ -117,7 +117,9 @@ AXES = {
 @every_solver
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("short_of_rad", [0.0, 1e-12, 1e-8, 1e-4])
-def test_half_turns_about_any_axis(axis: str, short_of_rad: float, solve: Solver) -> None:
+def test_half_turns_about_any_axis_are_solved(
+    axis: str, short_of_rad: float, solve: Solver
+) -> None:
     rng = np.random.default_rng(44)
     truth = Rotation.from_rotvec((np.pi - short_of_rad) * unit(np.array(AXES[axis], dtype=float)))
     for count in (2, 3, 8):
@@ -136,7 +138,7 @@ QUARTER_TURNS = list(Rotation.create_group("O"))
 @every_solver
 @pytest.mark.parametrize("truth", QUARTER_TURNS, ids=range(24))
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_axes_themselves_in_all_24_orientations_of_a_cube(
+def test_all_24_orientations_of_a_cube_are_solved(
     truth: Rotation, count: int, solve: Solver
 ) -> None:
     # Exact zeros and ones: where a quaternion's parts vanish altogether.
@@ -145,7 +147,7 @@ def test_the_axes_themselves_in_all_24_orientations_of_a_cube(
 
 
 @every_optimal
-def test_a_better_star_weighs_more(solve: Solver) -> None:
+def test_a_more_accurate_star_weighs_more(solve: Solver) -> None:
     # Of two pairs of directions that disagree by 0.1 rad of roll, the hundred times better decides but for 1e-4.
     ref = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     cam = np.vstack([ref[:2], Rotation.from_rotvec([0, 0, 0.1]).apply(ref[2:])])
@@ -170,7 +172,7 @@ def test_parallel_directions_are_refused(vectors: np.ndarray, solve: Solver) -> 
 
 
 @every_solver
-def test_stars_that_are_one_in_the_camera_or_one_in_the_catalog_are_refused(solve: Solver) -> None:
+def test_stars_that_coincide_in_camera_or_catalog_are_refused(solve: Solver) -> None:
     distinct = np.eye(3)[:2]
     identical = np.eye(3)[[0, 0]]
     for cam, ref in ((distinct, identical), (identical, distinct)):
@@ -198,7 +200,7 @@ def test_stars_that_are_one_in_the_camera_or_one_in_the_catalog_are_refused(solv
         (np.ones(3), np.ones(3), np.ones(3), r"shapes .* allowed: \(N, 3\)"),
     ],
 )
-def test_bad_directions_are_one_clear_line(
+def test_bad_directions_are_refused_in_one_line(
     cam: np.ndarray, ref: np.ndarray, sigma: np.ndarray, what: str, solve: Solver
 ) -> None:
     with pytest.raises(ValueError, match=what) as caught:
@@ -291,7 +293,7 @@ def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_tur
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("name", RAW)
-def test_each_bare_method_stands_at_half_a_turn(name: str, axis: str) -> None:
+def test_each_bare_method_is_exact_at_half_a_turn(name: str, axis: str) -> None:
     # QUEST's own vector is infinite there, and ESOQ2's matrix vanishes at no turn: another frame is taken.
     ref = unit(np.array([[1, 0.2, 0.1], [-0.3, 1, 0.4], [0.1, -0.6, 1]]))
     for angle in (np.pi, 0.0):
@@ -301,7 +303,7 @@ def test_each_bare_method_stands_at_half_a_turn(name: str, axis: str) -> None:
 
 
 @pytest.mark.slow
-def test_no_method_leaves_its_arrays() -> None:
+def test_no_method_reads_outside_its_arrays() -> None:
     """NumPy refuses an index beyond an array; compiled code would read and write what lies behind it."""
     plain = interpreted("estimator.attitude.wahba")
     rng = np.random.default_rng(56)
@@ -328,7 +330,7 @@ def test_no_method_leaves_its_arrays() -> None:
 
 
 @pytest.mark.slow
-def test_the_bare_quest_loses_in_a_narrow_field_what_the_polish_brings_back() -> None:
+def test_bare_quest_loses_precision_in_a_narrow_field_and_polishing_restores_it() -> None:
     rng = np.random.default_rng(52)
     worst = 0.0
     for _ in range(50):
@@ -343,7 +345,7 @@ def test_the_bare_quest_loses_in_a_narrow_field_what_the_polish_brings_back() ->
 # ---- TRIAD ----
 
 
-def test_triad_of_a_perfect_star_and_another_is_black_s_triad() -> None:
+def test_triad_with_one_perfect_star_is_black_s_triad() -> None:
     # Black 1964: the first star's direction is met exactly; the second sets the plane alone.
     rng = np.random.default_rng(53)
     for _ in range(50):
@@ -363,7 +365,7 @@ def test_triad_of_a_perfect_star_and_another_is_black_s_triad() -> None:
 @pytest.mark.parametrize(
     "half", [np.tan(FOV_RAD / 2), 5.0], ids=["a star tracker's field", "nearly half the sky"]
 )
-def test_triad_rests_on_the_pair_with_the_least_worst_variance(half: float) -> None:
+def test_triad_uses_the_pair_with_the_least_maximum_variance(half: float) -> None:
     rng = np.random.default_rng(54)
     for _ in range(50):
         cam = in_field(rng, 8, half=half)
@@ -408,7 +410,7 @@ def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
-def test_quaternions_and_matrices_are_scipy_s(axis: str, angle_rad: float) -> None:
+def test_quaternions_and_matrices_match_scipy(axis: str, angle_rad: float) -> None:
     rotation = Rotation.from_rotvec(angle_rad * unit(np.array(AXES[axis], dtype=float)))
     found = quaternion_xyzw(rotation.as_matrix())
     # Either sign is the same turn.
@@ -442,7 +444,7 @@ def monte_carlo(
 
 
 @pytest.mark.slow
-def test_fifteen_stars_err_as_the_reference_says() -> None:
+def test_fifteen_stars_have_the_reference_s_error() -> None:
     errors, claimed = monte_carlo(15, np.tan(FOV_RAD / 2), 1500, seed=45)
     cross, roll = np.sqrt([np.mean(errors[:, :2] ** 2), np.mean(errors[:, 2] ** 2)]) / ARCSEC_RAD
     # Reference section 3 (14.87 deg, 659 px, 0.1 px): 2.17" an axis and 21.1" rms; 1,500 trials give 1.3 and 1.8 %.
@@ -455,7 +457,7 @@ def test_fifteen_stars_err_as_the_reference_says() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("count", [2, 3, 5, 30])
-def test_the_covariance_is_true(count: int, name: str) -> None:
+def test_the_covariance_matches_the_scatter(count: int, name: str) -> None:
     errors, claimed = monte_carlo(count, np.tan(np.radians(5)), 600, seed=46, name=name)
     nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)
     # Chi-square of three degrees: mean 3, deviation sqrt(6 / 600) = 0.1; three of them, and 1 % for the
@@ -463,7 +465,7 @@ def test_the_covariance_is_true(count: int, name: str) -> None:
     assert nees.mean() == pytest.approx(3, abs=0.33)
 
 
-def test_the_covariance_of_three_axes_by_hand() -> None:
+def test_the_covariance_of_three_axes_matches_a_hand_calculation() -> None:
     # Directions along x, y, z of sigma s: each axis is seen by the other two: s^2 / 2.
     np.testing.assert_allclose(
         covariance(np.eye(3), np.full(3, 2e-5)), 2e-10 * np.eye(3), rtol=0, atol=1e-24
@@ -496,7 +498,7 @@ BY_HAND = {
 
 
 @pytest.mark.parametrize("case", BY_HAND)
-def test_right_ascension_declination_and_roll_by_hand(case: str) -> None:
+def test_right_ascension_declination_and_roll_match_a_hand_calculation(case: str) -> None:
     camera, (ra, dec, roll) = BY_HAND[case]
     found = ra_dec_roll_rad(camera)
     assert found[:2] == pytest.approx((ra, dec), abs=1e-15)  # rounding
@@ -513,7 +515,7 @@ def from_angles(ra: float, dec: float, roll: float) -> Rotation:
 
 
 @pytest.mark.parametrize("dec_deg", [-89.9999, -60, 0, 33, 89.999999])
-def test_angles_survive_the_way_through_a_rotation(dec_deg: float) -> None:
+def test_angles_are_recovered_from_their_rotation(dec_deg: float) -> None:
     rng = np.random.default_rng(47)
     for ra, roll in rng.uniform([0, -3.1], [6.28, 3.1], (50, 2)):
         found = np.array(ra_dec_roll_rad(from_angles(ra, np.radians(dec_deg), roll)))

@@ -69,7 +69,7 @@ def unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_equal_errors_have_the_covariance_of_the_solver() -> None:
+def test_equal_errors_give_the_solver_s_covariance() -> None:
     position_m = leds_in_view(8, 1)
     sigma = np.full(8, 3e-5)
     view = view_of(position_m)

@@ -137,7 +137,7 @@ def errors_rad(found: Rotation, truth: Rotation) -> np.ndarray:
 
 
 @pytest.mark.parametrize("block", ["by_led", "by_rotation", "by_shared"])
-def test_the_derivatives_are_the_residuals_slopes(block: str) -> None:
+def test_the_derivatives_match_finite_differences_of_the_residuals(block: str) -> None:
     place, turned, lever = small_dome(11, frames=3)
     frames = filmed(np.random.default_rng(12), turned, place, lever, SMALL, 0.1)
     seen = dome_survey._collect(frames, len(place))
@@ -163,7 +163,7 @@ def test_the_derivatives_are_the_residuals_slopes(block: str) -> None:
             np.testing.assert_allclose(slope, exact[m, :, n], rtol=1e-7, atol=1e-11 / h)
 
 
-def test_the_free_moves_change_no_pixel() -> None:
+def test_the_gauge_freedoms_change_no_pixel() -> None:
     place, turned, lever = small_dome(13)
     frames = filmed(np.random.default_rng(14), turned, place, lever, SMALL, 0.1)
     seen = dome_survey._collect(frames, len(place))
@@ -182,7 +182,7 @@ def test_the_free_moves_change_no_pixel() -> None:
 @pytest.mark.parametrize(
     "how", [{}, {"loss": "cauchy"}, {"known_length": (0, 7, 0.5)}, {"reference_frame": 4}]
 )
-def test_noise_free_frames_give_all_back(how: dict) -> None:
+def test_noise_free_frames_recover_every_parameter(how: dict) -> None:
     found, place, turned, lever = small_survey(0.0, 5, **how)
     assert found.status == "converged"
     assert found.surveyed.sum() > 35
@@ -206,7 +206,7 @@ def test_noise_free_frames_give_all_back(how: dict) -> None:
     np.testing.assert_allclose(found.camera.distortion, SMALL.distortion, rtol=0, atol=1e-9)
 
 
-def test_a_known_length_sets_the_size_of_lights_and_lever_and_nothing_else() -> None:
+def test_a_known_length_scales_lights_and_lever_alone() -> None:
     by_map, *_ = small_survey(0.01, 6)
     place = by_map.leds.position_m
     half = np.linalg.norm(place[2] - place[9]) / 2
@@ -224,7 +224,7 @@ def test_a_known_length_sets_the_size_of_lights_and_lever_and_nothing_else() -> 
     assert by_length.camera.focal_px == pytest.approx(by_map.camera.focal_px, rel=1e-8)
 
 
-def test_the_misfit_is_over_the_coordinates_beyond_the_unknowns() -> None:
+def test_the_misfit_counts_the_redundant_coordinates() -> None:
     """Three for each light and frame, three of the lever, seven of the lens; less four that change no pixel."""
     noise_px = 0.01
     found, place, turned, lever = small_survey(noise_px, 6)
@@ -274,7 +274,7 @@ def gauged(
     ],
     ids=["start and its size", "measured and length"],
 )
-def test_the_covariance_is_the_scatter(sigma_m: float, length_known: bool) -> None:
+def test_the_covariance_matches_the_scatter_of_surveys(sigma_m: float, length_known: bool) -> None:
     place, turned, lever = small_dome(21)
     rng = np.random.default_rng(22)
     length = (0, 7, float(np.linalg.norm(place[0] - place[7]))) if length_known else None
@@ -318,7 +318,7 @@ def misnamed(
     return wrong
 
 
-def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
+def test_a_robust_loss_tolerates_wrong_names_and_reports_them() -> None:
     place, turned, lever = small_dome(31, frames=60)
     rng = np.random.default_rng(32)
     frames = filmed(rng, turned, place, lever, SMALL, 0.1)
@@ -328,7 +328,7 @@ def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
     camera = replace(SMALL, focal_px=1.01 * SMALL.focal_px)
     clean = survey(frames, start, believed, camera, leds_sigma_m=0.002)
     robust = survey(mixed, start, believed, camera, loss="cauchy", leds_sigma_m=0.002)
-    told = {(int(k), int(row)) for k, row in robust.outliers}
+    outliers = {(int(k), int(row)) for k, row in robust.outliers}
     wrong = {
         (k, int(row))
         for k, (frame, other) in enumerate(zip(frames, mixed, strict=True))
@@ -336,9 +336,9 @@ def test_wrong_names_are_survived_by_a_robust_loss_and_told() -> None:
         if robust.surveyed[other.led[row]] and robust.tied[k]
     }
     assert len(wrong) > 15
-    assert wrong <= told
+    assert wrong <= outliers
     # Some right ones go too: 5 sigma in two dimensions are 4e-6 of Gaussian noise, so none of a thousand.
-    assert all(frames[k].led[row] != mixed[k].led[row] for k, row in told)
+    assert all(frames[k].led[row] != mixed[k].led[row] for k, row in outliers)
     assert robust.misfit == pytest.approx(
         1, abs=4 / np.sqrt(2 * 700)
     )  # some 700 degrees of freedom
@@ -433,7 +433,7 @@ def test_frames_in_two_groups_are_refused() -> None:
         ),
     ],
 )
-def test_a_wrong_question_is_answered_in_one_line(change: dict, message: str) -> None:
+def test_invalid_settings_are_refused_in_one_line(change: dict, message: str) -> None:
     with pytest.raises(ValueError, match=f"^survey: {message}"):
         small_survey(0.1, 5, **change)
 
@@ -463,7 +463,7 @@ def test_malformed_frames_are_refused_by_number() -> None:
         survey(frames[:3], *asked)
 
 
-def test_the_turns_between_two_sets_of_attitudes_are_found() -> None:
+def test_the_rotations_between_two_sets_of_attitudes_are_found() -> None:
     rng = np.random.default_rng(41)
     ours = attitudes(rng, 30, 25)
     left = Rotation.from_rotvec([0.3, -0.2, 2.0])
@@ -513,7 +513,7 @@ def afit_errors_deg(
 
 @pytest.mark.long
 @pytest.mark.parametrize("begin", ["imu", "rotation_only", "imu and wrong names"])
-def test_the_afit_dome_surveys_itself(begin: str) -> None:
+def test_the_afit_dome_is_surveyed_from_its_own_frames(begin: str) -> None:
     """The issue's bar: 1,400 lights, 600 frames, 0.1 px; 2 mm, 5 mm and 1 % wrong at the start."""
     rng = np.random.default_rng(2012)
     place = dome(1400, 40.2) + rng.normal(0, 0.001, (1400, 3))

@@ -101,12 +101,12 @@ def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
     return float((np.arccos(read[0] @ read[1]) - np.arccos(true[0] @ true[1])) / ARCSEC)
 
 
-def test_the_thesis_s_slip_widens_an_eight_degree_pair_by_44_arcsec() -> None:
+def test_the_thesis_s_formula_error_widens_an_eight_degree_pair_by_44_arcsec() -> None:
     # Reference 1.2, item 11: + 44 arcsec. Half a unit of its last digit.
     assert abs(pair_error_arcsec(np.radians(8), sine=False) - 44) < 0.5
 
 
-def test_with_the_sine_put_right_a_tenth_of_that_is_left() -> None:
+def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
     # By plane trigonometry: the ray meets the sphere `along` from the camera; the thesis stops at R - M.
     half = np.radians(4)
     along = -M_M * np.cos(half) + np.sqrt(R_M**2 - (M_M * np.sin(half)) ** 2)
@@ -128,7 +128,7 @@ def test_with_the_sine_a_point_lies_on_its_ray_r_minus_m_away() -> None:
 # ---- the epsilons --------------------------------------------------------------------------------------------------
 
 
-def test_the_epsilons_at_one_place_are_the_noise_put_in() -> None:
+def test_the_epsilons_at_one_stop_are_the_injected_noise() -> None:
     found = calibrate(at_home(np.random.default_rng(61), 250), CAMERA, SPHERE, LEVER)
     # x and y of twelve LEDs; z hardly moves.
     low, high = greatest_sd(24, 249)
@@ -169,7 +169,7 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
 
 
-def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(
+def test_the_averaged_spread_excludes_the_imu_error_between_stops(
     stops: list[Sighting],
 ) -> None:
     # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
@@ -180,7 +180,7 @@ def test_the_averaged_spread_does_not_see_an_imu_s_error_between_stops(
     assert low < found.epsilon_pos_m / (np.sqrt(2 / np.pi) * SIGMA_M) < high
 
 
-def test_stops_apart_show_the_geometry_s_own_error_without_noise() -> None:
+def test_different_stops_show_the_geometric_error_without_noise() -> None:
     # Five of AFIT's stops (Table 6) and no noise: what spread is left is eq. 44's on a dome seen from M.
     stops = np.radians(
         [
@@ -210,7 +210,7 @@ def test_stops_apart_show_the_geometry_s_own_error_without_noise() -> None:
     assert spread[True] < spread[False]
 
 
-def test_the_spreads_by_hand() -> None:
+def test_the_spreads_match_a_hand_calculation() -> None:
     value = np.array([1.0, 3, 11, 13, 5, 5, 7])
     group = np.array([0, 0, 0, 0, 2, 2, 1])
     stop = np.array([7, 7, 9, 9, 7, 9, 9])
@@ -241,7 +241,7 @@ def test_the_home_catalog_has_the_dome_s_angles_within_noise(home: HomeCatalog) 
     truth = {led: place for led, place in zip(leds.id, leds.position_m, strict=True)}
     true = angles(unit(np.array([truth[led] for led in home.id])))
     z = (angles(home.vectors) - true) / (np.sqrt(2) * SIGMA_M / R_M / np.sqrt(50))
-    # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The slip adds under .01 of one here.
+    # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The thesis's error adds under .01 of one.
     assert np.abs(z).max() < stats.norm.isf(RARE / 66 / 2)
     # and they are noisy: 21 independent squares (24 coordinates less a turn) or so have a mean near 1.
     assert 0.3 < np.mean(z**2) < 2.5
@@ -255,7 +255,7 @@ def test_the_catalog_is_brightest_first_and_carries_its_samples(home: HomeCatalo
     np.testing.assert_allclose(np.linalg.norm(home.vectors, axis=1), 1, rtol=0, atol=1e-15)
 
 
-def test_the_covariance_is_the_noise_s(home: HomeCatalog) -> None:
+def test_the_covariance_matches_the_noise(home: HomeCatalog) -> None:
     # n - 1 times the sum of 24 sample variances of x and y over sigma^2 is chi-squared with 24 * 49 degrees.
     variances = home.covariance_m2[:, [0, 1], [0, 1]].sum() * 49 / SIGMA_M**2
     assert stats.chi2.ppf(RARE, 24 * 49) < variances < stats.chi2.isf(RARE, 24 * 49)
@@ -263,7 +263,7 @@ def test_the_covariance_is_the_noise_s(home: HomeCatalog) -> None:
     assert home.covariance_m2[:, 2, 2].max() < (0.02 * SIGMA_M) ** 2
 
 
-def test_the_sample_covariance_is_numpy_s_and_none_of_one_sample() -> None:
+def test_the_sample_covariance_matches_numpy_and_is_absent_for_one_sample() -> None:
     lab_m = np.random.default_rng(14).normal(size=(9, 3))
     led = np.array([0, 2, 0, 1, 2, 0, 2, 0, 2])
     covariance = _covariance(lab_m, led)
@@ -302,7 +302,7 @@ def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
     assert len(calibrate(seen, CAMERA, SPHERE, LEVER, home_only=False)) == 12
 
 
-def test_a_camera_mounted_askew_gives_the_same_places() -> None:
+def test_a_camera_mounted_askew_gives_the_same_positions() -> None:
     # cam_from_body turned about the boresight, the pupil aside: mapping back must undo both.
     askew = Lever(np.array([0.004, -0.003, M_M]), Rotation.from_euler("z", 0.7))
     rng = np.random.default_rng(67)
@@ -332,7 +332,7 @@ def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(
     assert (leds.id == home.id).all()
 
 
-def test_the_thesis_s_magnitude_by_hand() -> None:
+def test_the_thesis_s_magnitude_matches_a_hand_calculation() -> None:
     # Areas 60, 80 and 100: the median is 80.
     found = instrument_brightness(np.array([120.0, 100, 20]), np.array([100.0, 80, 60]))
     np.testing.assert_allclose(found, [150, 100, 15], rtol=1e-15, atol=0)
@@ -341,7 +341,7 @@ def test_the_thesis_s_magnitude_by_hand() -> None:
 # ---- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_calibrated_is_refused_in_one_line() -> None:
+def test_unusable_sightings_are_refused_in_one_line() -> None:
     seen = at_home(np.random.default_rng(68), 2)
     twice = replace(seen[0], led=np.full(12, 100))
     short = replace(seen[0], brightness=np.ones(3))

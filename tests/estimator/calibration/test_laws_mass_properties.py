@@ -41,7 +41,7 @@ def drawn_states(rng: np.random.Generator, count: int) -> States:
     mass_dynamics.moved_on,
 )
 @given(rng=SEEDS)
-def test_a_change_of_states_is_found_again(rng: np.random.Generator) -> None:
+def test_a_change_of_states_is_recovered(rng: np.random.Generator) -> None:
     states = drawn_states(rng, 5)
     change = 0.1 * rng.standard_normal((STATE, 5))
     np.testing.assert_allclose(states.moved(change).minus(states), change, rtol=0, atol=1e-12)
@@ -154,7 +154,7 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
 
 @law(mass_properties.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True)
 @given(rng=SEEDS, at=some.integers(2, 24))
-def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
+def test_consider_covariance_is_the_effect_of_attitude_errors(
     rng: np.random.Generator, at: int
 ) -> None:
     """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e.
@@ -193,7 +193,7 @@ def test_what_is_considered_is_what_the_error_of_an_attitude_changes(
     inertia_six,
 )
 @given(rng=SEEDS)
-def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
+def test_an_estimate_is_read_from_its_state_vector(rng: np.random.Generator) -> None:
     half = rng.standard_normal((3, 3))
     values = rng.standard_normal(20)
     values[:6] = inertia_six(half + half.T)
@@ -213,7 +213,7 @@ def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
     slow=True,
 )
 @given(rng=SEEDS)
-def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
+def test_the_covariance_of_a_filter_never_grows(rng: np.random.Generator) -> None:
     assumed, vehicle = prior(SMALL, rng)
     estimates = list(mass_properties.filter_mass(RECORD, vehicle.lab, assumed))
     assert len(estimates) == len(RECORD.t_s) - mass_properties.START - 2
@@ -233,7 +233,7 @@ def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(first.values, estimates[0].values)
 
 
-def test_a_longer_record_is_surer() -> None:
+def test_a_longer_record_has_smaller_errors() -> None:
     assumed, vehicle = prior(SMALL, np.random.default_rng(3))
     short, long = (
         mass_properties.estimate_mass(
@@ -248,7 +248,7 @@ def test_a_longer_record_is_surer() -> None:
 
 @law(mass_dynamics.inverse_inertia, mass_dynamics.momentum_scale)
 @given(rng=SEEDS, factor=some.floats(0.1, 10))
-def test_a_momentum_is_scaled_as_the_inertia(rng: np.random.Generator, factor: float) -> None:
+def test_momentum_scales_with_the_inertia(rng: np.random.Generator, factor: float) -> None:
     """By the assumed over the estimated inertia, whatever the attitudes; the inverse is that of the inertia."""
     assumed, _ = prior(SMALL, rng)
     scaled = np.concatenate([factor * assumed.values[:6], assumed.values[6:]])

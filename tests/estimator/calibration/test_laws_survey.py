@@ -76,7 +76,9 @@ def whole_matrix(terms: ba.NormalEquations) -> Floats:
 
 @law(ba.linearize, ba.residuals, Bundle.apply_step, Sightings.take)
 @given(rng=SEEDS)
-def test_the_rows_are_the_residuals_slopes(rng: np.random.Generator) -> None:
+def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
+    rng: np.random.Generator,
+) -> None:
     true, seen = dome(rng)
     seen = seen.take(rng.permutation(len(seen.led))[:20])
     rows = ba.linearize(true, seen)
@@ -108,7 +110,7 @@ def test_the_rows_are_the_residuals_slopes(rng: np.random.Generator) -> None:
     Bundle.cost,
 )
 @given(rng=SEEDS, damping=some.floats(1e-6, 1), width=some.floats(0.5, 9))
-def test_lights_eliminated_are_the_whole_system_solved(
+def test_eliminating_the_lights_solves_the_whole_system(
     rng: np.random.Generator, damping: float, width: float
 ) -> None:
     true, seen = dome(rng, 0.1)
@@ -140,7 +142,7 @@ def test_lights_eliminated_are_the_whole_system_solved(
     focal_px=some.floats(0, 20),
     list_m=some.floats(1e-4, 0.1),
 )
-def test_what_is_assumed_is_a_measurement_of_its_weight(
+def test_an_assumption_acts_as_a_measurement_of_its_weight(
     rng: np.random.Generator, lever_m: float, focal_px: float, list_m: float
 ) -> None:
     """The right-hand sides are half the cost's falling slope, and the matrix has 1 / sigma^2 more for each value."""
@@ -172,7 +174,7 @@ def test_what_is_assumed_is_a_measurement_of_its_weight(
 
 @law(dome_survey.redundancy, dome_survey.check_redundancy)
 @given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), rows=some.integers(40, FRAMES * LIGHTS))
-def test_redundant_coordinates_are_those_that_the_unknowns_do_not_follow(
+def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     rng: np.random.Generator, list_m: float, rows: int
 ) -> None:
     """By definition: their number less the trace of the hat matrix, which takes pixels to those of the fit."""
@@ -198,7 +200,7 @@ def test_redundant_coordinates_are_those_that_the_unknowns_do_not_follow(
 
 @law(ba.adjust, ba.fit_attitudes, ba.covariance_in_gauge)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
-def test_an_adjustment_comes_to_rest_where_the_pixels_are(
+def test_an_adjustment_converges_to_the_observed_pixels(
     rng: np.random.Generator, by: float
 ) -> None:
     true, seen = dome(rng)
@@ -245,7 +247,7 @@ def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatc
     | some.tuples(some.integers(-1, 15), some.integers(-1, 15), some.floats(0.1, 2)),
     frame=some.none() | some.integers(-1, 7),
 )
-def test_a_gauge_moves_no_pixel(
+def test_a_gauge_freedom_moves_no_pixel(
     rng: np.random.Generator, length: tuple[int, int, float] | None, frame: int | None
 ) -> None:
     true, seen = dome(rng)
@@ -286,7 +288,7 @@ def test_a_gauge_moves_no_pixel(
 
 @law(align_attitudes)
 @given(rng=SEEDS, count=some.integers(3, 12))
-def test_two_turns_between_attitudes_are_found(rng: np.random.Generator, count: int) -> None:
+def test_two_rotations_between_attitudes_are_found(rng: np.random.Generator, count: int) -> None:
     ours = Rotation.random(count, rng=rng)
     left = turn(rng, 0.5)
     right = turn(rng, 3)
@@ -300,7 +302,7 @@ def test_two_turns_between_attitudes_are_found(rng: np.random.Generator, count: 
 
 @law(survey, DomeSurvey.focal_sigma_px, DomeSurvey.surveyed_leds, slow=True)
 @given(rng=SEEDS)
-def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Generator) -> None:
+def test_a_survey_of_a_dome_converges_and_states_its_errors(rng: np.random.Generator) -> None:
     true, _seen = dome(rng, 0.1)
     arm = Lever(true.camera_body_m, Rotation.from_matrix(true.R_cam_from_body))
     leds = LedMap(np.arange(LIGHTS), true.position_m, np.zeros(3), np.full(3, 1.2))
@@ -311,15 +313,15 @@ def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Gener
         frames.append(
             DomeFrame(np.arange(LIGHTS), xy, np.full(LIGHTS, 0.1), turn(rng, 0.01) * truth)
         )
-    told = answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=0.01))
-    assert told is not None
-    assert told.status == "converged"
-    assert 0 < told.focal_sigma_px < 100
-    assert told.surveyed_leds.id.tolist() == np.flatnonzero(told.surveyed).tolist()
+    result = answered(lambda: survey(frames, leds, arm, CAMERA, leds_sigma_m=0.01))
+    assert result is not None
+    assert result.status == "converged"
+    assert 0 < result.focal_sigma_px < 100
+    assert result.surveyed_leds.id.tolist() == np.flatnonzero(result.surveyed).tolist()
     for matrix in (
-        *told.led_covariance_m2[told.surveyed],
-        told.lever_covariance_m2,
-        told.lens_covariance,
+        *result.led_covariance_m2[result.surveyed],
+        result.lever_covariance_m2,
+        result.lens_covariance,
     ):
         assert_covariance(matrix)
 
@@ -387,7 +389,7 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     sigma=NUMBERS | arrays("f8", 5, elements=ANY),
     assumed_m=ANY,
 )
-def test_any_frames_are_a_survey_or_refused(
+def test_any_frames_give_a_survey_or_are_refused(
     rng: np.random.Generator, led: NDArray, xy: Floats, sigma: Floats, assumed_m: float
 ) -> None:
     true, _ = dome(rng)
@@ -417,15 +419,15 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
 @pytest.mark.slow
 @law(star_field.calibrate, star_field.disagreement_px, LensPrior.sigma)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
-def test_star_fields_give_the_lens(rng: np.random.Generator, longer: float) -> None:
+def test_star_fields_determine_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
     sheet = replace(CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5)
-    told = star_field.calibrate(frames, sheet)
-    assert told.report.status == "converged"
-    assert_covariance(told.covariance)
+    result = star_field.calibrate(frames, sheet)
+    assert result.report.status == "converged"
+    assert_covariance(result.covariance)
     assert star_field.disagreement_px(CAMERA, CAMERA) < 1e-9
-    assert star_field.disagreement_px(told.camera, CAMERA) < 0.3
-    assert (told.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
+    assert star_field.disagreement_px(result.camera, CAMERA) < 0.3
+    assert (result.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
     assert (LensPrior().sigma(sheet) > 0).all()
 
 
@@ -435,7 +437,9 @@ def test_star_fields_give_the_lens(rng: np.random.Generator, longer: float) -> N
     sigma=NUMBERS | arrays("f8", 5, elements=ANY),
     vectors=NUMBERS | arrays("f8", (5, 3), elements=ANY),
 )
-def test_any_star_fields_are_a_lens_or_refused(xy: Floats, sigma: Floats, vectors: Floats) -> None:
+def test_any_star_fields_determine_a_lens_or_are_refused(
+    xy: Floats, sigma: Floats, vectors: Floats
+) -> None:
     answered(lambda: star_field.calibrate([StarFrame(xy, sigma, vectors)] * 4, CAMERA))
     with pytest.raises(ValueError, match="no frames"):
         star_field.calibrate([], CAMERA)
@@ -460,17 +464,15 @@ class Namer:
 
 @law(star_field.self_calibrate)
 @given(rng=SEEDS, seen=some.booleans())
-def test_a_camera_calibrates_itself_by_the_stars_that_are_named(
-    rng: np.random.Generator, seen: bool
-) -> None:
+def test_a_camera_is_calibrated_by_identified_stars(rng: np.random.Generator, seen: bool) -> None:
     frames, _ = filmed(rng, 5)
     lights = [
         Centroids(one.xy_px, one.sigma_px, np.arange(1.0, 26.0) + 25 * k)
         for k, one in enumerate(frames)
     ]
     namer = Namer(frames, seen)
-    told = answered(
+    result = answered(
         lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01))
     )
-    assert (told is not None) == seen
-    assert told is None or star_field.disagreement_px(told.camera, CAMERA) < 0.5
+    assert (result is not None) == seen
+    assert result is None or star_field.disagreement_px(result.camera, CAMERA) < 0.5

@@ -34,7 +34,7 @@ from tests.helpers.surveyed_dome import attitudes, model, pixels
     slow=True,
 )
 @given(rng=SEEDS, factor=some.floats(0.1, 10))
-def test_errors_grow_with_noise_and_list_and_shrink_with_frames(
+def test_predicted_errors_grow_with_noise_and_list_errors_and_shrink_with_frames(
     rng: np.random.Generator, factor: float
 ) -> None:
     assumed = model(50)
@@ -59,7 +59,7 @@ def test_errors_grow_with_noise_and_list_and_shrink_with_frames(
 
 @law(survey_plan.choose)
 @given(rng=SEEDS, count=some.integers(1, 12))
-def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: int) -> None:
+def test_a_longer_plan_extends_a_shorter_one(rng: np.random.Generator, count: int) -> None:
     assumed = model(80)
     candidates = attitudes(rng, 60)
     shown = assumed.visible(candidates)
@@ -97,7 +97,7 @@ def test_rays_from_a_circle_cross_at_its_half_angle(
 
 @law(HeldFrames.shown, HeldFrames.rays)
 @given(rng=SEEDS)
-def test_rays_of_pixels_lead_to_the_leds(rng: np.random.Generator) -> None:
+def test_rays_of_pixels_pass_through_the_leds(rng: np.random.Generator) -> None:
     assumed = model(60)
     held = attitudes(rng, 6)
     frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
@@ -117,7 +117,7 @@ def test_rays_of_pixels_lead_to_the_leds(rng: np.random.Generator) -> None:
 
 @law(survey_faults.dark)
 @given(rng=SEEDS)
-def test_what_was_seen_or_rarely_shown_is_not_dark(rng: np.random.Generator) -> None:
+def test_an_led_seen_or_rarely_in_view_is_not_called_dark(rng: np.random.Generator) -> None:
     shown = rng.random((30, 40)) < rng.random()
     seen = shown & (rng.random((30, 40)) < 0.99)
     seen[:, :2] = False
@@ -146,7 +146,7 @@ def test_an_led_far_from_the_list_is_displaced(
 
 @law(survey_faults.stray_lights)
 @given(rng=SEEDS)
-def test_a_light_at_rest_is_found_and_a_pixel_s_fault_is_not(rng: np.random.Generator) -> None:
+def test_a_stationary_light_is_found_and_a_defective_pixel_is_not(rng: np.random.Generator) -> None:
     assumed = model(60)
     held = attitudes(rng, 40)
     frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
@@ -163,7 +163,9 @@ def test_a_light_at_rest_is_found_and_a_pixel_s_fault_is_not(rng: np.random.Gene
 
 @law(survey_faults.name_strays)
 @given(rng=SEEDS, count=some.integers(0, 5))
-def test_strays_are_named_by_the_nearest_places(rng: np.random.Generator, count: int) -> None:
+def test_stray_lights_are_named_by_the_nearest_positions(
+    rng: np.random.Generator, count: int
+) -> None:
     listed = 10 * rng.normal(0, 1, (8, 3))
     chosen = rng.permutation(8)[:count]
     strays = [StrayLight(listed[k] + 0.001 * rng.normal(0, 1, 3), 3) for k in chosen]
@@ -191,7 +193,7 @@ def close_group(
 
 @law(survey_faults.names)
 @given(rng=SEEDS)
-def test_of_equal_leds_the_names_are_the_nearest_of_all_orders(rng: np.random.Generator) -> None:
+def test_equal_leds_get_the_assignment_of_least_distance(rng: np.random.Generator) -> None:
     """The oracle tries all 24 orders of four LEDs that the list may have in any."""
     listed, place_m, covariance, table = close_group(rng, np.ones(60))
     listed[:4] = place_m[:4] + 3 * LIST_M * rng.normal(0, 1, (4, 3))
@@ -210,7 +212,7 @@ def test_of_equal_leds_the_names_are_the_nearest_of_all_orders(rng: np.random.Ge
 
 @law(survey_faults.names)
 @given(rng=SEEDS)
-def test_light_names_leds_that_the_list_has_in_the_wrong_order(rng: np.random.Generator) -> None:
+def test_brightness_identifies_leds_exchanged_in_the_list(rng: np.random.Generator) -> None:
     """Of neighbors the light decides; of LEDs farther apart the place, and an exchange is reported."""
     levels = np.exp(np.linspace(0, -30, 60))
     listed, place_m, covariance, table = close_group(rng, levels)
@@ -271,7 +273,9 @@ def test_exchanged_lights_are_named_whatever_the_gain(
 
 @law(Gauge.is_map)
 @given(rng=SEEDS)
-def test_a_gauge_is_the_map_s_unless_a_length_or_a_frame_is_given(rng: np.random.Generator) -> None:
+def test_the_gauge_follows_the_map_unless_a_length_or_a_frame_is_given(
+    rng: np.random.Generator,
+) -> None:
     place_m = rng.normal(0, 1, (4, 3))
     held = attitudes(rng, 2).as_matrix()
     assert Gauge(None, None, place_m, held).is_map

@@ -131,7 +131,7 @@ def test_wrong_tracker_covariance_is_found_from_the_misfit(factor: float) -> Non
 
 
 @pytest.mark.slow
-def test_filter_in_flight_ends_where_the_batch_does() -> None:
+def test_the_filter_ends_at_the_batch_solution() -> None:
     for one, lab, _, batch in draws(3, 2):
         rng = np.random.default_rng(5)
         *_, last = filter_mass(one, lab, prior(SMALL, rng)[0])
@@ -139,7 +139,7 @@ def test_filter_in_flight_ends_where_the_batch_does() -> None:
         np.testing.assert_allclose(last.sigma[NINE], batch.sigma[NINE], rtol=0.25)
 
 
-def test_free_swing_tells_only_the_ratio_of_inertia_and_offset() -> None:
+def test_a_free_swing_determines_only_the_ratio_of_inertia_and_offset() -> None:
     """Without wheels the equations are homogeneous in J and m r: their common scale stays as uncertain as assumed."""
     rng = np.random.default_rng(8)
     vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
@@ -154,7 +154,7 @@ def test_free_swing_tells_only_the_ratio_of_inertia_and_offset() -> None:
 
 
 @pytest.mark.slow
-def test_the_scale_of_free_swings_is_not_drawn_to_small_inertias() -> None:
+def test_the_scale_of_free_swings_is_not_biased_to_small_inertias() -> None:
     """Errors of the common scale over 16 draws in the claimed standard deviations: mean 0, mean square 1.
 
     With a random torque in place of an acceleration a smaller scale explains every motion by smaller torques: the mean
@@ -220,7 +220,7 @@ def shared_errors(attitudes: Rotation, sigma_rad: float, rng: np.random.Generato
 
 
 @pytest.mark.slow
-def test_errors_that_attitudes_share_are_in_the_covariance() -> None:
+def test_errors_common_to_all_attitudes_are_in_the_covariance() -> None:
     """Shared errors five times as large as the noise: of 12 draws the sum of 9 NEES each is as claimed.
 
     Without their part the covariance claims too little.

@@ -29,7 +29,7 @@ from skysim.core import images
 from skysim.core.files import ROOT
 from skysim.sources import star_archives
 
-# SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.
+# SHEFEX-2's chip behind an uncalibrated 25 mm lens, and what its data sheet says: 1.5 % off, no distortion.
 TRUE = Camera(659, 493, 2520.0, (336.5, 241.0), (-0.11, 0.35, 8e-4, -6e-4, -1.5))
 SHEET = Camera(659, 493, 2520.0 * 1.015, (329.0, 246.0))
 # 60 degrees across, with a barrel of 40 px in the corners.
@@ -83,7 +83,7 @@ def lens(camera: Camera) -> np.ndarray:
 @pytest.mark.parametrize(
     ("true", "sheet"), [(TRUE, SHEET), (WIDE, WIDE_SHEET)], ids=["15 deg", "60 deg"]
 )
-def test_without_noise_the_lens_is_found(true: Camera, sheet: Camera) -> None:
+def test_without_noise_the_lens_is_recovered(true: Camera, sheet: Camera) -> None:
     field = drawn(np.random.default_rng(90), true, noise_px=1e-6)
     found = calibrate([replace(one, xy_px=one.xy_px) for one in field.frames], sheet)
     assert found.report.status == "converged"
@@ -93,7 +93,7 @@ def test_without_noise_the_lens_is_found(true: Camera, sheet: Camera) -> None:
     assert (found.report.cam_from_ref * field.cam_from_ref.inv()).magnitude().max() < 1e-6
 
 
-def test_it_is_scipy_s_least_squares_and_its_covariance() -> None:
+def test_the_calibration_matches_scipy_s_least_squares_and_covariance() -> None:
     # The same cost, by finite differences of Camera.pixels, over all 8 + 3 F unknowns at once.
     field = drawn(np.random.default_rng(91), WIDE, frames=5)
     found = calibrate(field.frames, WIDE_SHEET)
@@ -103,14 +103,14 @@ def test_it_is_scipy_s_least_squares_and_its_covariance() -> None:
     scale = np.array([1.0, 1, 1, 1e-2, 1e-2, 1e-3, 1e-3, 1e-2])
 
     def residual(p: np.ndarray) -> np.ndarray:
-        told = start + scale * p[:8]
-        camera = Camera(659, 493, told[0], (told[1], told[2]), tuple(told[3:]))
+        lens = start + scale * p[:8]
+        camera = Camera(659, 493, lens[0], (lens[1], lens[2]), tuple(lens[3:]))
         turned = Rotation.from_rotvec(1e-3 * p[8:].reshape(-1, 3)) * found.report.cam_from_ref
         pixels = [
             (camera.pixels(turned[k].apply(one.vectors_ref)) - one.xy_px) / NOISE_PX
             for k, one in enumerate(field.frames)
         ]
-        return np.concatenate([np.ravel(pixels), (told - believed) / sigma])
+        return np.concatenate([np.ravel(pixels), (lens - believed) / sigma])
 
     oracle = least_squares(
         residual, np.zeros(8 + 15), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14
@@ -143,7 +143,7 @@ def rms(values: list[float]) -> float:
 
 
 @pytest.mark.long
-def test_twenty_frames_give_the_field_to_a_fiftieth_of_a_pixel(
+def test_twenty_frames_calibrate_the_field_to_a_fiftieth_of_a_pixel(
     clean: list[tuple[Field, Calibration]],
 ) -> None:
     off = [disagreement_px(TRUE, found.camera) for _, found in clean]
@@ -154,7 +154,9 @@ def test_twenty_frames_give_the_field_to_a_fiftieth_of_a_pixel(
 
 
 @pytest.mark.long
-def test_the_lens_s_covariance_is_true(clean: list[tuple[Field, Calibration]]) -> None:
+def test_the_covariance_of_the_lens_matches_its_errors(
+    clean: list[tuple[Field, Calibration]],
+) -> None:
     nees = []
     for _, found in clean:
         error = lens(found.camera) - lens(TRUE)
@@ -164,7 +166,7 @@ def test_the_lens_s_covariance_is_true(clean: list[tuple[Field, Calibration]]) -
 
 
 @pytest.mark.slow
-def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
+def test_the_covariance_of_the_attitudes_includes_the_lens_errors(
     clean: list[tuple[Field, Calibration]],
 ) -> None:
     # One frame a run: those of one run share the lens's error. Without that the spread would be far too small.
@@ -181,7 +183,7 @@ def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
 
 
 @pytest.mark.slow
-def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibration]]) -> None:
+def test_the_misfit_is_one_for_correct_sigmas(clean: list[tuple[Field, Calibration]]) -> None:
     freedom = 800 - 60 - 8
     misfit2 = np.array([found.report.misfit for _, found in clean]) ** 2
     assert (
@@ -193,7 +195,7 @@ def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibratio
 
 
 @pytest.mark.long
-def test_five_in_a_hundred_wrong_names_cost_nearly_nothing() -> None:
+def test_five_percent_wrong_names_cost_little_accuracy() -> None:
     off = []
     missed = 0
     lost = 0
@@ -234,7 +236,7 @@ def test_half_a_field_of_wrong_frames_is_left_out() -> None:
 # ---- Bad input ----
 
 
-def test_bad_frames_are_one_clear_line() -> None:
+def test_bad_frames_are_refused_in_one_line() -> None:
     good = drawn(np.random.default_rng(96), frames=1).frames[0]
     lacking = drawn(np.random.default_rng(96), frames=3, stars=4).frames
     spoiled = [
@@ -262,7 +264,7 @@ def test_a_wrong_focal_length_disagrees_by_its_share_of_the_distance_from_the_ce
     assert disagreement_px(camera, camera.zoomed(1.001)) == pytest.approx(expected, rel=0.06)
 
 
-def test_a_moved_principal_point_is_next_to_a_turn() -> None:
+def test_a_moved_principal_point_is_nearly_a_rotation() -> None:
     camera = Camera(800, 600, 3000.0, (399.5, 299.5))
     moved = replace(camera, center_px=(409.5, 299.5))
     # 10 px times the squared half field, 0.13^2, at most.
@@ -276,7 +278,7 @@ def test_a_moved_principal_point_is_next_to_a_turn() -> None:
 def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
     rng = np.random.default_rng(97)
     errors = []
-    told = []
+    claimed = []
     for _ in range(200):
         v_mag = rng.uniform(1, 6, 60)
         color = 0.3 * rng.normal(size=60)
@@ -286,9 +288,9 @@ def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
         instrumental[rng.random(400) < 0.05] += 3.0  # blends, wrong names
         zero = magnitude_zero(instrumental, v_mag[star], vectors[star])
         errors.append(zero.offset_mag - 12.3)
-        told.append((zero.sigma_mag, zero.scatter_mag))
+        claimed.append((zero.sigma_mag, zero.scatter_mag))
         assert zero.stars == len(np.unique(star))
-    sigma, scatter = np.mean(told, axis=0)
+    sigma, scatter = np.mean(claimed, axis=0)
     assert scatter == pytest.approx(0.3, rel=0.05)
     # The deviation of 200 draws is known to 5 %; three of them.
     assert np.std(errors) == pytest.approx(sigma, rel=0.15)
@@ -361,7 +363,7 @@ def test_no_frame_identified_is_refused() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("factor", [0.96, 1.02])
-def test_from_centroids_of_the_real_sky_alone(factor: float) -> None:
+def test_centroids_of_the_real_sky_alone_calibrate_the_camera(factor: float) -> None:
     # Twenty frames to V = 6.2 with three false stars each; the focal length is known to 5 %, the lens not at all.
     stars = catalog.read(ROOT / "data" / "catalogs" / "hipparcos_hp6.5.ecsv")
     rng = np.random.default_rng(99)

@@ -95,7 +95,7 @@ def simulated(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_factor", [1.0, 3.0])
-def test_surveys_err_by_what_is_predicted(sigma_factor: float) -> None:
+def test_surveys_have_the_predicted_errors(sigma_factor: float) -> None:
     """Within 20 %, whatever noise is believed. The focal length has one error a survey: 9 % of chance with 60."""
     true, held = planned(LEDS, FRAMES)
     predicted = survey_plan.predict(true, held, true.visible(held))
@@ -127,7 +127,7 @@ def test_surveys_err_by_what_is_predicted(sigma_factor: float) -> None:
 
 
 @pytest.mark.slow
-def test_few_frames_err_less_by_what_is_assumed() -> None:
+def test_with_few_frames_prior_assumptions_reduce_the_error() -> None:
     """Eight frames determine the focal length to 0.3 %, and to a seventh less with the lever and the focal length that
     are known to 5 mm and 1 % before. The survey errs by what is predicted."""
     true, held = planned(LEDS, 8)
@@ -171,7 +171,7 @@ def test_a_plan_needs_a_third_of_the_frames_of_random_attitudes() -> None:
 
 
 @pytest.mark.slow
-def test_a_plan_goes_on_from_the_frames_that_are_held() -> None:
+def test_a_plan_continues_from_the_frames_at_hand() -> None:
     """Of the same candidates the next choices are of LEDs that the first half of the dome does not show."""
     true = model(200)
     candidates = attitudes(np.random.default_rng(4), 300)
@@ -222,7 +222,7 @@ def test_a_plan_with_a_short_lever_still_connects_its_attitudes(arm_m: float, le
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
-def test_one_wrong_light_of_a_hundred_does_not_lead_a_survey_astray(seed: int) -> None:
+def test_one_wrong_light_in_a_hundred_does_not_bias_a_survey(seed: int) -> None:
     """A light 80 px off, as a neighbor of the LED that it is taken for, is as far off as four errors of the list.
 
     Weighted by the noise of 0.02 px alone, it would be fitted by a lever 90 mm off, and the right ones be rejected.
@@ -267,7 +267,7 @@ def test_a_dome_without_a_fault_gives_few_alarms() -> None:
 
 
 @pytest.mark.slow
-def test_exchanges_are_not_invented() -> None:
+def test_leds_in_the_right_order_are_not_reported_as_exchanged() -> None:
     """LEDs that scatter by 8 % in four levels, 300 surveys of 100 of them: none."""
     rng = np.random.default_rng(6)
     alarms = 0
@@ -292,7 +292,7 @@ def test_a_dead_led_among_many_is_found_by_four_frames() -> None:
     assert survey_faults.dark(shown, seen).tolist() == [17, 401]
 
 
-def test_codes_tell_exchanged_leds_of_one_brightness() -> None:
+def test_codes_reveal_exchanged_leds_of_equal_brightness() -> None:
     """Words of on and off that differ in half of the frames; two pairs at once, and a cycle of three."""
     rng = np.random.default_rng(8)
     words = rng.integers(0, 2, (60, 30)).T.astype(float)
@@ -310,5 +310,5 @@ def test_codes_tell_exchanged_leds_of_one_brightness() -> None:
     assert observable > 0.8
 
 
-def test_the_median_of_a_chi_square_is_the_one_used() -> None:
+def test_the_median_of_chi_square_matches_scipy() -> None:
     assert pytest.approx(chi2.median(3), abs=1e-3) == survey_faults.CHI2_MEDIAN

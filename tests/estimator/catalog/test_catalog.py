@@ -67,7 +67,7 @@ def oracle() -> SkyCoord:
 
 @pytest.mark.filterwarnings("ignore:ERFA function")  # negative parallaxes, set aside below
 @pytest.mark.parametrize("date", DATES)
-def test_apparent_places_are_skycoord_s(
+def test_apparent_places_match_skycoord(
     stars: StarCatalog, oracle: SkyCoord, date: datetime.datetime
 ) -> None:
     with (
@@ -132,7 +132,7 @@ def test_proper_motion_in_right_ascension_is_along_the_parallel() -> None:
     np.testing.assert_allclose(moved, [[0, ARCSEC_RAD, 0]], rtol=0, atol=1e-10)
 
 
-def test_parallax_leans_toward_the_sun() -> None:
+def test_parallax_shifts_stars_toward_the_sun() -> None:
     # A star at right angles to the Earth's place p shifts by the parallax toward -p.
     still = np.zeros(3)
     star = made_up((1, 90, 0, 0, 0, 750, 5))
@@ -147,7 +147,7 @@ def test_parallax_leans_toward_the_sun() -> None:
 @pytest.mark.parametrize(
     ("elongation_deg", "bent_mas"), [(90, 4.07), (45, 9.83), (10, 46.5), (180, 0)]
 )
-def test_the_sun_bends_light_away_by_the_textbook_s_amounts(
+def test_the_sun_deflects_light_by_the_textbook_s_angles(
     elongation_deg: float, bent_mas: float
 ) -> None:
     # 4.07 mas cot(psi / 2) at 1 au (Will 2014; IERS Conventions 2010, chapter 11). The Sun is toward -x.
@@ -157,7 +157,7 @@ def test_the_sun_bends_light_away_by_the_textbook_s_amounts(
     assert turned / MAS_RAD == pytest.approx(bent_mas, abs=0.05)
 
 
-def test_naive_and_zoned_times_are_one() -> None:
+def test_naive_times_are_utc_like_zoned_ones() -> None:
     zone = datetime.timezone(datetime.timedelta(hours=-3))
     naive = catalog.on_earth(datetime.datetime(2024, 5, 6, 15))
     zoned = catalog.on_earth(datetime.datetime(2024, 5, 6, 12, tzinfo=zone))
@@ -187,7 +187,7 @@ def test_two_equal_stars_ten_arcseconds_apart_merge_half_way_and_0_753_brighter(
     assert one.parallax_rad[0] / MAS_RAD == pytest.approx(12, abs=1e-9)
 
 
-def test_the_center_of_light_leans_toward_the_brighter_star() -> None:
+def test_the_center_of_light_is_nearer_to_the_brighter_star() -> None:
     # A magnitude of 2.5 is a tenth of the light: the middle stands 1/11 of the way from the bright one.
     pair = made_up((1, 50, 0, 0, 0, 0, 4.0), (2, 50, 11 / 3600, 0, 0, 0, 6.5))
     one = catalog.merge_doubles(pair, 20 * ARCSEC_RAD)
@@ -196,7 +196,7 @@ def test_the_center_of_light_leans_toward_the_brighter_star() -> None:
     assert one.v_mag[0] == pytest.approx(4 - 2.5 * np.log10(1.1), abs=1e-12)
 
 
-def test_a_chain_of_close_stars_is_one_and_a_star_farther_off_stays() -> None:
+def test_a_chain_of_close_stars_merges_and_a_distant_star_does_not() -> None:
     chain = [(k, 50, k * 9 / 3600, 0, 0, 0, 5.0) for k in range(4)]
     merged = catalog.merge_doubles(
         made_up(*chain, (9, 50, -11 / 3600, 0, 0, 0, 3.0)), 10 * ARCSEC_RAD
@@ -250,7 +250,7 @@ def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
     )
 
 
-def test_a_file_parted_by_blanks_is_read_too(tmp_path: Path) -> None:
+def test_a_file_separated_by_blanks_is_read(tmp_path: Path) -> None:
     path = tmp_path / "blanks.ecsv"
     path.write_bytes(
         b"# %ECSV 1.0\n"
@@ -274,7 +274,7 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_what_is_no_catalog_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+def test_an_invalid_catalog_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(UNREADABLE[name])
     with pytest.raises(
@@ -305,6 +305,6 @@ def test_stars_move_from_the_epoch_of_their_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [".", "no_such_file.ecsv"])
-def test_what_is_no_file_is_refused_alike(tmp_path: Path, name: str) -> None:
+def test_a_missing_file_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(ImageError, match="not a star catalog"):
         catalog.read(tmp_path / name)

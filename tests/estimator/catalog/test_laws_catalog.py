@@ -60,7 +60,7 @@ def test_stars_move_across_the_sky_and_no_farther_than_they_can(
 
 @law(catalog.on_earth)
 @given(some.datetimes(datetime.datetime(1900, 1, 1), datetime.datetime(2100, 1, 1)))
-def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.datetime) -> None:
+def test_the_earth_is_one_au_from_the_sun_and_moves_at_30_km_s(utc: datetime.datetime) -> None:
     there = catalog.on_earth(utc)
     assert 0.97 < np.linalg.norm(there.position_au) < 1.03
     assert 29e3 < np.linalg.norm(there.velocity_m_s) < 30.6e3
@@ -76,7 +76,7 @@ def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.d
     published_catalogs.asymmetric,
 )
 @given(rng=SEEDS, limit=some.floats(-2, 7), wanted=some.floats(0, 1e3))
-def test_a_catalog_s_subset_is_what_was_asked_for(
+def test_a_subset_of_a_catalog_holds_the_requested_stars(
     rng: np.random.Generator, limit: float, wanted: float
 ) -> None:
     stars = drawn(rng)
@@ -94,7 +94,7 @@ def test_a_catalog_s_subset_is_what_was_asked_for(
 
 @law(published_catalogs.thin, published_catalogs.uniform)
 @given(rng=SEEDS, apart_rad=some.floats(0.01, 1), count=some.integers(-1, 70))
-def test_spread_stars_are_apart_and_none_is_left_out_for_nothing(
+def test_spread_stars_are_apart_and_none_is_left_out_needlessly(
     rng: np.random.Generator, apart_rad: float, count: int
 ) -> None:
     stars = drawn(rng)
@@ -109,7 +109,7 @@ def test_spread_stars_are_apart_and_none_is_left_out_for_nothing(
 
 @law(published_catalogs.chosen, slow=True)
 @given(rng=SEEDS)
-def test_the_flown_catalog_has_its_number_or_is_refused(rng: np.random.Generator) -> None:
+def test_the_flown_catalog_has_the_requested_number_or_is_refused(rng: np.random.Generator) -> None:
     many = replace(drawn(rng, 2600), v_mag=np.linspace(4, 5.2, 2600))
     assert abs(len(published_catalogs.chosen(many)) - published_catalogs.COUNT) <= 3
     with pytest.raises(ImageError, match="2023 of"):
@@ -127,9 +127,9 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     assert (np.bincount(groups)[groups[alone]] == 1).all() or near_rad < 1e-6
     _, mag = catalog.light_centers(stars.vectors, stars.v_mag, groups)
     merged = catalog.merge_doubles(stars, near_rad)
-    for told in (mag, merged.v_mag):
+    for magnitudes in (mag, merged.v_mag):
         np.testing.assert_allclose(
-            np.sum(10 ** (-0.4 * told)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
+            np.sum(10 ** (-0.4 * magnitudes)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
         )
     assert set(merged.id) <= set(stars.id)
     assert (np.diff(merged.v_mag) >= 0).all()
@@ -143,7 +143,7 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     ),
     rng=SEEDS,
 )
-def test_any_table_is_a_catalog_or_is_none(
+def test_any_table_is_a_catalog_or_is_refused(
     tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]], rng: np.random.Generator
 ) -> None:
     path = tmp_path_factory.mktemp("catalog") / "x.ecsv"
@@ -169,13 +169,16 @@ def test_a_prepared_catalog_counts_every_star(
     raw = published_catalogs.OnBoard(
         stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0
     )
-    told = published_catalogs.proc_cat(raw, near_rad)
-    assert told.components.sum() == len(stars)
-    assert (np.diff(told.magnitude) >= 0).all()
-    edges, count = published_catalogs.histogram(told.magnitude, step_mag)
-    assert count.sum() == len(told)
-    assert edges[0] <= told.magnitude[0] + 1e-6 and told.magnitude[-1] < edges[-1] + step_mag  # noqa: PT018
-    assert len(published_catalogs.log(told, step_mag).splitlines()) == 6 + len(count) + len(told)
+    prepared = published_catalogs.proc_cat(raw, near_rad)
+    assert prepared.components.sum() == len(stars)
+    assert (np.diff(prepared.magnitude) >= 0).all()
+    edges, count = published_catalogs.histogram(prepared.magnitude, step_mag)
+    assert count.sum() == len(prepared)
+    assert edges[0] <= prepared.magnitude[0] + 1e-6
+    assert prepared.magnitude[-1] < edges[-1] + step_mag
+    assert len(published_catalogs.log(prepared, step_mag).splitlines()) == 6 + len(count) + len(
+        prepared
+    )
 
 
 # Indexes
@@ -191,14 +194,17 @@ def test_a_prepared_catalog_counts_every_star(
     SkyIndex.bytes,
 )
 @given(rng=SEEDS, most_rad=some.floats(0.3, 3.2), count=some.integers(8, 50))
-def test_three_indexes_hold_the_pairs_that_there_are(
+def test_all_three_indexes_hold_the_existing_pairs(
     rng: np.random.Generator, most_rad: float, count: int
 ) -> None:
     vectors = units(rng, count)
     mag = np.sort(rng.uniform(0, 6, count))
     every = apart(vectors, vectors)[np.triu_indices(count, 1)]
     pairs = int(np.count_nonzero(every <= most_rad))
-    for build in (pair_index.build, lambda *told: sky_index.build(told[0], mag, told[1])):
+    for build in (
+        pair_index.build,
+        lambda *arguments: sky_index.build(arguments[0], mag, arguments[1]),
+    ):
         made = answered(lambda: build(vectors, most_rad), ImageError)  # noqa: B023
         assert (len(made.pair) if made else 0) == (pairs if pairs >= 3 else 0)
     if made:  # the sky index: every pair once, in the bin of its angle
@@ -246,7 +252,7 @@ def test_the_shipped_catalog_is_brightest_first() -> None:
 
 
 @given(place=ANY, last=some.integers(0, 1000))
-def test_a_place_s_cell_is_the_nearest_there_is(place: float, last: int) -> None:
+def test_a_position_s_cell_is_the_nearest_one(place: float, last: int) -> None:
     """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
     expected = 0 if np.isnan(place) else min(max(place, 0), last)
     assert sky_index.cell_of(float(place), last) == int(expected)

@@ -25,7 +25,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @law(refraction.raised, refraction.lowered, SiteAir.seen, SiteAir.without_air)
 @given(rng=SEEDS, pressure_hpa=some.floats(300, 1100), temperature_c=some.floats(-60, 45))
-def test_what_is_raised_is_lowered_again(
+def test_lowering_undoes_the_raising_by_refraction(
     rng: np.random.Generator, pressure_hpa: float, temperature_c: float
 ) -> None:
     constants = refraction.refraction_constants(pressure_hpa, temperature_c, 6e-7)
@@ -55,7 +55,7 @@ def test_what_is_raised_is_lowered_again(
 
 @law(refraction.refraction_constants)
 @given(some.floats(500, 1060), some.floats(-20, 30), some.floats(4.5e-7, 1e-6))
-def test_refraction_is_erfa_s(
+def test_refraction_matches_erfa(
     pressure_hpa: float, temperature_c: float, wavelength_m: float
 ) -> None:
     """SOFA's A and B, of dry air: within 0.2" down to 15 degrees."""
@@ -68,7 +68,7 @@ def test_refraction_is_erfa_s(
 
 @law(refraction.zenith_icrs, SiteAir.zenith)
 @given(DATES, some.floats(-90, 90), some.floats(-180, 180), some.floats(-1e5, 1e5))
-def test_the_zenith_is_erfa_s(
+def test_the_zenith_matches_erfa(
     utc: datetime.datetime, latitude: float, longitude: float, t_s: float
 ) -> None:
     """By precession and nutation of IAU 2006/2000A and the Earth rotation angle, of UTC for UT1 in both."""

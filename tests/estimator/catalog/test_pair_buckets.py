@@ -138,7 +138,7 @@ def test_pairs_are_limited_by_magnitude_and_angle(crowd: Floats) -> None:
     np.testing.assert_array_equal(names(known.pair), names(pair[in_range]))
 
 
-def test_what_gives_no_catalog_is_refused(crowd: Floats) -> None:
+def test_settings_that_leave_no_catalog_are_refused(crowd: Floats) -> None:
     with pytest.raises(PLAIN.ImageError, match=r"no pair of stars from 20\.000 to 30\.000 deg"):
         build_pair_catalog(crowd, np.zeros(500), range_rad=(np.radians(20), np.radians(30)))
     with pytest.raises(PLAIN.ImageError, match="bucket width 0 rad; allowed: more than 0"):

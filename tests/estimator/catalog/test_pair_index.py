@@ -31,7 +31,7 @@ def sky() -> pair_index.PairIndex:
     return pair_index.build(uniform_sky(600, seed=30), np.radians(18.0))
 
 
-def test_the_pairs_are_those_of_brute_force(sky: pair_index.PairIndex) -> None:
+def test_the_pairs_match_brute_force(sky: pair_index.PairIndex) -> None:
     every = angles(sky.vectors)
     i, j = np.nonzero(np.triu(every <= np.radians(18.0), 1))
     wanted = sorted(zip(i.tolist(), j.tolist(), strict=True))
@@ -77,7 +77,7 @@ ANY_ANGLE = st.floats(0, 1, allow_subnormal=False) | SIXTY_FOURTHS
 @pytest.mark.long
 @settings(max_examples=400, deadline=None, derandomize=True)
 @given(st.lists(ANY_ANGLE, min_size=3, max_size=40).map(sorted), ANY_ANGLE, ANY_ANGLE)
-def test_the_k_vector_never_misses_and_takes_in_little(
+def test_the_k_vector_misses_no_pair_and_adds_few(
     given_rad: list, one: float, other: float
 ) -> None:
     low = min(one, other)
@@ -101,7 +101,7 @@ def test_an_angle_on_a_node_of_the_line_is_found() -> None:
     assert pair_index.pair_range(known, 0.4, 0.5)[1] >= 2
 
 
-def test_a_range_of_the_real_index_is_brute_force_s_with_a_few_more(
+def test_a_range_of_the_real_index_holds_brute_force_s_pairs_and_few_more(
     sky: pair_index.PairIndex,
 ) -> None:
     rng = np.random.default_rng(32)
@@ -122,7 +122,7 @@ def test_ranges_off_either_end_are_empty_or_all(sky: pair_index.PairIndex) -> No
     assert pair_index.pair_range(sky, -1.0, 2.0) == (0, count)
 
 
-def test_the_count_of_pairs_is_geometry_s() -> None:
+def test_the_number_of_pairs_follows_from_the_solid_angle() -> None:
     # A uniform sky of N stars has N (N - 1) / 2 (1 - cos theta) / 2 pairs closer than theta, Poisson nearly.
     known = pair_index.build(uniform_sky(2000, seed=33), np.radians(10.0))
     expected = 2000 * 1999 / 2 * (1 - np.cos(np.radians(10))) / 2
@@ -130,7 +130,7 @@ def test_the_count_of_pairs_is_geometry_s() -> None:
 
 
 @pytest.mark.parametrize("theta_deg", [3.0, 6.0, 9.0])
-def test_the_candidates_of_one_angle_are_reference_s_f2(theta_deg: float) -> None:
+def test_the_candidates_of_one_angle_match_reference_f2(theta_deg: float) -> None:
     # Reference section 4: f2 = N (N - 1) / 2 sin(theta) sin(eps).
     known = pair_index.build(uniform_sky(2000, seed=34), np.radians(10.0))
     eps = np.radians(0.1)
@@ -158,7 +158,7 @@ def test_a_sky_without_patterns_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_range_of_magnitudes_is_brute_force_s() -> None:
+def test_a_range_of_magnitudes_matches_brute_force() -> None:
     rng = np.random.default_rng(35)
     magnitude = np.sort(np.round(rng.uniform(0, 6, 300), 1))  # many are equal
     known = pair_index.build(uniform_sky(300, seed=36), np.radians(20.0), magnitude=magnitude)
@@ -168,7 +168,7 @@ def test_a_range_of_magnitudes_is_brute_force_s() -> None:
         assert list(range(begin, end)) == inside.tolist()
 
 
-def test_without_magnitudes_or_a_gate_all_stars_are_alike(sky: pair_index.PairIndex) -> None:
+def test_without_magnitudes_or_a_gate_no_star_is_excluded(sky: pair_index.PairIndex) -> None:
     known = pair_index.build(
         uniform_sky(50, seed=37), np.radians(60.0), magnitude=np.linspace(0, 5, 50)
     )

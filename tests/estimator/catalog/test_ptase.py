@@ -47,7 +47,7 @@ def test_the_file_s_order_stays_until_the_catalog_is_processed() -> None:
     assert np.all(np.diff(proc_cat(raw, 60 * ARCSEC_RAD).magnitude) >= 0)
 
 
-def test_the_mission_s_epoch_is_erfa_s_space_motion() -> None:
+def test_the_mission_s_epoch_matches_erfa_s_space_motion() -> None:
     raw = read_cat(FILE, 4.0, 2010.0)
     still = read_cat(FILE, 4.0)
     rows = [line.split(",") for line in FILE.read_text().splitlines() if line[:1].isdigit()]
@@ -84,10 +84,10 @@ def test_a_double_is_one_star_of_all_the_light_at_its_center() -> None:
     assert one.components.tolist() == [2, 1]
     assert one.magnitude[0] == pytest.approx(5 - 2.5 * np.log10(1.1), abs=1e-12)
     ra = np.arctan2(one.vectors[0, 1], one.vectors[0, 0])
-    assert ra / ARCSEC_RAD == pytest.approx(100, abs=1e-4)  # the chord's slip, 1e-7 of it
+    assert ra / ARCSEC_RAD == pytest.approx(100, abs=1e-4)  # a chord instead of an arc: 1e-7 of it
 
 
-def test_merging_keeps_the_light_and_the_stars_and_parts_the_rest() -> None:
+def test_merging_keeps_light_and_star_count_and_leaves_the_rest_apart() -> None:
     raw = read_cat(FILE, 6.5, 2010.0)
     merged = proc_cat(raw, 120 * ARCSEC_RAD)
     light, all_light = (np.sum(10 ** (-0.4 * stars.magnitude)) for stars in (merged, raw))
@@ -127,7 +127,7 @@ def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
     assert sum(counts) == 3
 
 
-def test_what_is_no_catalog_and_a_limit_without_stars_are_refused(tmp_path: Path) -> None:
+def test_an_invalid_catalog_and_a_limit_without_stars_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "no_colors.ecsv"
     path.write_text(HEADER.replace(",b_v,v_i", "") + "1,0,0,0,0,0,4\n")
     assert len(read_cat(path, 6.0)) == 1

@@ -82,7 +82,7 @@ def test_the_hemispheres_have_their_own_limits(stars: StarCatalog) -> None:
 
 
 @pytest.mark.long
-def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay(
+def test_thinned_stars_are_apart_with_none_left_out_needlessly_and_the_brightest_kept(
     stars: StarCatalog,
 ) -> None:
     apart = np.radians(3.0)
@@ -100,7 +100,7 @@ def test_thinned_stars_are_apart_none_is_left_out_needlessly_and_the_bright_stay
     assert (within & as_bright).any(axis=1).all()
 
 
-def test_a_count_that_cannot_be_is_refused(stars: StarCatalog) -> None:
+def test_an_impossible_count_is_refused(stars: StarCatalog) -> None:
     with pytest.raises(ImageError, match="9000 of 7996 stars; allowed"):
         uniform(stars, 9000)
     with pytest.raises(ImageError, match="100 of 7996 stars; allowed: 9"):

@@ -19,7 +19,7 @@ def patch(rng: np.random.Generator, count: int) -> Floats:
 
 @pytest.mark.parametrize("chord", [1e-4, 0.01, 0.2, 1.9, 2.0])
 @pytest.mark.parametrize("make", [directions, patch])
-def test_the_stars_within_a_distance_are_brute_force_s(make, chord: float) -> None:
+def test_the_stars_within_a_distance_match_brute_force(make, chord: float) -> None:
     rng = np.random.default_rng(1)
     vectors = make(rng, 700)
     known = sky_index.build_grid(vectors)

@@ -85,9 +85,9 @@ def errors_of(name: str, flux_e: float, noise_e: float, gain_e_dn: float, seed: 
         image, places = starfield(rng, flux_e, noise_e)
         image /= gain_e_dn
         found = CENTROIDERS[name](image, detect.local(image, 6.0, max_blobs=1000), gain_e_dn)
-        error, told = matched(found, places)
+        error, claimed = matched(found, places)
         off.append(error)
-        sigma.append(told)
+        sigma.append(claimed)
     return np.concatenate(off), np.concatenate(sigma)
 
 
@@ -143,7 +143,7 @@ def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
 
 
 @pytest.mark.parametrize("light", [0.5, 1.0, 2.0, -1.0])
-def test_any_light_but_zero_has_a_center_of_gravity(light: float) -> None:
+def test_any_nonzero_light_has_a_center_of_gravity(light: float) -> None:
     """A quarter and three quarters of it in two pixels, on a sky of zero; none at all is of no place."""
     moments = interpreted("estimator.centroiding.moments")
     image = np.zeros((9, 9))
@@ -159,7 +159,7 @@ def test_any_light_but_zero_has_a_center_of_gravity(light: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
-def test_the_center_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
+def test_the_center_of_gravity_has_the_theoretical_s_curve(sigma: float) -> None:
     # Reference section 3: the center of gravity errs by exp(-2 pi^2 sigma^2) / pi sin(2 pi x), wide window.
     phases = np.linspace(-0.5, 0.5, 21)
     images = [100 + gaussian((40, 40), 20 + x, 20.0, 1e4, sigma) for x in phases]
@@ -174,7 +174,7 @@ def test_the_center_of_gravity_has_the_s_curve_of_theory(sigma: float) -> None:
     np.testing.assert_allclose(off, curve, rtol=0, atol=2e-4)
 
 
-def test_what_the_fit_cannot_fit_keeps_its_center_of_gravity() -> None:
+def test_a_blob_whose_fit_fails_keeps_its_center_of_gravity() -> None:
     image = 10 + 200 * disk((128, 128), 60.37, 58.81, 10.4)
     image += gaussian((128, 128), 2.0, 100.2, 2e4)  # too near the border for a window of 7x7
     blobs = detect.local(image, min_area_px=1)
@@ -217,7 +217,7 @@ def test_the_fit_reaches_the_cramer_rao_bound(
 )
 @pytest.mark.parametrize("gain_e_dn", [1.0, 20.0])
 @pytest.mark.parametrize(("flux_e", "noise_e"), [(1e4, 15), (1e5, 15), (1e5, 1)])
-def test_the_reported_sigma_is_true(
+def test_the_reported_sigma_matches_the_scatter(
     name: str, band: tuple[float, float], gain_e_dn: float, flux_e: float, noise_e: float
 ) -> None:
     off, sigma = errors_of(name, flux_e, noise_e, gain_e_dn, seed=22)
@@ -333,7 +333,7 @@ def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
-def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(
+def test_the_disk_fit_is_unbiased_and_beats_center_of_gravity_under_noise(
     radius: float, bright_e: float
 ) -> None:
     # An edge blurred by optics of 0.8 px; the reference's LED of 20.8 px, and a smaller one.
@@ -373,7 +373,7 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     assert 0.6 < np.mean((np.array(off) / np.array(sigma)[:, None]) ** 2) < 2.0
 
 
-def test_the_disk_fit_gives_place_flux_and_radius_of_a_blurred_disk() -> None:
+def test_the_disk_fit_gives_position_flux_and_radius_of_a_blurred_disk() -> None:
     """Without noise, on a sky of 50; by the interpreter, which refuses what is beyond an array."""
     fit = interpreted("estimator.centroiding.disk_fit")
     radius = 4.0

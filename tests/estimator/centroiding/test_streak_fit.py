@@ -85,7 +85,7 @@ def cramer_rao_px(length: float, flux_e: float, noise_e: float) -> tuple[float, 
 
 @pytest.mark.parametrize("dtype", ["u2", "f8"])
 @pytest.mark.parametrize("streak_px", [(9.0, 0.0), (0.0, 7.0), (8.0, -6.0), (-3.0, 12.0)])
-def test_the_line_filter_is_scipy_s_mean_along_the_line(streak_px, dtype: str) -> None:
+def test_the_line_filter_matches_scipy_s_mean_along_the_line(streak_px, dtype: str) -> None:
     rng = np.random.default_rng(60)
     image = rng.integers(0, 200, (90, 120)).astype(dtype)
     taps = detect.line_taps(streak_px)
@@ -102,7 +102,7 @@ def test_the_line_filter_is_scipy_s_mean_along_the_line(streak_px, dtype: str) -
 
 
 @pytest.mark.parametrize("streak_px", [(9.0, 0.0), (8.0, -6.0)])
-def test_white_noise_keeps_so_much_through_the_line_filter(streak_px) -> None:
+def test_the_line_filter_scales_white_noise_by_its_stated_factor(streak_px) -> None:
     taps = detect.line_taps(streak_px)
     noise = np.random.default_rng(61).normal(0, 1, (600, 600))
     smooth = ndimage.correlate(noise, BINOMIAL)
@@ -111,8 +111,8 @@ def test_white_noise_keeps_so_much_through_the_line_filter(streak_px) -> None:
     assert detect.noise_factor(taps) == pytest.approx(line.std(), rel=0.025)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) -> None:
+@pytest.mark.parametrize("with_gyro", [True, False])
+def test_streaks_of_12_px_are_found_with_and_without_the_gyro(with_gyro: bool) -> None:
     rng = np.random.default_rng(62)
     # At 1,000 e a streak's pixels are 5 of their own sigmas in the filtered image; the line filter sees 10.
     fluxes = np.concatenate([np.full(12, 1000.0), np.full(24, 3000.0)])
@@ -121,14 +121,14 @@ def test_smears_of_12_px_are_found_by_the_gyro_s_streak_and_without(told: bool) 
         dx = 12 * np.cos(angle)
         dy = 12 * np.sin(angle)
         image, xy = field(rng, dx, dy, fluxes)
-        blobs = detect.default(image, priors=FramePriors((dx, dy) if told else None))
+        blobs = detect.default(image, priors=FramePriors((dx, dy) if with_gyro else None))
         found += near(blobs.xy_px, xy)
         strangers += len(blobs) - near(blobs.xy_px, xy)
     assert found >= 0.98 * 6 * 36
     assert strangers <= 3
 
 
-def test_of_noise_alone_the_line_filter_keeps_what_is_five_pixels_and_bright() -> None:
+def test_in_pure_noise_the_line_filter_keeps_only_bright_runs_of_five_pixels() -> None:
     # At two sigma noise itself makes blobs: they are scipy's labels of the filtered frame, by the rule.
     image = np.random.default_rng(69).normal(1000, 9, (256, 256))
     streak_px = (9.0, 0.0)
@@ -147,7 +147,7 @@ def test_of_noise_alone_the_line_filter_keeps_what_is_five_pixels_and_bright() -
     assert (area >= 8).sum() > 20
 
 
-def test_a_line_filter_gains_over_a_round_one() -> None:
+def test_a_line_filter_detects_fainter_streaks_than_a_round_filter() -> None:
     # Reference section 3: a streak of 15 px loses 2.2 magnitudes; the mean over it gains most of it back.
     rng = np.random.default_rng(63)
     image, xy = field(rng, 12.0, 9.0, np.full(36, 900.0))
@@ -160,7 +160,7 @@ def test_a_line_filter_gains_over_a_round_one() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [4.41, 8.8, 15.0])
-def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> None:
+def test_the_streak_center_is_mid_exposure_within_its_covariance(length: float) -> None:
     rng = np.random.default_rng(64)
     scaled = []
     off = []
@@ -193,7 +193,7 @@ def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> N
 
 
 @pytest.mark.slow
-def test_the_fit_reaches_the_bound_along_and_across() -> None:
+def test_the_fit_reaches_the_cramer_rao_bound_along_and_across() -> None:
     along, across = cramer_rao_px(4.41, 2000.0, 15.0)
     # The reference's section 3: .074 and .037 for a streak of 4.41 px, 2,000 e, read noise 15.
     assert along == pytest.approx(0.074, rel=0.03)
@@ -214,7 +214,7 @@ def test_the_fit_reaches_the_bound_along_and_across() -> None:
     assert rms[1] / across == pytest.approx(1, abs=0.12)
 
 
-def test_a_faint_streak_does_not_call_a_piece_of_itself_the_whole() -> None:
+def test_a_fragment_of_a_faint_streak_is_not_taken_for_the_whole() -> None:
     rng = np.random.default_rng(71)
     priors = FramePriors((14.0, 10.0))
     scaled = []
@@ -259,7 +259,9 @@ def test_round_stars_get_the_round_fit() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stretch", [1.0, 1.5])
-def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float) -> None:
+def test_a_star_s_own_streak_has_its_claimed_covariance_for_any_frame_streak(
+    stretch: float,
+) -> None:
     """The vector without priors has no bias and an honest covariance, also if the frame's streak is half too long."""
     true = np.array([6.0, 3.5])
     nees = []
@@ -282,7 +284,7 @@ def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_star_s_own_vector_is_that_of_the_data_without_the_priors(seed: int) -> None:
+def test_a_star_s_own_vector_excludes_the_priors(seed: int) -> None:
     """Of seven Gaussian parameters: the posterior of data and priors leads back to mean and covariance of the data."""
     rng = np.random.default_rng(seed)
     place = [streak_fit.LENGTH, streak_fit.ANGLE]
@@ -338,8 +340,8 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
 
 
 @pytest.mark.slow
-def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
-    """Five streaks of which the filter for round stars sees two at most; nobody tells which way they go."""
+def test_streaks_below_the_single_detection_limit_are_found_by_their_common_direction() -> None:
+    """Five streaks of unknown direction; the filter for round stars finds two of them at most."""
     rng = np.random.default_rng(31)
     middles = rng.uniform(40, 360, (5, 2))
     along = np.array([10.0, 6.0])
@@ -355,10 +357,10 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
                 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2 / 0.64)
             )
     image = 100 + light + rng.normal(0, 10, light.shape)
-    told = detect.default(image, priors=FramePriors(tuple(along)))
+    blobs = detect.default(image, priors=FramePriors(tuple(along)))
     unaided = detect.default(image)
     assert len(detect.local(image)) <= 2
-    assert len(told) == 5
+    assert len(blobs) == 5
     near = np.linalg.norm(unaided.xy_px[:, None] - middles, axis=2).min(axis=0)
     assert (
         np.sum(near < 3) >= 4
@@ -366,7 +368,7 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
     assert len(unaided) <= 6
 
 
-def test_noise_alone_has_no_direction() -> None:
+def test_pure_noise_has_no_streak_direction() -> None:
     frames = np.random.default_rng(32).normal(100, 10, (20, 300, 300))
     assert sum(len(detect.default(frame)) for frame in frames) <= 2
 
@@ -403,7 +405,7 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
     "start",
     [(0.2, 0.1, 0.3, 0.02), (2.5, -1.0, 0.0, 0.0), (0.0, 0.0, 6.0, 0.0), (0.0, 0.0, 0, 0.3)],
 )
-def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(
+def test_a_fit_that_starts_pixels_off_converges_to_the_truth(
     start: tuple[float, float, float, float],
 ) -> None:
     """Of place, length and direction: where a first step would go too far it is shortened; almost without noise."""

@@ -18,7 +18,7 @@ def pixels_over(camera: Camera, count: int, seed: int) -> np.ndarray:
     )
 
 
-def test_a_distorted_pixel_by_hand() -> None:
+def test_a_distorted_pixel_matches_a_hand_calculation() -> None:
     # x/z = .2, y/z = -.1: r2 = .05; radial = 1 + .05 k1 + .0025 k2 with k1 = -.1, k2 = .4 is .996;
     # x' = .1992 + 2 p1 (-.02) + p2 (.05 + .08) with p1 = .01, p2 = -.02: .1992 - .0004 - .0026 = .1962;
     # y' = -.0996 + p1 (.05 + .02) + 2 p2 (-.02) = -.0996 + .0007 + .0008 = -.0981.
@@ -39,11 +39,11 @@ def test_x_is_to_the_right_and_y_is_down() -> None:
     np.testing.assert_allclose(pixels, [[60, 50], [50, 60]], rtol=0, atol=1e-12)  # rounding
 
 
-def test_what_is_behind_the_camera_has_no_pixel() -> None:
+def test_a_direction_behind_the_camera_has_no_pixel() -> None:
     assert np.isnan(DISTORTED.pixels(np.array([[0.1, 0.1, -1.0], [1.0, 0.0, 0.0]]))).all()
 
 
-def test_a_star_far_off_does_not_fold_back_into_a_barrel_s_field() -> None:
+def test_barrel_distortion_does_not_fold_a_far_star_into_the_field() -> None:
     # r (1 - .15 r^2) turns back at r = sqrt(1 / .45) = 1.4907; at r = 2.5 it is .156, well within the field.
     camera = Camera(1600, 1200, 2000.0, (810.5, 590.25), (-0.15, 0.0, 0.0, 0.0, 0.0))
     pixels = camera.pixels(np.array([[1.4906, 0, 1], [1.4908, 0, 1], [0, 2.5, 1]]))
@@ -54,7 +54,7 @@ def test_a_star_far_off_does_not_fold_back_into_a_barrel_s_field() -> None:
         assert np.isfinite(sharp.pixels(np.array([[2.5, 0, 1]]))).all()
 
 
-def test_the_distortion_is_opencv_s() -> None:
+def test_the_distortion_matches_opencv() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.ones(500)]) * rng.uniform(
         1, 9, (500, 1)
@@ -64,7 +64,7 @@ def test_the_distortion_is_opencv_s() -> None:
     np.testing.assert_allclose(DISTORTED.pixels(points), oracle[:, 0], rtol=0, atol=1e-9)
 
 
-def test_the_undistortion_is_opencv_s() -> None:
+def test_the_undistortion_matches_opencv() -> None:
     pixels = pixels_over(DISTORTED, 500, seed=2)
     done = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
     oracle = cv2.undistortPoints(pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done).reshape(
@@ -76,7 +76,7 @@ def test_the_undistortion_is_opencv_s() -> None:
 
 
 @pytest.mark.parametrize("lens", [(0.0,) * 5, LENS, (0.2, -0.1, 0.003, 0.002, 0.05)])
-def test_rays_and_pixels_are_each_other_s_inverse(lens: tuple[float, ...]) -> None:
+def test_rays_and_pixels_are_inverse_functions(lens: tuple[float, ...]) -> None:
     camera = Camera(1600, 1200, 2000.0, (810.5, 590.25), lens)
     pixels = pixels_over(camera, 1000, seed=3)
     rays = camera.rays(pixels)
@@ -94,7 +94,7 @@ def test_without_distortion_tangents_are_linear_however_far_off() -> None:
 
 
 @pytest.mark.parametrize("coefficient", range(5))
-def test_each_coefficient_alone_is_undone(coefficient: int) -> None:
+def test_the_distortion_by_each_coefficient_is_undone(coefficient: int) -> None:
     lens = tuple(0.05 * (n == coefficient) for n in range(5))
     tangent = np.array([[0.2, -0.1], [-0.3, 0.25], [0.0, 0.1]])
     xy_px = 2000 * distorted(tangent, lens) + [810.5, 590.25]
@@ -103,7 +103,7 @@ def test_each_coefficient_alone_is_undone(coefficient: int) -> None:
     )
 
 
-def test_the_field_is_the_angle_between_the_edge_columns_middles() -> None:
+def test_the_field_is_the_angle_between_the_centers_of_the_edge_columns() -> None:
     camera = Camera.from_fov(659, 493, np.radians(14.87))
     left, right = camera.rays(np.array([[0.0, 246.0], [658.0, 246.0]]))
     assert np.degrees(np.arccos(left @ right)) == pytest.approx(14.87, abs=1e-12)  # rounding
@@ -132,7 +132,7 @@ def test_a_zoomed_camera_magnifies_angles_from_the_axis() -> None:
     )  # rounding
 
 
-def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_middles() -> None:
+def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_pixel_centers() -> None:
     camera = Camera(10, 8, 10.0, (4.5, 3.5))
     inside = camera.contains(
         np.array([[-0.5, -0.5], [9.5, 7.5], [-0.51, 0], [9.51, 0], [0, 7.51], [0, -0.51]])
@@ -151,6 +151,6 @@ def test_an_image_of_another_size_is_refused_with_both_sizes() -> None:
 
 
 @pytest.mark.parametrize("given", [{}, {"fov_rad": 0.3, "fov_deg": 17.0}])
-def test_a_field_of_view_is_given_once(given: dict[str, float]) -> None:
+def test_giving_the_field_of_view_twice_is_refused(given: dict[str, float]) -> None:
     with pytest.raises(ImageError, match="takes either fov_rad or fov_deg"):
         Camera.from_fov(640, 480, **given)

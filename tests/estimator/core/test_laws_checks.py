@@ -72,7 +72,7 @@ def is_plain(array: NDArray, dtype: Any) -> bool:
 
 @law(checks.native, checks.floats, detect.to_native, detect.in_row_order, detect.check_pixel_type)
 @given(array=MATRICES)
-def test_an_array_in_any_disguise_is_the_plain_one(array: NDArray) -> None:
+def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(array: NDArray) -> None:
     for one in disguises(array):
         plain = checks.floats("x", one, (None, array.shape[1]))
         assert is_plain(plain, np.float64)
@@ -99,7 +99,7 @@ def test_an_array_in_any_disguise_is_the_plain_one(array: NDArray) -> None:
     checks.excerpt,
 )
 @given(thing=THINGS)
-def test_anything_is_what_is_asked_for_or_one_line(thing: Any) -> None:
+def test_any_value_is_converted_or_refused_in_one_line(thing: Any) -> None:
     number = answered(lambda: checks.number("x", thing, 0.0, 5.0, "0 to 5"), ImageError)
     assert number is None or (type(number) is float and 0 <= number <= 5)
     whole = answered(lambda: checks.number("x", thing, 0, 5, "0 to 5", True), ImageError)
@@ -125,7 +125,7 @@ def test_anything_is_what_is_asked_for_or_one_line(thing: Any) -> None:
     assert len(checks.excerpt(thing)) <= 60
 
 
-def test_a_rotation_is_one_and_no_nan() -> None:
+def test_a_rotation_is_valid_and_finite() -> None:
     checks.one_rotation("x", Rotation.identity())
     with pytest.raises(ImageError, match="a stack of 3 rotations"):
         checks.one_rotation("x", Rotation.identity(3))
@@ -142,7 +142,9 @@ def test_a_rotation_is_one_and_no_nan() -> None:
     checks.angle_guess,
 )
 @given(rng=SEEDS, thing=THINGS)
-def test_rows_are_of_their_length_finite_and_there(rng: np.random.Generator, thing: Any) -> None:
+def test_rows_have_their_length_and_are_finite_and_present(
+    rng: np.random.Generator, thing: Any
+) -> None:
     for call in (checks.rows, checks.unit_rows):
         found = answered(
             lambda call=call: call("x", thing, *([None, 3][: 1 + (call is checks.rows)])),
@@ -188,7 +190,7 @@ def lights(rng: np.random.Generator, count: int) -> dict[str, NDArray]:
     value=some.sampled_from([np.nan, np.inf, -np.inf, -1.0, 0.0]),
     longer=some.sampled_from([-1, 1, 7]),
 )
-def test_centroids_are_of_one_length_and_their_numbers_usable(
+def test_centroids_have_equal_lengths_and_valid_numbers(
     rng: np.random.Generator, value: float, longer: int
 ) -> None:
     count = int(rng.integers(2, 20))
@@ -211,7 +213,7 @@ def test_centroids_are_of_one_length_and_their_numbers_usable(
 
 @law(StarCatalog.from_radec, catalog.checked)
 @given(rng=SEEDS)
-def test_a_catalog_of_arrays_is_that_of_vectors(rng: np.random.Generator) -> None:
+def test_a_catalog_from_arrays_equals_that_from_vectors(rng: np.random.Generator) -> None:
     stars = drawn(rng)
     x, y, z = stars.vectors.T
     ra_deg = np.degrees(np.arctan2(y, x))
@@ -275,7 +277,7 @@ def fields(one: StarCatalog) -> dict[str, Any]:
 
 @law(catalog.utc, StarCatalog.read)
 @given(thing=THINGS, when=some.datetimes())
-def test_a_date_is_one_or_is_told(thing: Any, when: datetime.datetime) -> None:
+def test_a_date_is_valid_or_refused(thing: Any, when: datetime.datetime) -> None:
     for date in (when, when.isoformat()):
         found = answered(lambda date=date: catalog.utc(date), ImageError)  # type: ignore[misc]
         assert found == (when if 1800 <= when.year < 2200 else None)
@@ -284,7 +286,7 @@ def test_a_date_is_one_or_is_told(thing: Any, when: datetime.datetime) -> None:
         answered(lambda: StarCatalog.read(thing), ImageError)
 
 
-def test_the_file_read_by_its_class_is_that_of_the_function() -> None:
+def test_the_class_reads_a_file_as_the_function_does() -> None:
     path = catalog.Path(catalog.__file__).parents[2] / "data/catalogs/hipparcos_hp6.5.ecsv"
     assert np.array_equal(StarCatalog.read(path).vectors, catalog.read(path).vectors)
 
@@ -357,7 +359,7 @@ def test_settings_are_known_and_usable(word: str, value: Any) -> None:
         assert made is None or type(getattr(made, name)) is type(getattr(Settings(), name))
 
 
-def test_a_misspelt_setting_is_told_the_nearest() -> None:
+def test_a_misspelt_setting_is_answered_with_the_nearest_name() -> None:
     with pytest.raises(
         ImageError, match="'centroid_sigma' is unknown; did you mean centroid_sigma_px"
     ):

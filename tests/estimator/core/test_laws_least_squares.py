@@ -49,7 +49,7 @@ def test_the_robust_fit_finds_scipy_s_minimum(
 
 @law(fit_soft_l1)
 @given(rng=SEEDS)
-def test_a_parameter_without_effect_stays_where_it_was(rng: np.random.Generator) -> None:
+def test_a_parameter_without_effect_keeps_its_value(rng: np.random.Generator) -> None:
     found = fit_soft_l1(lambda p: p[:1] - np.array([3.0, 3.0]), np.array([0.0, 7.0]), np.ones(2))
     np.testing.assert_allclose(found, [3.0, 7.0], atol=1e-6)
 

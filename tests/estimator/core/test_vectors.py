@@ -15,7 +15,7 @@ every_mode = pytest.mark.parametrize("vectors", MODULES.values(), ids=MODULES)
 
 @every_mode
 @pytest.mark.parametrize("size_rad", [1e-2, 1e-3])
-def test_a_small_rotation_is_right_to_its_second_order(vectors, size_rad: float) -> None:
+def test_a_small_rotation_is_accurate_to_second_order(vectors, size_rad: float) -> None:
     """The error of I + [w] + [w]^2 / 2 is |w|^3 / 6; the rows are made orthonormal to rounding."""
     rng = np.random.default_rng(0)
     for _ in range(30):
@@ -44,7 +44,7 @@ def test_a_pair_s_frame_is_right_handed_with_its_bisector_and_normal(vectors) ->
 
 
 @every_mode
-def test_products_are_numpy_s(vectors) -> None:
+def test_products_match_numpy(vectors) -> None:
     rng = np.random.default_rng(2)
     out = np.empty((3, 3))
     a, b = rng.normal(size=(2, 3, 3))

@@ -58,7 +58,7 @@ def flags_near(blobs: Blobs, x: float, y: float) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.45, 0.7, 1.0, 2.0])
-def test_stars_are_stars(sigma: float) -> None:
+def test_stars_are_not_flagged(sigma: float) -> None:
     rng = np.random.default_rng(40)
     flags = []
     for _ in range(10):
@@ -100,7 +100,7 @@ def test_a_track_among_round_stars_is_flagged(angle_deg: float) -> None:
     assert np.count_nonzero(blobs.flag) == 1
 
 
-def test_the_moon_is_flagged_and_is_no_texture_of_its_neighborhood() -> None:
+def test_the_moon_is_flagged_and_its_neighborhood_is_not() -> None:
     # 0.52 deg at 14.87 deg a row of 659 is a disk of 23 px, blurred by its own glare.
     rng = np.random.default_rng(43)
     light, xy = sky_frame(rng, 15, 0.7)
@@ -113,7 +113,7 @@ def test_the_moon_is_flagged_and_is_no_texture_of_its_neighborhood() -> None:
     assert not any(flags_near(blobs, *place) & NO_STAR for place in xy[far])
 
 
-def test_an_led_is_no_moon() -> None:
+def test_an_led_is_not_flagged_as_moon() -> None:
     # Reference section 2: a 2 mm LED is a disk of 20.8 px on the 1600x1200 camera; all disks are alike.
     rng = np.random.default_rng(44)
     light = np.zeros((1200, 1600))
@@ -127,7 +127,7 @@ def test_an_led_is_no_moon() -> None:
     assert blobs.flag.tolist() == [0] * 8
 
 
-def test_branches_are_texture() -> None:
+def test_branches_are_flagged_as_texture() -> None:
     # The lower fifth of the frame is as rough as foliage under a street lamp.
     rng = np.random.default_rng(45)
     light, xy = sky_frame(rng, 15, 0.7)
@@ -143,7 +143,7 @@ def test_branches_are_texture() -> None:
 
 
 @pytest.mark.slow
-def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
+def test_smeared_stars_are_no_tracks_and_give_the_frame_s_streak() -> None:
     rng = np.random.default_rng(46)
     light = np.zeros(SHAPE)
     for x, y in sky_frame(rng, 15, 0.7)[1]:
@@ -175,7 +175,7 @@ def smeared_frame(
 
 
 @pytest.mark.parametrize("streak", [(2.5, 1.0), (4.0, -3.0)])
-def test_a_short_streak_is_seen_without_a_gyro_and_centered_as_with_one(
+def test_a_short_streak_is_found_and_centered_without_a_gyro_as_with_one(
     streak: tuple[float, float],
 ) -> None:
     """A round star in place of a streak of some pixels would double the error, and claim too little."""
@@ -188,7 +188,7 @@ def test_a_short_streak_is_seen_without_a_gyro_and_centered_as_with_one(
     assert rms_px[0] < 1.1 * rms_px[1] < 0.06
 
 
-def test_a_hot_pixel_is_no_star_of_a_smeared_frame() -> None:
+def test_a_hot_pixel_in_a_smeared_frame_is_not_taken_for_a_star() -> None:
     image, _ = smeared_frame(np.random.default_rng(48), (3.5, 2.0))
     hot = [(25, 25), (640, 480)]
     for x, y in hot:
@@ -218,7 +218,7 @@ HOT_PX = [(25, 25), (640, 480), (8, 250), (650, 8)]
 @pytest.mark.parametrize("rate_known", [False, True])
 @pytest.mark.parametrize("streak", [(0.0, 0.0), (4.0, 0.0), (10.0, -6.0), (20.0, 5.0)])
 @pytest.mark.parametrize("turn_rad", [0.025, -0.045])
-def test_streaks_that_a_roll_makes_differ_are_stars(
+def test_streaks_that_differ_by_a_roll_are_stars(
     streak: tuple[float, float], turn_rad: float, rate_known: bool
 ) -> None:
     """By 20 or 37 px between opposite corners; the four brightest lights are hot pixels. From a gyro or the frame."""
@@ -293,7 +293,7 @@ def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
     assert max(left) <= 2, (pieces, left)
 
 
-def test_tracks_among_round_stars_make_no_roll() -> None:
+def test_tracks_among_round_stars_are_not_taken_for_a_roll() -> None:
     """Of three tracks and the sky, any two lines give a turn, but the stars are round."""
     rng = np.random.default_rng(50)
     light, _ = sky_frame(rng, 15, 0.7)
@@ -305,7 +305,7 @@ def test_tracks_among_round_stars_make_no_roll() -> None:
     assert np.count_nonzero(blobs.flag == 0) == 15
 
 
-def test_three_tracks_make_no_roll() -> None:
+def test_three_tracks_are_not_taken_for_a_roll() -> None:
     """Any two lines agree with some field: five must."""
     light = np.zeros(SHAPE)
     for at, angle in (((100, 100), 0.4), ((500, 120), 2.0), ((220, 400), 1.2)):
@@ -347,7 +347,7 @@ def trailed_frame(seed: int, flux_per_px: float, spread: float) -> np.ndarray:
     return exposed(rng, light)
 
 
-def test_long_streaks_that_differ_by_some_percent_are_no_tracks() -> None:
+def test_long_streaks_that_differ_by_a_few_percent_are_stars() -> None:
     """Of 45 px: at 5 % the squared lengths, 2,000 px^2, differ by 200, far more than a track of 6 px."""
     blobs = detect.default(trailed_frame(60, 600.0, 0.05))
     assert len(blobs) == 15
@@ -372,7 +372,7 @@ def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
 
 
 @pytest.mark.parametrize("height_px", [24, 30])
-def test_a_caption_is_text_and_tells_no_streak(height_px: int) -> None:
+def test_a_caption_is_flagged_as_text_and_gives_no_streak(height_px: int) -> None:
     """Most of the brightest lights are letters, some of them vertical lines."""
     rng = np.random.default_rng(62)
     light, xy = sky_frame(rng, 15, 0.8)
@@ -392,7 +392,7 @@ def test_a_caption_is_text_and_tells_no_streak(height_px: int) -> None:
     assert np.count_nonzero(blobs.flag[written] & Flag.TEXT) >= written.sum() - 1
 
 
-def test_rows_of_equal_lights_are_no_text() -> None:
+def test_rows_of_equal_lights_are_not_flagged_as_text() -> None:
     """LEDs are disks of one size and may be in a row; letters differ in width."""
     light = np.zeros(SHAPE)
     y, x = np.mgrid[-12:13, -12:13]
@@ -404,7 +404,7 @@ def test_rows_of_equal_lights_are_no_text() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 50, 84])
-def test_columns_of_readout_smear_are_no_streaks(seed: int) -> None:
+def test_columns_of_readout_smear_are_not_taken_for_streaks(seed: int) -> None:
     """Saturated stars leave columns from border to border: they are parallel, but no star moved along them."""
     setup = frames.SETUPS[3]
     stars = catalog.hipparcos()
@@ -445,10 +445,10 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
-def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -> None:
+def test_a_star_on_a_replaced_pixel_has_its_claimed_sigma(centroider: str) -> None:
     rng = np.random.default_rng(48)
     off = []
-    told = []
+    claimed_px = []
     for _ in range(12):
         light, xy = sky_frame(rng, 15, 0.8)
         image = exposed(rng, light)
@@ -459,13 +459,13 @@ def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -
         )
         rows = np.linalg.norm(found.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
         off.append(found.xy_px[rows] - xy)
-        told.append(found.sigma_px[rows])
-    chi2 = np.mean((np.concatenate(off) / np.concatenate(told)[:, None]) ** 2)
+        claimed_px.append(found.sigma_px[rows])
+    chi2 = np.mean((np.concatenate(off) / np.concatenate(claimed_px)[:, None]) ** 2)
     # 360 numbers that are not Gaussian (a bad pixel on the peak is worse than one beside it): within a factor of 2.
     assert 0.5 < chi2 < 2
 
 
-def test_a_bad_pixel_far_from_any_star_is_no_light() -> None:
+def test_a_bad_pixel_far_from_any_star_is_not_detected() -> None:
     rng = np.random.default_rng(49)
     light, _ = sky_frame(rng, 10, 0.8)
     image = exposed(rng, light)

@@ -36,7 +36,7 @@ def field(seed: int, sigma: float = 0.8) -> np.ndarray:
 
 @pytest.mark.slow  # compiles the published scans
 @pytest.mark.parametrize("seed", range(4))
-def test_both_scans_find_the_same_objects(seed: int) -> None:
+def test_both_component_scans_find_the_same_objects(seed: int) -> None:
     image = field(seed)
     once = detect.sequential(image)
     again = detect.maximum(image)
@@ -48,7 +48,7 @@ def test_both_scans_find_the_same_objects(seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", [sequential_scan, maximum_scan])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_objects_are_scipy_s_labels(scan, seed: int) -> None:
+def test_the_objects_match_scipy_s_labels(scan, seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     image = rng.integers(0, 100, (60, 70)).astype(np.uint8)
     boxes, sums = scan(image, 10.0, 70.0, 1, 2000)
@@ -69,7 +69,7 @@ def test_the_objects_are_scipy_s_labels(scan, seed: int) -> None:
     assert boxes[:, 2].max() <= 69
 
 
-def test_the_table_holds_the_brightest_and_not_the_first() -> None:
+def test_a_full_table_keeps_the_brightest_objects_not_the_first() -> None:
     image = field(9)
     every = detect.sequential(image)
     few = detect.sequential(image, max_blobs=5)
@@ -107,7 +107,7 @@ def test_the_thesis_takes_full_scale_from_the_saturation() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["u2", "i4", "f8"])
-def test_runs_are_scipy_s_mask_under_a_bilinear_threshold(dtype: str) -> None:
+def test_runs_match_scipy_s_mask_under_a_bilinear_threshold(dtype: str) -> None:
     rng = np.random.default_rng(16)
     image = rng.integers(0, 120, (101, 133)).astype(dtype)
     grid = rng.uniform(50, 90, (3, 4))
@@ -125,7 +125,7 @@ def test_runs_are_scipy_s_mask_under_a_bilinear_threshold(dtype: str) -> None:
     np.testing.assert_array_equal(mask, wanted)
 
 
-def test_more_runs_than_the_first_room_are_all_there() -> None:
+def test_runs_beyond_the_first_allocation_are_all_kept() -> None:
     image = np.zeros((300, 300))
     image[::2, ::4] = 100.0
     runs = runs_above(image, np.full((1, 1), 20.0))
@@ -135,7 +135,7 @@ def test_more_runs_than_the_first_room_are_all_there() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_labels_are_scipy_s(seed: int) -> None:
+def test_labels_match_scipy(seed: int) -> None:
     rng = np.random.default_rng(200 + seed)
     image = ndimage.gaussian_filter(rng.normal(0, 1, (120, 150)), 1.2)
     runs = runs_above(image, np.full((1, 1), 0.1 * seed - 0.1))

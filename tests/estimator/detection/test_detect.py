@@ -45,7 +45,7 @@ def nearest_px(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [4.0, 4.5, 5.0])
-def test_false_alarms_on_white_noise_are_the_gaussian_tail(sigma: float) -> None:
+def test_the_false_alarm_rate_on_white_noise_is_the_gaussian_tail(sigma: float) -> None:
     rng = np.random.default_rng(4)
     frames = 8
     area = sum(
@@ -59,7 +59,7 @@ def test_false_alarms_on_white_noise_are_the_gaussian_tail(sigma: float) -> None
     assert expected / 2 - spread < area < 2 * expected + spread
 
 
-def test_three_pixels_at_five_sigma_keep_white_noise_out() -> None:
+def test_three_pixels_at_five_sigma_reject_white_noise() -> None:
     # 4 Mpx hold 1.2 pixels above 5 sigma; three together are far rarer.
     rng = np.random.default_rng(5)
     assert sum(len(detect.local(rng.normal(0, 1, (1024, 1024)))) for _ in range(4)) == 0
@@ -89,7 +89,7 @@ def test_the_sky_of_a_crowded_tile_is_the_sky_between_the_stars(dtype: str) -> N
     np.testing.assert_allclose(background.level, 60, rtol=0, atol=1.0)
 
 
-def test_the_noise_of_floats_has_the_floor_of_sixteen_bits() -> None:
+def test_the_noise_of_float_images_has_the_floor_of_16_bit_rounding() -> None:
     """A step over the range of the image, uniform within: step / sqrt(12), which the binomial filter reduces to 3/8."""
     image = np.full((128, 128), 40.0)
     image[64, 64] = 40.0 + 65535 * 0.25
@@ -108,7 +108,7 @@ def test_the_sky_between_tile_centers_is_bilinear() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_blobs_are_scipy_s_labels_of_the_same_mask(seed: int) -> None:
+def test_blobs_match_scipy_s_labels_of_the_same_mask(seed: int) -> None:
     rng = np.random.default_rng(seed)
     height, width = rng.integers(20, 90, 2)
     image = rng.normal(50, 10, (height, width))
@@ -153,7 +153,7 @@ def test_the_peak_of_an_image_below_zero_is_below_zero() -> None:
 
 
 @pytest.mark.parametrize("slope", [(0.5, 0.0), (0.0, -2.0), (3.0, 3.0), (20.0, -10.0)])
-def test_a_ramp_of_the_sky_is_no_blob(slope: tuple[float, float]) -> None:
+def test_a_ramp_of_the_sky_is_not_detected(slope: tuple[float, float]) -> None:
     y, x = np.mgrid[:512, :640]
     image = 20_000 + slope[0] * x + slope[1] * y + np.random.default_rng(8).normal(0, 5, (512, 640))
     assert len(detect.local(image)) == 0
@@ -201,7 +201,7 @@ def test_the_thesis_s_full_scale_is_that_of_the_given_pixels() -> None:
     assert [len(detect.thesis(image.astype(dtype))) for dtype in ("u1", "u2")] == [1, 0]
 
 
-def test_a_mask_of_ones_is_an_image_too() -> None:
+def test_a_boolean_mask_is_a_valid_image() -> None:
     image = np.zeros((64, 64), bool)
     image[30:34, 40:44] = True
     np.testing.assert_allclose(
@@ -218,7 +218,7 @@ def test_blobs_come_brightest_first_and_the_faintest_are_dropped() -> None:
     np.testing.assert_allclose(blobs.xy_px, [[61, 21], [101, 21]], rtol=0, atol=0.1)
 
 
-def test_hot_pixels_do_not_take_the_places_of_stars() -> None:
+def test_hot_pixels_do_not_displace_stars_from_the_list() -> None:
     """Two hundred bright hot pixels beside the stars, and room for sixty blobs: all the stars are among them."""
     image, xy_px = field_of_stars(4)
     rng = np.random.default_rng(5)
@@ -258,7 +258,7 @@ BAD = {
 
 @pytest.mark.parametrize("message", BAD)
 @pytest.mark.parametrize("name", list(detect.DETECTORS))
-def test_what_is_no_image_is_refused_in_one_line(name: str, message: str) -> None:
+def test_an_invalid_image_is_refused_in_one_line(name: str, message: str) -> None:
     with pytest.raises(ImageError, match=f"^{message}[^\n]*$"):
         detect.DETECTORS[name](BAD[message])
 
@@ -275,7 +275,7 @@ def test_a_texture_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(
+def test_the_line_filter_ignores_streaks_longer_than_the_maximum(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Lattices that close to lines of 1200 and of 600 px: filters of the length of the first took a minute."""
@@ -293,8 +293,8 @@ def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(
     assert max(map(abs, short.streak_px)) < detect.MAX_STREAK_PX
     assert taps
     stars, xy = field_of_stars(3)
-    told = detect.default(stars, priors=FramePriors((0.0, 5000.0)))
-    assert nearest_px(told.xy_px, xy).max() < 1
+    in_stars = detect.default(stars, priors=FramePriors((0.0, 5000.0)))
+    assert nearest_px(in_stars.xy_px, xy).max() < 1
 
 
 def streaked(
@@ -317,7 +317,7 @@ def streaked(
 
 @pytest.mark.parametrize("length_px", [12.0, 24.0, 48.0])
 @pytest.mark.parametrize("angle_deg", [63.0, 120.0])
-def test_faint_streaks_are_found_in_their_length(length_px: float, angle_deg: float) -> None:
+def test_faint_streaks_are_found_at_full_length(length_px: float, angle_deg: float) -> None:
     """Streaks of 2 sigma in a pixel, of which the first filter finds pieces: without longer filters a streak of 48 px
     appears to be of 7 px.
     """
@@ -331,7 +331,7 @@ def test_faint_streaks_are_found_in_their_length(length_px: float, angle_deg: fl
     assert nearest_px(blobs.xy_px, places).max() < 3
 
 
-def test_a_field_that_only_turns_is_left_as_it_is() -> None:
+def test_a_field_that_only_rolls_is_not_line_filtered() -> None:
     """Its streaks are those of a turn, and that at the center has no length to grow from."""
     image, _ = field_of_stars(4)
     turning = replace(detect.default(image), streak_px=(0.0, 0.0), turn_rad=0.01)

@@ -79,10 +79,12 @@ def assert_inside(blobs: Blobs, most: int) -> None:
         lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))
     )
 )
-def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
-    told = answered(lambda: detect.prepare_image(image), ImageError)
-    assert told is None or (told.ndim == 2 and told.dtype.isnative and min(told.shape) >= 16)
-    assert told is None or (np.isfinite(told).all() and (told == image).all())
+def test_any_array_is_taken_with_its_values_or_refused(image: NDArray) -> None:
+    prepared = answered(lambda: detect.prepare_image(image), ImageError)
+    assert prepared is None or (
+        prepared.ndim == 2 and prepared.dtype.isnative and min(prepared.shape) >= 16
+    )
+    assert prepared is None or (np.isfinite(prepared).all() and (prepared == image).all())
 
 
 @law(*DETECTORS.values(), slow=True)
@@ -93,7 +95,7 @@ def test_any_array_is_an_image_of_its_values_or_none(image: NDArray) -> None:
     streak_px=STREAKS,
     most=some.integers(1, 12),
 )
-def test_blobs_are_of_the_frame(
+def test_blobs_lie_in_the_frame(
     rng: np.random.Generator,
     hostile: NDArray,
     name: str,
@@ -130,7 +132,7 @@ def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: s
     slow=True,
 )
 @given(rng=SEEDS, streak_px=STREAKS.filter(bool), sigma=some.floats(3, 9))
-def test_what_stands_out_less_is_found_with_less(
+def test_a_lower_threshold_finds_fainter_objects(
     rng: np.random.Generator, streak_px: tuple[float, float], sigma: float
 ) -> None:
     frame, _ = starry(rng)
@@ -154,16 +156,16 @@ def test_what_stands_out_less_is_found_with_less(
 
 @law(components.runs_above, background.estimate_background, background.accumulator_type)
 @given(rng=SEEDS, threshold=some.floats(90, 300), kind=some.sampled_from(["u2", "f8"]))
-def test_runs_are_the_pixels_that_a_plain_filter_has_above(
+def test_runs_match_a_plain_filter_above_threshold(
     rng: np.random.Generator, threshold: float, kind: str
 ) -> None:
     frame, _ = starry(rng, kind)
     runs = components.runs_above(frame, np.full((1, 1), threshold))
-    told = np.zeros(frame.shape, bool)
+    in_runs = np.zeros(frame.shape, bool)
     for y, first, last in runs:
-        told[y, first : last + 1] = True
+        in_runs[y, first : last + 1] = True
     np.testing.assert_array_equal(
-        told, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold
+        in_runs, convolve(frame.astype(float), BINOMIAL, mode="nearest") > threshold
     )
     lower, higher = (
         background.estimate_background(frame + np.array(more, kind)) for more in (0, 50)
@@ -196,11 +198,13 @@ def test_a_line_filter_keeps_less_noise_and_has_no_direction(
         "i8", some.tuples(some.integers(0, 9), some.just(2)), elements=some.integers(-2, 95)
     ),
 )
-def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray) -> None:
+def test_replacing_bad_pixels_changes_no_other_pixel(
+    rng: np.random.Generator, bad: NDArray
+) -> None:
     frame, _ = starry(rng)
-    told = answered(lambda: detect.replace_bad_pixels(frame, bad), ImageError)
-    assert (told is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
-    mended = frame if told is None else told
+    replaced = answered(lambda: detect.replace_bad_pixels(frame, bad), ImageError)
+    assert (replaced is not None) == bool(((bad >= 0) & (bad < [WIDTH, HEIGHT])).all())
+    mended = frame if replaced is None else replaced
     changed = set(map(tuple, np.argwhere(mended != frame)[:, ::-1].tolist()))
     assert changed <= set(map(tuple, bad.tolist()))
     assert frame.min() <= mended.min() <= mended.max() <= frame.max()
@@ -208,7 +212,7 @@ def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray
 
 @law()
 @given(SEEDS, some.integers(5, 12), some.integers(8, 30), some.booleans())
-def test_letters_are_text_wherever_they_are(
+def test_letters_are_flagged_as_text_anywhere(
     rng: np.random.Generator, letters: int, height: int, even: bool
 ) -> None:
     """A line of letters beside lights far below; moved and in any order; none if they are equally wide."""
@@ -236,18 +240,20 @@ def test_letters_are_text_wherever_they_are(
 
 @law(classify.classify, Blobs.take)
 @given(rng=SEEDS, full=some.floats(50, 400), streak_px=STREAKS)
-def test_a_verdict_changes_flags_alone(
+def test_classification_changes_only_flags(
     rng: np.random.Generator, full: float, streak_px: tuple[float, float] | None
 ) -> None:
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 50, FramePriors())
-    told = classify.classify(frame, blobs, FramePriors(streak_px, full))
-    np.testing.assert_array_equal(told.flag & int(Flag.SATURATED) != 0, told.peak >= full)
-    assert streak_px in (None, told.streak_px)
-    order = rng.permutation(len(told))
-    taken = told.take(order)
+    classified = classify.classify(frame, blobs, FramePriors(streak_px, full))
+    np.testing.assert_array_equal(
+        classified.flag & int(Flag.SATURATED) != 0, classified.peak >= full
+    )
+    assert streak_px in (None, classified.streak_px)
+    order = rng.permutation(len(classified))
+    taken = classified.take(order)
     for name in ("box_px", "xy_px", "flux", "peak", "area_px", "flag"):
-        np.testing.assert_array_equal(getattr(taken, name), getattr(told, name)[order])
+        np.testing.assert_array_equal(getattr(taken, name), getattr(classified, name)[order])
 
 
 @law(classify.streaks_px)
@@ -290,7 +296,7 @@ def test_windows_anywhere_hold_blobs_of_the_frame(
     centroid.streak,
 )
 @given(rng=SEEDS, name=some.sampled_from(sorted(CENTROIDERS)), hostile=FRAMES)
-def test_a_centroid_is_its_star_s_whatever_the_order(
+def test_centroids_are_at_their_stars_in_any_order_of_blobs(
     rng: np.random.Generator, name: str, hostile: NDArray
 ) -> None:
     frame, places = starry(rng)
@@ -309,7 +315,7 @@ def test_a_centroid_is_its_star_s_whatever_the_order(
 
 @law(centroid.streak, centroid.streak_ends, centroid.gaussian_fit)
 @given(rng=SEEDS, long_px=some.floats(7, 11))
-def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
+def test_a_streak_s_center_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
     frame, _places = starry(rng, smear_px=long_px)
     priors = FramePriors((long_px, 0.0))
     blobs = DETECTORS["default"](frame, 5.0, 3, 9, priors)
@@ -332,7 +338,7 @@ def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px
     pipeline.inflate_uncertainty,
 )
 @given(rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2))
-def test_lights_are_chosen_and_doubted_as_told(
+def test_lights_are_selected_and_weighted_by_the_settings(
     rng: np.random.Generator, count: int, base: int, floor_px: float
 ) -> None:
     lights = Centroids(
@@ -384,12 +390,12 @@ def test_weights_are_the_inverse_of_all_the_errors(
     hostile=FRAMES | arrays("f8", array_shapes(max_dims=3, max_side=90), fill=some.just(1)),
     streak_px=STREAKS,
 )
-def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
+def test_processing_a_frame_gives_lights_on_the_chip_and_its_duration(
     rng: np.random.Generator, hostile: NDArray, streak_px: tuple[float, float] | None
 ) -> None:
     fits = answered(lambda: camera.check_frame(hostile, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
-    nothing = Attitude("nobody asked")
+    nothing = Attitude("not solved")
     answered(
         lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px),
         ImageError,
@@ -410,7 +416,9 @@ def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
 @law(Camera.rays, Camera.pixels, Camera.tangents, Camera.contains)
 @given(rng=SEEDS, k1=some.floats(-0.3, 0.3), p=some.floats(-0.01, 0.01))
 @example(rng=np.random.default_rng(1), k1=2.2e-313, p=0.0)  # once divided by
-def test_pixels_of_rays_are_the_pixels(rng: np.random.Generator, k1: float, p: float) -> None:
+def test_projected_rays_return_to_their_pixels(
+    rng: np.random.Generator, k1: float, p: float
+) -> None:
     lens = Camera(WIDTH, HEIGHT, 120.0, (44.0, 36.0), (k1, 0.0, p, -p, 0.0))
     xy = rng.uniform(-0.5, [WIDTH - 0.5, HEIGHT - 0.5], (20, 2))
     rays = lens.rays(xy)
@@ -443,7 +451,7 @@ def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> Non
     noise=some.floats(0, 0.01),
     name=some.sampled_from(sorted(SOLVERS)),
 )
-def test_a_solver_finds_the_turn_in_any_order(
+def test_a_solver_finds_the_rotation_in_any_order_of_stars(
     rng: np.random.Generator, count: int, noise: float, name: str
 ) -> None:
     truth = turn(rng)
@@ -480,8 +488,8 @@ def test_a_solver_finds_the_turn_in_any_order(
 def test_any_directions_are_solved_or_refused(
     rng: np.random.Generator, cam: NDArray, ref: NDArray, sigma: NDArray, name: str, scale: float
 ) -> None:
-    told = answered(lambda: SOLVERS[name](cam, ref, sigma))
-    assert told is None or np.isfinite(told.as_quat()).all()
+    solution = answered(lambda: SOLVERS[name](cam, ref, sigma))
+    assert solution is None or np.isfinite(solution.as_quat()).all()
     answered(lambda: solvers.covariance(cam, sigma, name))
     seen = units(rng, 5)
     spread = solvers.covariance(seen, np.full(5, 1e-4), name)
@@ -493,7 +501,9 @@ def test_any_directions_are_solved_or_refused(
 
 @law(ra_dec_roll_rad, Attitude.ra_dec_roll_deg)
 @given(rng=SEEDS)
-def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Generator) -> None:
+def test_right_ascension_declination_and_roll_determine_the_attitude(
+    rng: np.random.Generator,
+) -> None:
     truth = turn(rng)
     ra, dec, roll = ra_dec_roll_rad(truth)
     assert 0 <= ra < 2 * np.pi

@@ -21,7 +21,7 @@ def crowded(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return image, above, ndimage.label(above > WINDOWS.GROW_SIGMA, EIGHT)[0]
 
 
-def test_a_blob_is_all_that_is_connected_with_its_peak() -> None:
+def test_a_blob_holds_all_pixels_connected_with_its_peak() -> None:
     """Up to the first and the last row and column."""
     touched = np.zeros(4, bool)
     for seed in range(5):

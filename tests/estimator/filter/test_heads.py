@@ -127,7 +127,7 @@ def test_the_second_mounting_tends_to_its_rotation_relative_to_the_first() -> No
     np.testing.assert_array_equal(mekf.state.others["mounting"], np.zeros(3))
 
 
-def test_a_head_that_there_is_not_is_refused() -> None:
+def test_an_unknown_head_is_refused() -> None:
     mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), 1e-3, 0.0, heads=2)
     with pytest.raises(ValueError, match="update: head 2; allowed: 0 to 1"):
         mekf.update(0.0, Rotation.identity(), NOISE_RAD2[0], head=2)

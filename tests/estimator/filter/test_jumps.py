@@ -78,23 +78,23 @@ def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
 ) -> None:
     vehicle = Vehicle(1)
     assert statuses(vehicle.updates(HOME, right)) == [(USED, right)]
-    told = vehicle.updates(WRONG, wrong)
+    updates = vehicle.updates(WRONG, wrong)
     refused = [(OUTSIDE_GATE, 2), (DISPUTED, wrong - 2)]
-    assert statuses(told) == refused
-    assert [update.agreeing for update in told] == list(range(1, wrong + 1))
-    assert (np.diff([update.log_odds for update in told]) > 0).all()
-    assert told[-1].log_odds < ENOUGH
+    assert statuses(updates) == refused
+    assert [update.agreeing for update in updates] == list(range(1, wrong + 1))
+    assert (np.diff([update.log_odds for update in updates]) > 0).all()
+    assert updates[-1].log_odds < ENOUGH
     assert statuses(vehicle.updates(HOME, 3)) == [(USED, 3)]
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_a_tracker_that_stays_wrong_prevails_after_half_a_minute() -> None:
+def test_the_filter_adopts_a_persistently_wrong_tracker_after_half_a_minute() -> None:
     """Nothing that the filter knows distinguishes it then from a gyro that failed without a flag."""
     vehicle = Vehicle(2)
     vehicle.updates(HOME, 60)
-    told = statuses(vehicle.updates(WRONG, 60))
-    assert [status for status, _ in told] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
-    assert 25 <= told[1][1] <= 40
+    runs = statuses(vehicle.updates(WRONG, 60))
+    assert [status for status, _ in runs] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
+    assert 25 <= runs[1][1] <= 40
 
 
 @pytest.mark.parametrize("off", [0.01, 0.1, 3.0])
@@ -104,7 +104,7 @@ def test_a_wrong_start_is_given_up_at_the_third_solution(off: float) -> None:
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_what_confirmed_a_restart_supports_the_filter_after_it() -> None:
+def test_after_a_restart_ten_wrong_solutions_do_not_cause_another() -> None:
     vehicle = Vehicle(9, start=WRONG.inv())
     assert vehicle.updates(HOME, 3)[-1].status == RESET
     assert RESET not in [update.status for update in vehicle.updates(WRONG, 10)]
@@ -119,18 +119,18 @@ def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> Non
         for k, off in enumerate((100.0, -100.0, 100.0)):
             mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
             seen = Rotation.from_rotvec([0.0, off * ARCSEC_RAD, 0.0])
-            told = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
-        assert told.status == last
+            update = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
+        assert update.status == last
 
 
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong: int) -> None:
     vehicle = Vehicle(4, sigma_rad=2.0)  # knows nothing at the start
     assert statuses(vehicle.updates(WRONG, wrong)) == [(USED, wrong)]
-    told = statuses(vehicle.updates(HOME, 30))
-    assert [status for status, _ in told] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
+    runs = statuses(vehicle.updates(HOME, 30))
+    assert [status for status, _ in runs] == [OUTSIDE_GATE, DISPUTED, RESET, USED]
     # log(100) / -log(wrong_repeat) = 16.0 more than the wrong ones.
-    assert told[0][1] + told[1][1] + told[2][1] - wrong in (16, 17)
+    assert runs[0][1] + runs[1][1] + runs[2][1] - wrong in (16, 17)
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
@@ -164,13 +164,13 @@ def test_after_a_knock_the_filter_is_back_within_three_solutions(
     vehicle.updates(HOME, 40)
     turn, after = knock(times_limit * LIMIT_RAD_S, samples)
     flagged = slice(40, 40 + samples) if known_by == "the flag" else slice(0)
-    told = [vehicle.update(after, turn, flagged), *vehicle.updates(after, 3)]
-    assert told[2].status in (USED, RESET)
-    assert told[3].status == USED
+    updates = [vehicle.update(after, turn, flagged), *vehicle.updates(after, 3)]
+    assert updates[2].status in (USED, RESET)
+    assert updates[3].status == USED
     assert vehicle.error_rad(after) < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
-def test_a_knock_that_the_gyro_measures_is_no_licence_for_a_wrong_solution() -> None:
+def test_a_measured_knock_does_not_admit_a_wrong_solution() -> None:
     """A turn of 20 degrees below the limit, at rates that change smoothly, and ten wrong solutions after it."""
     gyro = GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf, limit_rad_s=10.0)
     vehicle = Vehicle(6, gyro)
@@ -220,7 +220,7 @@ def jump(**changes: float) -> Jump:
     return Jump(np.radians(5.0), 1800.0, 3, 3.0, 0.0, 100)._replace(**changes)  # type: ignore[arg-type]
 
 
-def test_the_odds_are_those_of_the_docstring() -> None:
+def test_the_odds_match_the_docstring_s_formula() -> None:
     model = JumpModel(1e-6, 1e-3, 0.5, 0.02)
     wrong = math.log(1e-3) + 2 * math.log(0.5)
     assert log_odds(jump(), model) == pytest.approx(math.log(3e-6) - wrong, rel=1e-9)
@@ -239,7 +239,7 @@ def test_a_small_jump_is_put_to_the_filter_s_own_model_at_the_third_solution() -
     assert log_odds(jump(distance=40.0, agreeing=CONFIRMATIONS), JumpModel()) < ENOUGH
 
 
-def test_a_shock_is_the_sharpest_change_of_rate_and_no_noise() -> None:
+def test_a_shock_is_the_largest_change_of_rate_above_noise() -> None:
     rng = np.random.default_rng(8)
     samples = np.zeros((100, 5))
     samples[:, 0] = 2.0 + np.cumsum(rng.uniform(0.005, 0.015, 100))
@@ -254,6 +254,6 @@ def test_a_shock_is_the_sharpest_change_of_rate_and_no_noise() -> None:
 
 @pytest.mark.parametrize("name", ["missed_per_s", "wrong_share", "wrong_repeat", "wrong_start"])
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, np.nan])
-def test_a_bad_probability_is_one_clear_line(name: str, value: float) -> None:
+def test_a_bad_probability_is_refused_in_one_line(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"jumps: {name} is .*; allowed: above 0, below 1$"):
         JumpModel(**{name: value})

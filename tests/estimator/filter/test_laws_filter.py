@@ -1,4 +1,4 @@
-"""Laws of the attitude filter and of exposure control, whatever they are told."""
+"""Laws of the attitude filter and of exposure control, for any input."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def test_the_inverse_response_undoes_the_gyro_s_matrix(seed: int, used: NDArray)
     )
 
 
-def assert_sound(told: FilterState) -> None:
-    assert_covariance(told.covariance)
+def assert_sound(state: FilterState) -> None:
+    assert_covariance(state.covariance)
     np.testing.assert_allclose(
-        told.sigma_attitude_rad**2, np.diag(told.covariance)[:3], rtol=1e-12, atol=0
+        state.sigma_attitude_rad**2, np.diag(state.covariance)[:3], rtol=1e-12, atol=0
     )
     np.testing.assert_allclose(
-        told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0
+        state.sigma_bias_rad_s**2, np.diag(state.covariance)[3:], rtol=1e-12, atol=0
     )
 
 
@@ -75,7 +75,9 @@ def test_any_finite_turns_leave_a_unit_attitude_and_a_covariance(
 
 @law(AttitudeFilter.propagate, FilterState.sigma_attitude_rad, FilterState.sigma_bias_rad_s)
 @given(rng=SEEDS, cut=some.integers(1, 9))
-def test_how_samples_are_cut_into_calls_is_no_matter(rng: np.random.Generator, cut: int) -> None:
+def test_the_result_does_not_depend_on_how_samples_are_split_into_calls(
+    rng: np.random.Generator, cut: int
+) -> None:
     t_s = np.cumsum(rng.uniform(1e-3, 0.1, 10))
     angle = rng.normal(0, 0.1, (10, 3))
     seed = int(rng.integers(2**32))
@@ -90,7 +92,7 @@ def test_how_samples_are_cut_into_calls_is_no_matter(rng: np.random.Generator, c
 
 @law(AttitudeFilter.propagate, AttitudeFilter.rate_rad_s)
 @given(t_s=NUMBERS, angle=NUMBERS, full=NUMBERS, rng=SEEDS)
-def test_what_is_no_gyro_is_refused_and_changes_nothing(
+def test_invalid_gyro_samples_are_refused_and_change_nothing(
     t_s: NDArray, angle: NDArray, full: NDArray, rng: np.random.Generator
 ) -> None:
     mekf = filtering(rng)
@@ -106,20 +108,20 @@ def test_what_is_no_gyro_is_refused_and_changes_nothing(
 
 @law(AttitudeFilter.update)
 @given(rng=SEEDS, off_rad=some.floats(0, np.pi), sigma_rad=some.floats(1e-7, 1))
-def test_a_solution_that_is_used_makes_the_filter_surer(
+def test_an_accepted_solution_shrinks_the_covariance(
     rng: np.random.Generator, off_rad: float, sigma_rad: float
 ) -> None:
     mekf = filtering(rng)
     mekf.propagate([0.1, 0.2], rng.normal(0, 0.1, (2, 3)), [False, False])
     before = mekf.state
     measured = Rotation.from_rotvec(off_rad * laws.units(rng, 1)[0]) * before.body_from_ref
-    told = mekf.update(0.2, measured, sigma_rad**2 * np.eye(3))
+    update = mekf.update(0.2, measured, sigma_rad**2 * np.eye(3))
     after = mekf.state
     assert_sound(after)
-    np.testing.assert_allclose(np.linalg.norm(told.residual_rad), off_rad, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(update.residual_rad), off_rad, rtol=0, atol=1e-9)
     shrunk = np.trace(after.covariance[3:, 3:]) <= np.trace(before.covariance[3:, 3:]) * (1 + 1e-9)
     unchanged = np.array_equal(after.covariance, before.covariance)
-    assert shrunk if told.status == USED else unchanged
+    assert shrunk if update.status == USED else unchanged
 
 
 @law(AttitudeFilter.update)
@@ -145,7 +147,7 @@ def test_any_solution_is_taken_or_refused(
     overexposed=some.integers(0, 99),
     control=some.builds(Control, some.floats(0, 1e5), longest_s=some.floats(1e-3, 10)),
 )
-def test_an_exposure_stays_within_the_camera_s(
+def test_an_exposure_stays_within_the_camera_s_limits(
     time_s: float, mean_dn: float, stars: int, overexposed: int, control: Control
 ) -> None:
     asked = exposure_control.step(
@@ -164,10 +166,12 @@ def test_an_exposure_stays_within_the_camera_s(
     boxes=arrays("i8", (4, 4), elements=some.integers(-3, 40)),
     full=some.floats(0, 7e4),
 )
-def test_what_is_seen_of_a_frame_is_within_it(image: NDArray, boxes: NDArray, full: float) -> None:
-    told = answered(lambda: exposure_control.observe(image, boxes, full, Control(1e3)))
+def test_an_observation_requires_boxes_inside_the_frame(
+    image: NDArray, boxes: NDArray, full: float
+) -> None:
+    observation = answered(lambda: exposure_control.observe(image, boxes, full, Control(1e3)))
     inside = (boxes[:, :2] >= 0).all() and (boxes[:, 2:] < [30, 20]).all()
-    assert (told is not None) == inside
+    assert (observation is not None) == inside
     everything = exposure_control.observe(image, np.array([[0, 0, 29, 19]]), full, Control(1e3))
     np.testing.assert_allclose(everything.mean_dn, image.mean(), rtol=1e-12, atol=0)
     assert everything.overexposed == (np.count_nonzero(image >= full) > 1)

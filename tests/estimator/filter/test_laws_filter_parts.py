@@ -56,7 +56,7 @@ def solution_near(
 
 @law(states.of_head, states.build_layout)
 @given(heads=some.integers(1, 8), considered=CHOICES)
-def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
+def test_every_head_has_its_own_mounting_and_slow_error_states(
     heads: int, considered: tuple[str, ...]
 ) -> None:
     """They share no row; only the first mounting can be considered, the slow errors all together."""
@@ -86,15 +86,15 @@ def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
 @law(consistency.not_negative)
 @given(value=ANY | NUMBERS)
 def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None:
-    told = answered(lambda: consistency.not_negative("sigma", value))
+    checked = answered(lambda: consistency.not_negative("sigma", value))
     good = np.shape(value) in ((), (3,)) and bool((np.asarray(value) >= 0).all())
-    assert (told is not None) == good
-    np.testing.assert_array_equal(told if good else value, value)
+    assert (checked is not None) == good
+    np.testing.assert_array_equal(checked if good else value, value)
 
 
 @law(consistency.checked_samples)
 @given(rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5))
-def test_samples_keep_what_was_measured_and_say_how(
+def test_checked_samples_keep_measured_angles_and_mark_lost_and_limited_ones(
     rng: np.random.Generator, angle: NDArray, lost: NDArray
 ) -> None:
     t_s = np.cumsum(rng.uniform(0.01, 0.1, 5))
@@ -115,14 +115,14 @@ def test_samples_keep_what_was_measured_and_say_how(
 
 @law(consistency.checked_covariances, consistency.is_covariance)
 @given(rng=SEEDS, any_matrix=NUMBERS | arrays("f8", (3, 3), elements=ANY))
-def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(
+def test_a_solution_s_covariance_is_the_sum_of_noise_and_common_errors(
     rng: np.random.Generator, any_matrix: NDArray
 ) -> None:
     noise = covariance(rng, 3)
     common = covariance(rng, 3)
-    told = consistency.checked_covariances(noise + common, common)
-    np.testing.assert_allclose(told[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
-    np.testing.assert_array_equal(told[1], told[1].T)
+    covariances = consistency.checked_covariances(noise + common, common)
+    np.testing.assert_allclose(covariances[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
+    np.testing.assert_array_equal(covariances[1], covariances[1].T)
     assert consistency.is_covariance(noise)
     assert not consistency.is_covariance(noise - 2 * np.trace(noise) * np.eye(3))
     assert consistency.is_covariance(np.outer(noise[0], noise[0]), singular=True)
@@ -209,7 +209,7 @@ def test_the_slow_error_returns_to_its_unit_variance(
 
 @law(states.decorrelate)
 @given(rng=SEEDS)
-def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random.Generator) -> None:
+def test_a_rotation_decorrelates_the_slow_error_alone(rng: np.random.Generator) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
     before = state_of(rng, layout)
     after = states.decorrelate(before, TRACKER, layout)
@@ -230,7 +230,7 @@ def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random
 
 @law(correct.innovation, correct.offset_rows)
 @given(rng=SEEDS, off_rad=some.floats(0, 0.5))
-def test_the_residual_follows_the_errors_that_it_is_linear_in(
+def test_the_residual_is_linear_in_the_error_states(
     rng: np.random.Generator, off_rad: float
 ) -> None:
     layout = states.build_layout(GYRO, TRACKER, ())
@@ -261,7 +261,7 @@ def test_the_residual_follows_the_errors_that_it_is_linear_in(
 
 @law(correct.correct)
 @given(rng=SEEDS, considered=CHOICES)
-def test_a_correction_leaves_the_considered_and_shrinks_the_estimated(
+def test_a_correction_shrinks_estimated_states_and_keeps_considered_ones(
     rng: np.random.Generator, considered: tuple[str, ...]
 ) -> None:
     layout = states.build_layout(GYRO, TRACKER, considered)
@@ -308,7 +308,9 @@ def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(
 
 @law(correct.wxyz_of, correct.right_jacobian, correct.root)
 @given(rng=SEEDS, length=some.floats(0, 3))
-def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, length: float) -> None:
+def test_rotation_vectors_and_matrix_roots_reproduce_their_arguments(
+    rng: np.random.Generator, length: float
+) -> None:
     some_turn = turn(rng)
     same = Rotation.from_quat(correct.wxyz_of(some_turn), scalar_first=True) * some_turn
     assert same.magnitude() < 1e-12
@@ -338,7 +340,7 @@ def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, leng
     lost=some.floats(0, 10),
     support=some.integers(0, 10000),
 )
-def test_odds_rise_with_what_speaks_against_the_filter(
+def test_odds_rise_with_evidence_against_the_filter(
     angle: float, distance: float, agreeing: int, since_s: float, lost: float, support: int
 ) -> None:
     model = JumpModel()
@@ -361,7 +363,7 @@ def test_odds_rise_with_what_speaks_against_the_filter(
 
 @law(consistency.shock_rad)
 @given(rng=SEEDS, step=some.floats(1e-3, 1.0), slope=some.floats(-10, 10))
-def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
+def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_not(
     rng: np.random.Generator, step: float, slope: float
 ) -> None:
     at = int(rng.integers(2, 18))
@@ -379,15 +381,15 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
 @law(FilterState.sigma, AttitudeFilter.state)
 @given(rng=SEEDS)
 def test_the_sigma_of_each_state_is_its_part_of_the_covariance(rng: np.random.Generator) -> None:
-    told = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
+    state = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
     parts = [
-        told.sigma_attitude_rad,
-        told.sigma_bias_rad_s,
-        *(told.sigma(name) for name in told.others),
+        state.sigma_attitude_rad,
+        state.sigma_bias_rad_s,
+        *(state.sigma(name) for name in state.others),
     ]
     np.testing.assert_allclose(
-        np.concatenate(parts) ** 2, np.diag(told.covariance), rtol=1e-12, atol=0
+        np.concatenate(parts) ** 2, np.diag(state.covariance), rtol=1e-12, atol=0
     )
-    assert list(told.others) == ["scale", "misalignment", "mounting"]
+    assert list(state.others) == ["scale", "misalignment", "mounting"]
     with pytest.raises(KeyError):
-        told.sigma("attitude")
+        state.sigma("attitude")

@@ -49,7 +49,7 @@ def measured(
 # ---- A tumble, integrated by another method ----
 
 
-def test_the_gyro_is_followed() -> None:
+def test_the_filter_integrates_the_gyro() -> None:
     t_s = np.arange(4001) / 400
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 0.0, 0.0)
     mekf.propagate(t_s[1:], tumble_angle_rad(t_s), np.zeros(4000, bool))
@@ -76,7 +76,7 @@ def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
 
 
 @pytest.mark.slow
-def test_an_error_common_to_all_solutions_stays_and_is_claimed() -> None:
+def test_an_error_common_to_all_solutions_remains_in_the_covariance() -> None:
     """Fifteen solutions with a common error of covariance S and noise of S / 9: NEES 3, less what S adds as noise."""
     rng = np.random.default_rng(15)
     common_rad2 = TRACKER_RAD2
@@ -147,7 +147,9 @@ def farrenkopf(
 @pytest.mark.parametrize(
     ("s_u", "s_v", "period_s"), [(0.05, 0.3, 1.0), (1.0, 0.1, 1.0), (0.3, 2.0, 0.25)]
 )
-def test_farrenkopf_s_steady_state(s_u: float, s_v: float, period_s: float) -> None:
+def test_the_variance_reaches_farrenkopf_s_steady_state(
+    s_u: float, s_v: float, period_s: float
+) -> None:
     sigma_rad = 20 * ARCSEC_RAD
     arw = s_v * sigma_rad / period_s**0.5
     walk = s_u * sigma_rad / period_s**1.5
@@ -186,7 +188,7 @@ def test_the_transition_is_the_exponential_of_the_error_s_equation(angle_rad: fl
     assert np.abs(rows - expm(slope)[:3]).max() < 1e-14
 
 
-def test_a_large_correction_leaves_the_solution_s_covariance() -> None:
+def test_after_a_large_correction_the_covariance_is_the_solution_s() -> None:
     spread = np.diag([1.0, 4.0, 30.0]) ** 2 * 1e-8
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e3, 0.0, floor_rad=3e-4)
     attitude = Rotation.from_rotvec([1.0, -0.6, 0.8])
@@ -221,7 +223,7 @@ def drawn(gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Ge
 
 
 @pytest.mark.long
-def test_the_errors_are_what_the_covariance_says() -> None:
+def test_the_errors_match_the_covariance() -> None:
     # Solutions once a second, for a moment 0.3025 s ago, in the middle of a sample; 4 sigma of a chi-square's mean.
     runs = 300
     seconds = 5
@@ -489,7 +491,7 @@ class Blow:
 
 
 @pytest.mark.parametrize("limit_deg_s", [10.0, 100.0])
-def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_deg_s: float) -> None:
+def test_after_a_blow_the_filter_recovers_and_keeps_its_bias(limit_deg_s: float) -> None:
     blow = Blow(np.radians(limit_deg_s))
     rng = np.random.default_rng(67)
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
@@ -503,7 +505,7 @@ def test_after_a_blow_the_filter_comes_back_and_its_bias_is_not_spoiled(limit_de
     assert (np.abs(state.bias_rad_s - before.bias_rad_s) < before.sigma_bias_rad_s).all()
 
 
-def test_without_the_flag_the_blow_is_laid_to_the_bias() -> None:
+def test_without_the_saturation_flag_the_blow_corrupts_the_bias() -> None:
     blow = Blow(np.radians(10.0))
     rng = np.random.default_rng(67)
     trusting = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S, gate_sigma=np.inf)
@@ -518,7 +520,7 @@ def test_without_the_flag_the_blow_is_laid_to_the_bias() -> None:
     assert (np.abs(state.bias_rad_s - blow.bias_rad_s) < 4 * state.sigma_bias_rad_s).all()
 
 
-def test_plain_integration_is_wrong_by_the_missed_angle_for_good() -> None:
+def test_plain_integration_keeps_the_missed_angle_as_an_error() -> None:
     blow = Blow(np.radians(10.0), bias_rad_s=0.0)
     plain = AttitudeFilter(QUIET, 0.0, HOME, 0.0, 0.0)
     missed_rad = 0.2 * 2 * blow.limit_rad_s
@@ -581,7 +583,7 @@ def wild(*rotvec: float) -> Rotation:
 
 
 @pytest.mark.slow
-def test_the_gate_is_as_rare_as_so_many_sigma() -> None:
+def test_the_gate_rejects_as_rarely_as_its_number_of_sigma() -> None:
     # 1.5 sigma of one normal number is exceeded in 13.4 % of draws, here from the filter's own uncertainty.
     rng = np.random.default_rng(64)
     count = 500
@@ -595,7 +597,7 @@ def test_the_gate_is_as_rare_as_so_many_sigma() -> None:
     assert abs(outside / count - 0.1336) < 4 * np.sqrt(0.1336 * 0.8664 / count)
 
 
-def test_a_single_wild_solution_is_refused_and_harmless() -> None:
+def test_a_single_outlier_is_rejected_without_effect() -> None:
     mekf = turning()
     untouched = turning()
     update = after_turning(mekf, 3, wild(0.5, 0, 0))
@@ -611,7 +613,7 @@ def test_a_single_wild_solution_is_refused_and_harmless() -> None:
         same(mekf.state, untouched.state)
 
 
-def test_wild_solutions_that_disagree_are_refused_for_ever() -> None:
+def test_outliers_that_disagree_are_always_rejected() -> None:
     mekf = turning()
     rng = np.random.default_rng(65)
     for k in range(3, 15):
@@ -645,7 +647,7 @@ def test_a_jump_during_an_outage_is_taken_at_the_third_solution(outage: int) -> 
     assert after_turning(mekf, 6, jump).status == USED
 
 
-def test_a_good_solution_between_ends_the_row() -> None:
+def test_a_good_solution_resets_the_count_of_agreeing_outliers() -> None:
     mekf = turning()
     jump = wild(0.3, -0.2, 0.6)
     got = [
@@ -680,7 +682,7 @@ def refused_then(
 @pytest.mark.parametrize(
     ("axis", "status"), [((0.0, 0.0, 4e-3), RESET), ((0.0, 4e-3, 0.0), OUTSIDE_GATE)]
 )
-def test_an_earlier_error_turns_with_the_body_before_it_is_compared(
+def test_an_earlier_residual_is_rotated_with_the_body_before_comparison(
     axis: tuple[float, ...], status: str
 ) -> None:
     """The first solution is 4 sigma off in roll about z (allowed), or as much about y (400 sigma).
@@ -719,7 +721,7 @@ def test_solutions_confirm_each_other_within_what_the_bias_turns(
         (np.eye(2), r"allowed: \(3, 3\)"),
     ],
 )
-def test_a_bad_covariance_is_one_clear_line(covariance: np.ndarray, what: str) -> None:
+def test_a_bad_covariance_is_refused_in_one_line(covariance: np.ndarray, what: str) -> None:
     with pytest.raises(ValueError, match=f"update: covariance_rad2 .*{what}") as caught:
         AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 1e-5).update(0.0, HOME, covariance)
     assert "\n" not in str(caught.value)
@@ -738,7 +740,7 @@ def test_a_bad_covariance_is_one_clear_line(covariance: np.ndarray, what: str) -
         ([9.0], np.zeros((1, 3)), [False], "a tenth of bias_time_s"),
     ],
 )
-def test_bad_samples_are_one_clear_line(
+def test_bad_samples_are_refused_in_one_line(
     t_s: list, angle: np.ndarray, saturated: list, what: str
 ) -> None:
     mekf = AttitudeFilter(GyroModel(1e-5, 1e-6, 20.0), 1.0, HOME, 1e-3, 1e-5)

@@ -117,7 +117,7 @@ MODELS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("considers", [False, True])
-def test_each_state_s_errors_are_what_the_covariance_says(name: str, considers: bool) -> None:
+def test_each_state_s_errors_match_its_covariance(name: str, considers: bool) -> None:
     attitude, every, states = squared(MODELS[name], MODELS[name], (name,) if considers else ())
     assert 2.5 < attitude < 3.5
     assert abs(every - states) < 4 * np.sqrt(2 * states / RUNS)
@@ -127,7 +127,7 @@ def test_each_state_s_errors_are_what_the_covariance_says(name: str, considers: 
 @pytest.mark.parametrize(
     "considered", [(), ("mounting", "systematic"), ("scale", "misalignment", "systematic")]
 )
-def test_all_states_together_are_what_the_covariance_says(considered: tuple[str, ...]) -> None:
+def test_all_states_together_match_their_covariance(considered: tuple[str, ...]) -> None:
     gyro = replace(SCALE, misalignment_rad=1e-3)
     attitude, every, states = squared((gyro, EVERYTHING), (gyro, EVERYTHING), considered)
     assert states == 18
@@ -137,7 +137,7 @@ def test_all_states_together_are_what_the_covariance_says(considered: tuple[str,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["scale", "misalignment", "mounting", "systematic"])
-def test_without_its_state_an_error_is_not_claimed(name: str) -> None:
+def test_an_error_without_a_state_is_not_in_the_covariance(name: str) -> None:
     attitude, _, _ = squared(MODELS[name], (GYRO, TrackerModel()), (), runs=20)
     assert attitude > 10
 
@@ -147,7 +147,7 @@ def test_without_its_state_an_error_is_not_claimed(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("named_by", ["the filter's model", "the solutions", "half each"])
-def test_a_constant_error_of_the_tracker_is_claimed_once(named_by: str) -> None:
+def test_a_constant_tracker_error_is_not_averaged_down(named_by: str) -> None:
     """30 arcsec about each axis, in 60 solutions of 10 arcsec at rest: NEES 3, and the claim is 30 to 32 arcsec."""
     rng = np.random.default_rng(30)
     nees = []
@@ -189,7 +189,7 @@ def test_an_error_that_changes_faster_than_assumed_does_not_close_the_gate() -> 
     ).all()
 
 
-def test_the_slow_error_is_another_one_after_a_turn() -> None:
+def test_a_rotation_decorrelates_the_slow_error_of_the_tracker() -> None:
     """Two solutions with the same slow error S average to S, and to S / 2 if the vehicle turned a long way between."""
     noise_rad2 = (0.1 * ARCSEC_RAD) ** 2 * np.eye(3)
     sigma = 30 * ARCSEC_RAD
@@ -232,7 +232,7 @@ def turning_about(
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_turn_shows_the_scale_factor_of_its_axis_alone(axis: int) -> None:
+def test_a_rotation_makes_only_its_axis_scale_factor_observable(axis: int) -> None:
     state = turning_about(axis, 40, replace(SCALE, misalignment_rad=1e-3))
     sigma = state.sigma("scale")
     elsewhere = np.arange(3) != axis
@@ -248,7 +248,7 @@ def test_a_turn_shows_the_scale_factor_of_its_axis_alone(axis: int) -> None:
     assert (state.sigma("misalignment")[~seen] > 0.9e-3).all()
 
 
-def test_at_rest_no_error_of_the_gyro_s_matrix_shows() -> None:
+def test_at_rest_no_scale_or_misalignment_is_observable() -> None:
     gyro = replace(SCALE, misalignment_rad=1e-3)
     mekf = AttitudeFilter(gyro, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS)
     for k in range(20):
@@ -289,7 +289,7 @@ def test_the_rate_is_corrected_by_the_gyro_s_matrix() -> None:
 # ---- Bad options ----
 
 
-def test_bad_options_are_one_clear_line() -> None:
+def test_bad_options_are_refused_in_one_line() -> None:
     def built(**options: object) -> AttitudeFilter:
         return AttitudeFilter(GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, **options)  # type: ignore[arg-type]
 

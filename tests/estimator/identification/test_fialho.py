@@ -100,7 +100,7 @@ PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 @pytest.mark.parametrize("optimized", [False, True])
 @pytest.mark.parametrize("gate", [1.0, np.inf])
-def test_the_triplets_are_brute_force_s(gate: float, optimized: bool) -> None:
+def test_the_triplets_match_brute_force(gate: float, optimized: bool) -> None:
     rng = np.random.default_rng(101)
     known = uniform_sky(250, 102)
     total = 0
@@ -113,7 +113,7 @@ def test_the_triplets_are_brute_force_s(gate: float, optimized: bool) -> None:
     assert total > 5
 
 
-def test_the_number_of_triplets_is_theory_s(sky: pair_index.PairIndex) -> None:
+def test_the_number_of_triplets_matches_theory(sky: pair_index.PairIndex) -> None:
     # Reference section 4: f3 = N (N-1) (N-2) sin(a) sin(eps) 2 (2 eps)^2 / (4 pi sin K), halved by handedness.
     rng = np.random.default_rng(103)
     eps = np.radians(0.1)
@@ -264,7 +264,7 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(
     assert fialho_3(cluster, sky, 5 * SIGMA_RAD) is None
 
 
-def test_an_error_of_magnitude_that_is_none_is_refused(sky: pair_index.PairIndex) -> None:
+def test_an_invalid_magnitude_error_is_refused(sky: pair_index.PairIndex) -> None:
     seen, light, _, _ = field(np.random.default_rng(112), sky)
     with pytest.raises(
         ImageError, match=r"fialho: tolerance 0\.1 rad, magnitude error 0; allowed: more than 0"

@@ -140,7 +140,7 @@ def test_another_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", named("fialho_3", "fialho_4", "shefex", "saa"))
-def test_false_stars_are_withstood(sky: pair_index.PairIndex, name: str) -> None:
+def test_false_stars_do_not_prevent_identification(sky: pair_index.PairIndex, name: str) -> None:
     # A third of 18 and more stars is false. A false star may pass for a star near it: once in a thousand.
     found = 0
     for one in fields(sky, 20, 94, least=12, false=6):
@@ -165,7 +165,7 @@ def test_without_magnitudes_geometry_is_enough(sky: pair_index.PairIndex, name: 
 
 
 @pytest.mark.parametrize("name", PAPERS)
-def test_what_it_cannot_work_with_is_refused(sky: pair_index.PairIndex, name: str) -> None:
+def test_unusable_input_of_an_identifier_is_refused(sky: pair_index.PairIndex, name: str) -> None:
     one = fields(sky, 1, 96)[0]
     method: Callable[..., StarMatch | None] = IDENTIFIERS[name]
     assert method(one.seen[:3], sky, 1e-4) is None

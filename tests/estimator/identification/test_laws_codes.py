@@ -69,7 +69,7 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
     assert found[0, 0] <= led_codes.expected_misfit(np.array([19]))[0] + GROSS * gross
 
 
-def test_a_true_word_is_seldom_suspicious() -> None:
+def test_a_true_code_word_is_seldom_called_suspicious() -> None:
     """Half of a chi-square exceeds the limit without its allowance for gross errors in 1 of 50 cases or fewer."""
     for measured in (3, 9, 19, 31):
         limit = led_codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
@@ -91,7 +91,7 @@ def test_noise_beyond_the_declared_is_found_from_the_misfits(
 
 @law(led_naming.is_supported)
 @given(lights=some.integers(2, 6), rival=some.floats(0.0, 30.0))
-def test_names_hold_only_at_a_common_time_and_against_the_other_lights(
+def test_names_require_a_common_time_and_consistency_with_the_other_lights(
     lights: int, rival: float
 ) -> None:
     """Two lights that are perfect at different phases of the clock, or together at one; and lights without a name."""
@@ -178,7 +178,7 @@ def test_codes_that_name_nothing_are_refused(levels: Floats) -> None:
 
 
 @pytest.mark.parametrize(("excess", "decided"), [(2.0, False), (11.0, False), (12.0, True)])
-def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likely(
+def test_two_lights_are_named_if_every_other_pair_is_1e5_times_less_likely(
     excess: float, decided: bool
 ) -> None:
     """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""

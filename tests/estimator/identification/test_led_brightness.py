@@ -68,7 +68,7 @@ def test_the_evidence_of_a_brightness_is_a_bayes_factor() -> None:
 
 
 @pytest.mark.parametrize("known", ["map", "exposure", "neither"])
-def test_without_brightness_the_evidence_is_that_of_the_places(known: str) -> None:
+def test_without_brightness_the_evidence_depends_on_positions_alone(known: str) -> None:
     evidence = interpreted("estimator.identification.led_evidence")
     dome = build_dome_index(grid(LEVELS if known == "map" else None), LEVER, CAMERA)
     flux_s = np.full(3, FLUX_S) if known == "exposure" else None
@@ -79,7 +79,7 @@ def test_without_brightness_the_evidence_is_that_of_the_places(known: str) -> No
 
 
 @pytest.mark.slow
-def test_brightness_tells_the_fields_of_a_grid_apart() -> None:
+def test_brightness_distinguishes_the_fields_of_a_grid() -> None:
     """Equal LEDs on a grid are ambiguous everywhere; with three levels nearly all attitudes are found, none wrong."""
     leds = grid(LEVELS)
     trackers = {

@@ -79,7 +79,7 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.7, 0.5)])
-def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, float]) -> None:
+def test_two_iterations_of_the_attitude_reach_the_truth(axis: tuple[float, float, float]) -> None:
     """Gauss-Newton of exact detections squares the error: 0.5 deg, some 1e-4 rad, below 1e-6 rad."""
     dome, detections, R_cam_from_lab = wide_field(
         Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
@@ -92,7 +92,7 @@ def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, fl
 
 
 @pytest.mark.parametrize("uncertainty", [0.0, 0.1])
-def test_the_information_is_that_of_the_projection_s_slopes(uncertainty: float) -> None:
+def test_the_information_matches_the_projection_s_derivatives(uncertainty: float) -> None:
     """J' J / sigma^2, J the tangents' derivatives by a rotation of the camera about the bearing, by differences.
 
     And by the logarithm of the focal length, if that is uncertain.
@@ -120,7 +120,7 @@ def test_the_information_is_that_of_the_projection_s_slopes(uncertainty: float) 
 
 
 @pytest.mark.slow
-def test_two_fits_of_attitude_and_focal_length_come_to_the_truth() -> None:
+def test_two_iterations_of_attitude_and_focal_length_reach_the_truth() -> None:
     """Tangents of a lens 8 % longer than assumed; the start is 0.3 deg and 1 % off."""
     dome, detections, R_cam_from_lab = wide_field(
         Rotation.from_euler("xyz", [5, -8, 30], degrees=True)

@@ -1,4 +1,4 @@
-"""LEDs told apart at a finite distance: equal ones, dead ones, reflections, domes of any shape, and twins."""
+"""Identification of LEDs at a finite distance: equal LEDs, dead LEDs, reflections, any dome shape, and twins."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def names_right(match: StarMatch, names: Floats) -> bool:
         pytest.param(0.5, 5, 0.15, marks=pytest.mark.long),
     ],
 )
-def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least):
+def test_equal_leds_are_identified_and_never_wrongly(surface, dead, false, least):
     truth = spread(1400, surface, 1)
     leds = surveyed(truth, 2)
     dome = build_dome_index(leds, LEVER, CAMERA)
@@ -124,7 +124,7 @@ def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least
     assert found >= least * 80
 
 
-def test_a_better_survey_finds_leds_of_which_half_are_dead():
+def test_an_accurate_survey_identifies_leds_of_which_half_are_dead():
     """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
     truth = spread(1400, OVAL, 4)
     dome = build_dome_index(truth, LEVER, CAMERA)
@@ -138,7 +138,7 @@ def test_a_better_survey_finds_leds_of_which_half_are_dead():
 
 
 @pytest.mark.long
-def test_lights_that_fell_anywhere_are_no_attitude():
+def test_random_lights_give_no_attitude():
     """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
     dome = build_dome_index(leds, LEVER, CAMERA)
@@ -211,18 +211,18 @@ def seen_by_tracker(leds: LedMap, yaw_deg: float) -> tuple[str, float]:
 @pytest.mark.parametrize(
     "turns", [(0.0, 180.0), (0.0, 120.0, 240.0)], ids=["two boards", "three boards"]
 )
-def test_a_pattern_that_is_its_own_twin_is_called_ambiguous(turns):
+def test_a_symmetric_pattern_is_called_ambiguous(turns):
     assert seen_by_tracker(boards(turns, extra=False), 33.0)[0] == led_search.AMBIGUOUS
 
 
-def test_one_light_that_breaks_the_symmetry_is_enough():
+def test_one_light_that_breaks_the_symmetry_makes_the_attitude_unique():
     status, error_deg = seen_by_tracker(boards((0.0, 120.0, 240.0), extra=True), 33.0)
     assert status == "solved"
     # .05 px across a pattern of 500 px: .006 deg of roll; five times that.
     assert error_deg < 0.03
 
 
-def test_too_few_lights_are_no_attitude():
+def test_too_few_lights_give_no_attitude():
     leds = spread(300, OVAL, 12)
     dome = build_dome_index(leds, LEVER, CAMERA)
     for count in range(3):
@@ -332,7 +332,7 @@ def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
     assert 100 < found < 400
 
 
-def test_a_ray_meets_the_sphere_of_an_led_s_radius() -> None:
+def test_a_ray_intersects_the_sphere_of_an_led_s_radius() -> None:
     """From the pupil along the ray: the point is `radius_m` from the bearing, and its direction is returned."""
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     for ray in CAMERA.rays(np.array([[0.0, 0.0], [1599.0, 300.0], [799.5, 599.5]])):
@@ -380,7 +380,9 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
 @pytest.mark.parametrize(
     ("dead", "required", "found"), [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)]
 )
-def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, found: int) -> None:
+def test_the_quick_check_stops_once_the_outcome_is_decided(
+    dead: list[int], required: int, found: int
+) -> None:
     """Five exact detections; without the LEDs of some it ends where the rest cannot reach what is required."""
     places = np.array([[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02]])
     position_m = np.column_stack([places, np.full(5, 1.2192)])
@@ -417,7 +419,7 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
 
 
 @pytest.mark.parametrize("ratio", [0.89, 1.0, 1.11])
-def test_a_pair_tells_the_focal_length_at_which_it_is_two_leds(ratio: float) -> None:
+def test_a_pair_gives_the_focal_length_at_which_it_matches_two_leds(ratio: float) -> None:
     """At the exact chord, radii of 1.1 m and 1.3 m; the error left by three iterations is below 1e-6."""
     rays = CAMERA.rays(np.array([[100.0, 300.0], [1500.0, 900.0]]))
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
@@ -450,7 +452,7 @@ def test_a_second_pair_is_the_first_that_shares_the_fewest_detections_with_the_b
         assert PLAIN._disjoint_pair(pairs, rank, best) == wanted
 
 
-def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
+def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     """The integral of a normal density of the three errors over the prior's volume: sqrt(det 2 pi P) / V."""
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
@@ -549,7 +551,7 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
 
 
 @pytest.mark.long
-def test_lights_that_fell_anywhere_have_no_attitude_at_any_focal_length() -> None:
+def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
     """As for a calibrated camera: evidence of x powers of ten is met in one frame of 10^x at most."""
     dome = build_dome_index(surveyed(spread(1400, OVAL, 6), 7), LEVER, CAMERA.zoomed(0.88))
     rng = np.random.default_rng(8)

@@ -124,7 +124,7 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
         assert charged - free == pytest.approx(0.07 * missing, abs=1e-12)
 
 
-def test_the_tail_of_chance_matches_is_the_binomial_s_down_to_the_least_number() -> None:
+def test_the_tail_of_chance_matches_is_binomial_down_to_the_least_number() -> None:
     """Beyond 1e-300, which doubles hardly hold, it stays there: a finite evidence."""
     chance = interpreted("estimator.identification.chance")
     for trials, hits, p in ((10, 4, 0.01), (30, 12, 1e-4), (5, 5, 0.3), (40, 1, 1e-3)):
@@ -183,7 +183,7 @@ def triangle(sides_rad: Floats) -> Floats:
         ((1.0, 1.0, 1.018), False, 0),
     ],
 )
-def test_a_triangle_s_sides_must_agree_on_one_focal_length(
+def test_the_sides_of_a_triangle_must_agree_on_one_focal_length(
     scale: tuple[float, float, float], unknown: bool, hypotheses: int
 ) -> None:
     """The stretch of 0.015 is one factor of all sides if the focal length is unknown, and else each side's own."""
@@ -243,7 +243,7 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
 
 
 @pytest.mark.parametrize("name", ["pyramid", "shefex"])
-def test_as_many_triangles_are_tried_as_allowed(name: str) -> None:
+def test_the_number_of_triangles_tried_is_the_allowed_one(name: str) -> None:
     """The first three of four triangles have a false star; the first that has none is the last in order."""
     stars = unit(
         np.array(
@@ -532,7 +532,7 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
     assert several > 15
 
 
-def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
+def test_of_two_stars_with_one_partner_the_cheaper_keeps_it() -> None:
     for costs, kept in (([1.0, 2.0], 0), ([2.0, 1.0], 2)):
         partner = np.array([7, 3, 7, -1])
         cost = np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
@@ -640,9 +640,9 @@ def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
     rays, _, _, index, _ = field(1)
     asked: list[tuple[int, ...]] = []
 
-    def no_triplet(*told: object) -> object:
-        asked.append(tuple(told[3]))
-        told[5][1] += 7
+    def no_triplet(*arguments: object) -> object:
+        asked.append(tuple(arguments[3]))
+        arguments[5][1] += 7
         return FIALHO.no_match()
 
     monkeypatch.setattr(FIALHO, "triplets", no_triplet)

@@ -135,7 +135,7 @@ def test_each_blob_and_each_star_is_matched_once(sky: pair_index.PairIndex) -> N
 
 
 @pytest.mark.long
-def test_nothing_but_false_stars_gives_no_attitude(bright_sky: pair_index.PairIndex) -> None:
+def test_false_stars_alone_give_no_attitude(bright_sky: pair_index.PairIndex) -> None:
     # 1e-5 a field is what is promised; 2,000 fields would show 1.5e-3 with 95 %.
     rng = np.random.default_rng(63)
     fields = (rng.uniform(0, [658, 492], (rng.integers(4, 13), 2)) for _ in range(2000))
@@ -143,7 +143,7 @@ def test_nothing_but_false_stars_gives_no_attitude(bright_sky: pair_index.PairIn
 
 
 @pytest.mark.long
-def test_nothing_but_many_false_stars_gives_no_attitude(sky: pair_index.PairIndex) -> None:
+def test_many_false_stars_alone_give_no_attitude(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(64)
     fields = (rng.uniform(0, [658, 492], (40, 2)) for _ in range(60))
     assert sum(solved(xy, sky, triangles=60) is not None for xy in fields) == 0
@@ -217,14 +217,14 @@ def test_an_unknown_focal_length_is_measured_by_the_triangles(
 
 @pytest.mark.parametrize("trials", [1, 5, 12, 100])
 @pytest.mark.parametrize("p", [1e-6, 1e-3, 0.07, 0.5, 0.97])
-def test_the_tail_is_scipy_s_binomial(trials: int, p: float) -> None:
+def test_the_tail_matches_scipy_s_binomial(trials: int, p: float) -> None:
     for hits in range(trials + 1):
         wanted = stats.binom.logsf(hits - 1, trials, p) / np.log(10)
         # 1e-10: lgamma of a hundred, relatively 1e-16, times some hundreds; below 1e-300 there is a floor.
         assert log10_tail(trials, hits, p) == pytest.approx(max(wanted, -300), abs=1e-10)
 
 
-def test_more_hits_than_trials_cannot_be() -> None:
+def test_more_hits_than_trials_have_probability_zero() -> None:
     assert log10_tail(3, 4, 0.5) == -300
 
 

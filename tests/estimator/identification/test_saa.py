@@ -127,7 +127,7 @@ def test_a_symmetric_pattern_of_equal_leds_is_refused(places: Floats) -> None:
         assert found(seen, light, known) is None
 
 
-def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
+def test_a_square_of_unequal_leds_is_identified() -> None:
     # So that the refusal above is the symmetry's, not a gate's. Magnitudes 20 epsilons apart: at two to
     # four a full square, on which false assumptions find partners too, is mostly refused.
     rng = np.random.default_rng(76)
@@ -143,7 +143,7 @@ def test_the_same_square_of_unequal_leds_is_told_apart() -> None:
     assert named > 25  # at 97 % expected, 25 or fewer of 30 come once in a thousand
 
 
-def test_without_magnitudes_an_irregular_pattern_is_enough_and_a_k_vector_will_do() -> None:
+def test_without_magnitudes_an_irregular_pattern_is_identified_with_a_k_vector_too() -> None:
     rng = np.random.default_rng(77)
     places = rng.uniform(-3, 3, (14, 2))
     known = build_pair_catalog(patch(places), np.zeros(14))
@@ -159,7 +159,7 @@ def test_without_magnitudes_an_irregular_pattern_is_enough_and_a_k_vector_will_d
     assert right > 26  # at 98 % expected, 26 or fewer of 30 come three times in a thousand
 
 
-def test_a_mirror_image_and_mere_noise_are_refused() -> None:
+def test_a_mirror_image_and_pure_noise_are_refused() -> None:
     rng = np.random.default_rng(78)
     # Off the lattice: a lattice's mirror image has most of its places.
     places = LATTICE + rng.uniform(-0.3, 0.3, (12, 2))
@@ -171,7 +171,7 @@ def test_a_mirror_image_and_mere_noise_are_refused() -> None:
         assert found(seen, light, known) is None
 
 
-def test_three_stars_and_an_uncertain_focal_length_are_not_its_business() -> None:
+def test_saa_refuses_three_stars_and_an_uncertain_focal_length() -> None:
     known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
     assert saa(patch(LATTICE[:3]), known, SIGMA_RAD) is None
     with pytest.raises(

@@ -35,7 +35,7 @@ def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -
 @pytest.mark.parametrize(
     ("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)]
 )
-def test_cos_error_is_reference_h5_s_tolerance_of_angles(
+def test_cos_error_equals_reference_h5_s_angle_tolerance(
     angle_deg: float, tolerance_deg: float
 ) -> None:
     low, high = np.degrees(angle_interval(np.radians(angle_deg), 5.5e-5))
@@ -84,7 +84,7 @@ def observe(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[
 TOLERANCE_RAD = 500 * ARCSEC_RAD / np.sqrt(2)  # +-500 arcsec of an angle
 
 
-def test_nine_stars_on_a_screen_are_told_by_their_master() -> None:
+def test_nine_stars_on_a_screen_are_identified_by_their_master_star() -> None:
     rng = np.random.default_rng(120)
     found = 0
     for _ in range(40):

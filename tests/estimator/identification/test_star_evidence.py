@@ -144,9 +144,7 @@ def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> No
 
 
 @pytest.mark.parametrize(("sigmas", "matched"), [(3.4, 7), (3.6, 6)])
-def test_a_match_is_within_three_and_a_half_standard_deviations(
-    sigmas: float, matched: int
-) -> None:
+def test_only_stars_within_three_and_a_half_sigma_match(sigmas: float, matched: int) -> None:
     """Of the fitted place. The seventh star's error ellipse is wide and weighs a hundredth in the fit."""
     wide = 10 * SIGMA
     detections = seen(TANGENT[:7])
@@ -198,7 +196,7 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
 
 
 @pytest.mark.parametrize("uncertain", [0.0, 0.01])
-def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) -> None:
+def test_the_information_matches_the_projection_s_derivatives(uncertain: float) -> None:
     """J' W J of the tangents' derivatives by rotation and log focal length, by differences; in the interpreter."""
     plain = interpreted("estimator.identification.star_evidence")
     detections = seen(1.01 * TANGENT[:7])

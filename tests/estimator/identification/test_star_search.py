@@ -58,7 +58,7 @@ coordinate = st.one_of(st.floats(-1, 1), st.sampled_from([-1.0, 0.0, 1.0]))
 @settings(deadline=None)
 @given(coordinate, coordinate, coordinate, st.floats(1e-4, 0.05))
 @example(-1.0, -1.0, 0.921875, 0.046875)  # the star stands at a tangent of 1.13 of the face
-def test_the_nearest_star_is_that_of_a_tree(x: float, y: float, z: float, gate: float) -> None:
+def test_the_nearest_star_matches_a_k_d_tree(x: float, y: float, z: float, gate: float) -> None:
     where = np.array([x, y, z]) + 1e-3
     where /= np.linalg.norm(where)
     star, chord2 = sky_index.nearest(
@@ -79,7 +79,9 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("share", "brighter"), [(0.5, False), (0.5, True), (0.7, False)])
-def test_false_lights_may_be_the_brightest(share: float, brighter: bool) -> None:
+def test_a_field_is_identified_if_its_brightest_lights_are_false(
+    share: float, brighter: bool
+) -> None:
     """Half of the lights false and brighter than any star, or two in three: the search begins with false ones alone."""
     rng = np.random.default_rng(14)
     solved = 0
@@ -104,7 +106,7 @@ def test_false_lights_may_be_the_brightest(share: float, brighter: bool) -> None
     assert solved >= 38
 
 
-def test_lights_that_are_worse_along_than_across_count_as_they_are() -> None:
+def test_lights_with_elongated_errors_are_weighted_by_their_covariance() -> None:
     """Smeared stars: about y, which errors along x turn, the attitude errs as it says, and about x too."""
     rng = np.random.default_rng(12)
     scaled = []
@@ -140,7 +142,7 @@ def test_true_lights_give_the_true_attitude_and_names() -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_half_of_the_lights_may_be_false(known: bool) -> None:
+def test_a_field_is_identified_if_half_of_its_lights_are_false(known: bool) -> None:
     rng = np.random.default_rng(3)
     solved = 0
     for _ in range(40):
@@ -163,7 +165,7 @@ def test_half_of_the_lights_may_be_false(known: bool) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("zoom", [0.0, 0.05])
-def test_the_covariance_is_true(zoom: float) -> None:
+def test_the_covariance_matches_the_scatter(zoom: float) -> None:
     """NEES of 300 attitudes; with the focal length unknown to 5 % that of the zoom's own error too."""
     rng = np.random.default_rng(4)
     nees = []
@@ -198,7 +200,7 @@ def zoom_sigma(truth: Rotation, row, zoom: float) -> float:
 
 
 @pytest.mark.long
-def test_lights_that_fell_anywhere_are_refused() -> None:
+def test_random_lights_are_refused() -> None:
     """Evidence beyond 10^x is met in less than one of 10^x frames, and 10^4 is asked for: none of 200."""
     rng = np.random.default_rng(5)
     for _ in range(200):
@@ -235,7 +237,7 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     assert not len(solve(detections_of(tangent, mag, sigma=loose), twice).star)
 
 
-def test_one_light_of_another_brightness_costs_little() -> None:
+def test_one_light_of_wrong_brightness_costs_little_evidence() -> None:
     """A variable star, or a planet on a star: the others carry the answer, and it is matched all the same."""
     rng = np.random.default_rng(9)
     for _ in range(20):
@@ -264,7 +266,7 @@ def test_the_normal_equations_are_solved(seed: int) -> None:
     st.integers(0, 2**32 - 1),
     st.sampled_from([None, [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]]),
 )
-def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
+def test_a_matrix_has_the_rotation_of_its_quaternion(seed: int, axis) -> None:
     """Half turns, where the scalar part vanishes, as well."""
     rotation = (
         Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
@@ -408,7 +410,7 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
         ("FFFF", 3, 9, 4, False),
     ],
 )
-def test_the_quick_check_stops_as_soon_as_it_knows(
+def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
     true: str, required: int, max_misses: int, lookups: int, fits: bool
 ) -> None:
     """Four detections beside the pair, with (T) and without (F) a star at their place."""
@@ -429,7 +431,9 @@ def test_the_quick_check_stops_as_soon_as_it_knows(
 
 
 @pytest.mark.parametrize(("limit_mag", "matches"), [(np.nan, 4), (6.0, 0)])
-def test_all_lights_must_confirm_what_the_brightest_tell(limit_mag: float, matches: int) -> None:
+def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
+    limit_mag: float, matches: int
+) -> None:
     """Four exact stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
     rng = np.random.default_rng(4)
     truth = Rotation.random(rng=rng)

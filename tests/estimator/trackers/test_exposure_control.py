@@ -37,7 +37,7 @@ GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
         (replace(GOOD, stars=3, overexposed=3), 0.002, False, True),
     ],
 )
-def test_each_branch_of_the_chart(
+def test_each_branch_of_the_exposure_chart_is_followed(
     seen: Observation, change_s: float, saturated: bool, no_stars: bool
 ) -> None:
     after = step(NextExposure(0.03), seen, CONTROL)
@@ -53,7 +53,7 @@ def run(start_s: float, seen: Observation, count: int, control: Control) -> list
     return [state.time_s for state in states]
 
 
-def test_it_stops_at_either_limit_and_comes_back() -> None:
+def test_the_exposure_stops_at_either_limit_and_returns() -> None:
     dark = replace(GOOD, stars=0)
     bright = replace(GOOD, mean_dn=4000.0)
     assert run(0.0471, dark, 4, CONTROL) == pytest.approx(
@@ -84,7 +84,7 @@ def test_times_are_whole_microseconds_after_many_steps() -> None:
         ({"mean_dn": np.nan}, "mean_dn is NaN"),
     ],
 )
-def test_bad_limits_are_one_clear_line(limits: dict[str, float], what: str) -> None:
+def test_bad_limits_are_refused_in_one_line(limits: dict[str, float], what: str) -> None:
     with pytest.raises(ValueError, match=what) as caught:
         Control(**{"mean_dn": 100.0, **limits})
     assert "\n" not in str(caught.value)
@@ -133,8 +133,8 @@ def lit(lab: Lab, glare_e_s: float) -> Lab:
 
 
 def exposed(lab: Lab, time_s: float) -> Lab:
-    told = lab.scene.exposure.model_copy(update={"time_s": time_s})
-    return lab.with_scene(lab.scene.model_copy(update={"exposure": told}))
+    exposure = lab.scene.exposure.model_copy(update={"time_s": time_s})
+    return lab.with_scene(lab.scene.model_copy(update={"exposure": exposure}))
 
 
 def flown(
@@ -159,7 +159,7 @@ GLARE_E_S = 4e5
 
 
 @pytest.mark.slow
-def test_an_intruder_shortens_the_exposure_and_its_leaving_restores_the_stars(lab: Lab) -> None:
+def test_a_bright_intruder_shortens_the_exposure_until_it_leaves(lab: Lab) -> None:
     glare = [0.0] * 3 + [GLARE_E_S] * 19 + [0.0] * 12
     control = Control(mean_dn=150.0)
     states, seen = flown(lab, glare, 0.04, control)

@@ -55,7 +55,7 @@ def tracker(stars: catalog.StarCatalog) -> StarTracker:
 @pytest.mark.parametrize("detector", DETECTORS)
 @BRIEF
 @given(image=IMAGES, centroider=some.sampled_from(sorted(CENTROIDERS)))
-def test_any_image_gives_centroids_or_one_line(
+def test_any_image_gives_centroids_or_one_error_line(
     detector: str, centroider: str, image: NDArray
 ) -> None:
     try:
@@ -95,7 +95,7 @@ def test_no_lights_of_noise_have_an_attitude(
 @pytest.mark.parametrize("solver", SOLVERS)
 @BRIEF
 @given(count=some.integers(0, 6), data=some.data())
-def test_any_directions_give_a_rotation_or_one_line(
+def test_any_directions_give_a_rotation_or_one_error_line(
     solver: str, count: int, data: some.DataObject
 ) -> None:
     cam, ref = (data.draw(arrays("f8", (count, 3), elements=ANY)) for _ in range(2))
@@ -136,9 +136,9 @@ def test_hostile_pictures_are_refused(
 ) -> None:
     """No attitude but a true one, no exception, no second over two a megapixel, no eleventh frame of memory."""
     monkeypatch.setattr(hostile, "SEARCHED", 0.0)  # at all focal lengths: see the benchmark
-    told = hostile.judged(count, seed)
-    assert sum(one.looked for one in told.values()) == count
-    assert [line for one in told.values() for line in one.defects] == []
+    verdicts = hostile.judged(count, seed)
+    assert sum(one.looked for one in verdicts.values()) == count
+    assert [line for one in verdicts.values() for line in one.defects] == []
 
 
 @pytest.mark.parametrize("frames", [3, pytest.param(1000, marks=pytest.mark.long)])
@@ -151,13 +151,13 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> N
         picture, there = hostile.starry(np.random.default_rng([2026, n]))
         for seen in (picture[:, ::-1], picture[::-1]):
             assert not eye.solve(np.ascontiguousarray(seen)).attitude.solved
-        told = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
-        right += (told * there.inv()).magnitude() < metrics.WRONG_RAD
+        answered = eye.solve(picture).attitude.cam_from_ref or Rotation.identity()
+        right += (answered * there.inv()).magnitude() < metrics.WRONG_RAD
     assert right >= 0.9 * frames
 
 
 @pytest.mark.slow
-def test_four_stars_among_twice_as_many_strangers_are_no_sky(tmp_path: Path) -> None:
+def test_four_stars_among_twice_as_many_false_ones_are_refused(tmp_path: Path) -> None:
     """A mirrored sky that once had an answer: 4 of 12 lights on stars, a chance of one in ten thousand by itself."""
     name, shot, answer, _, _ = hostile.Judge(tmp_path).take(68, 14)
     assert (name, shot.skies) == ("mirrored", ())

@@ -47,7 +47,7 @@ def tracker(depth: float, bit_time_s: float | None = None, **settings: float) ->
     failing=some.sampled_from([0.0, 0.02]),
     gyro=some.booleans(),
 )
-def test_lights_are_named_by_their_codes_or_not_at_all(
+def test_lights_are_named_correctly_by_their_codes_or_not_at_all(
     rng: np.random.Generator, depth: float, rate_rad_s: float, failing: float, gyro: bool
 ) -> None:
     """Within a code's length of frames at 50 Hz, with 2 % of noise in the light."""

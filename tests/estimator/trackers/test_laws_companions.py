@@ -32,7 +32,7 @@ def tracker() -> StarTracker:
     return StarTracker(CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, merge_px=0.0))
 
 
-def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> None:
+def test_a_bright_double_star_does_not_bias_the_attitude(tracker: StarTracker) -> None:
     """A double 2.2" off, with half of the field's information: the NEES is 13, without the model of companions 25."""
     nees = []
     for seed in range(FIELDS):
@@ -58,7 +58,7 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
 
 @law(misfit.with_companions, misfit.are_small)
 @given(seed=some.integers(0, 10**6))
-def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed: int) -> None:
+def test_coarse_centroids_ignore_companions(tracker: StarTracker, seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = Rotation.random(rng=rng)
     stars = tracker.stars
@@ -78,7 +78,7 @@ def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed:
 
 @law(information_of)
 @given(seed=some.integers(0, 10**6))
-def test_the_information_holds_each_weight_at_its_axes(seed: int) -> None:
+def test_the_information_matrix_has_the_weights_as_elements(seed: int) -> None:
     weight = np.random.default_rng(seed).standard_normal((5, 3))
     for row, matrix in zip(weight, information_of(weight), strict=True):
         assert matrix.tolist() == [[row[0], row[2]], [row[2], row[1]]]
@@ -131,7 +131,7 @@ def test_a_star_loses_information_only_by_what_companions_explain(
 
 
 @pytest.mark.slow
-def test_shares_are_those_of_the_catalogs() -> None:
+def test_shares_of_companions_match_the_catalogs() -> None:
     """Hipparcos' entries against the center of light of Gaia's stars: shares beyond 0.5 and 1.5 seconds of arc."""
     entries = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
     when = catalog.on_earth(catalog.utc("2012-06-22T21:00"))
@@ -146,5 +146,5 @@ def test_shares_are_those_of_the_catalogs() -> None:
         off_arcsec.append(np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD)
     for limit in (0.5, 1.5):
         found = float(np.mean(np.array(off_arcsec) > limit))
-        told = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
-        assert told == pytest.approx(found, rel=0.5)
+        expected = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
+        assert expected == pytest.approx(found, rel=0.5)

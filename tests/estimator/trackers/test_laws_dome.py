@@ -76,7 +76,7 @@ def even(count: int) -> LedMap:
 @given(
     rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2))
 )
-def test_rays_meet_the_surface_on_their_way(
+def test_rays_intersect_the_surface_ahead_of_the_camera(
     rng: np.random.Generator, radius_m: float, place_m: Floats
 ) -> None:
     rays = units(rng, 9)
@@ -142,7 +142,7 @@ def test_a_focal_length_is_fitted_with_the_attitude(
 
 @law(nearfield.fitted_sigma_rad)
 @given(rng=SEEDS, name=some.sampled_from(sorted(SOLVERS)))
-def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(
+def test_the_error_of_a_fitted_parameter_is_that_of_a_shifted_pixel(
     rng: np.random.Generator, name: str
 ) -> None:
     """By differences: of a pixel shifted along x and along y, the turn of its ray and the change of its tangents."""
@@ -157,8 +157,8 @@ def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(
 
 @law(nearfield.infinity, nearfield.thesis, nearfield.thesis_points)
 @given(rng=SEEDS, name=some.sampled_from(["infinity", "thesis"]))
-def test_the_thesis_s_ways_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
-    """Some degrees by the field's few lights, and a light stands on its ray where the slip is put right."""
+def test_the_thesis_s_methods_are_near_the_truth(rng: np.random.Generator, name: str) -> None:
+    """Within a few degrees with few lights in view; with the corrected formula a light lies on its ray."""
     arm = lever(rng)
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, SPHERE, arm, truth, 12)
@@ -181,8 +181,8 @@ def test_any_rays_are_solved_or_refused(
     rng: np.random.Generator, rays: Floats, sigma: Floats, place: Floats, name: str
 ) -> None:
     arm = lever(rng)
-    told = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
-    assert told is None or told[1].shape == (3, 3)
+    solution = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
+    assert solution is None or solution[1].shape == (3, 3)
     answered(lambda: nearfield.thesis_points(rays, SPHERE, arm))
 
 
@@ -201,7 +201,7 @@ def eye() -> DomeTracker:
     dome_tracker.led_pairs,
 )
 @given(rng=SEEDS, false=some.integers(0, 4))
-def test_lights_are_named_as_they_are_or_not_at_all(
+def test_lights_are_named_correctly_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, false: int
 ) -> None:
     truth = turn(rng, 0.3)
@@ -211,12 +211,12 @@ def test_lights_are_named_as_they_are_or_not_at_all(
         [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
     )
     star = np.concatenate([star, np.full(false, -1)])
-    told = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
+    solution = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
     truth_cam = eye.lever.cam_from_body * truth
-    assert not told.solved or (told.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
+    assert not solution.solved or (solution.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
     assert (
-        not told.solved
-        or (star[told.match.observed] >= 0).sum() >= len(told.match.observed) - false
+        not solution.solved
+        or (star[solution.match.observed] >= 0).sum() >= len(solution.match.observed) - false
     )
     rays = CAMERA.rays(xy)
     sigma = np.full(len(xy), 1e-4)
@@ -248,7 +248,7 @@ def test_no_lights_of_noise_have_an_attitude_under_a_dome(
 
 @law(dome_tracker.non_dimensional)
 @given(rng=SEEDS, ratio=some.floats(0.9, 1.1), false=some.integers(0, 3))
-def test_leds_are_named_rightly_at_any_focal_length_or_not_at_all(
+def test_leds_are_named_correctly_at_any_focal_length_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, ratio: float, false: int
 ) -> None:
     truth = turn(rng, 0.3)
@@ -289,7 +289,7 @@ def test_a_warm_up_changes_no_answer_under_a_dome(
 
 @law(led_index.build_dome_index, led_index.build_grid, led_index.scale_pair_angles)
 @given(rng=SEEDS, count=some.integers(20, 60))
-def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
+def test_a_dome_index_covers_the_whole_dome(rng: np.random.Generator, count: int) -> None:
     leds = even(count)
     dome = led_index.build_dome_index(leds, lever(rng), CAMERA)
     grid = led_index.build_grid(leds.position_m / 1.2)
@@ -303,7 +303,7 @@ def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
 
 @law(led_index.corner_rays, led_index.inner_field, led_index.cap_height)
 @given(rng=SEEDS, factor=some.floats(0.3, 5), margin_rad=some.floats(0, 3))
-def test_a_field_holds_its_inner_one(
+def test_the_inner_field_is_smaller_than_the_field(
     rng: np.random.Generator, factor: float, margin_rad: float
 ) -> None:
     corners = led_index.corner_rays(CAMERA.zoomed(factor))
@@ -325,7 +325,7 @@ def test_a_field_holds_its_inner_one(
 @pytest.mark.parametrize(
     ("led_mm", "lever_mm", "noise_px"), [(0.5, 0.0, 0.5), (0.0, 1.0, 0.5), (0.4, 0.5, 0.2)]
 )
-def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
+def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
     led_mm: float, lever_mm: float, noise_px: float
 ) -> None:
     """A survey drawn once: over K frames of one attitude the mean error has covariance S + (P - S) / K."""
@@ -396,7 +396,7 @@ def test_a_spread_knows_scale_and_no_shift(
     spread=some.sampled_from(["pooled", "averaged"]),
     sine=some.booleans(),
 )
-def test_a_home_catalog_is_of_the_lights_that_were_shown(
+def test_a_home_catalog_holds_exactly_the_lights_shown(
     rng: np.random.Generator, frames: int, spread: str, sine: bool
 ) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
@@ -413,16 +413,16 @@ def test_a_home_catalog_is_of_the_lights_that_were_shown(
         )
         for _ in range(frames)
     ]
-    told = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
-    assert sorted(told.id) == sorted(leds.id)
-    assert (np.diff(told.brightness) <= 0).all()
-    assert (told.samples == frames).all()
-    for covariance in told.covariance_m2:
+    home = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine, spread)
+    assert sorted(home.id) == sorted(leds.id)
+    assert (np.diff(home.brightness) <= 0).all()
+    assert (home.samples == frames).all()
+    for covariance in home.covariance_m2:
         assert_covariance(covariance)
-    assert 0 < told.epsilon_pos_rad < 0.01
-    on = home_position.led_map(told, SPHERE)
+    assert 0 < home.epsilon_pos_rad < 0.01
+    on = home_position.led_map(home, SPHERE)
     np.testing.assert_allclose(np.linalg.norm(on.position_m, axis=1), 1.2, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(np.cross(on.position_m, told.vectors), 0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(on.position_m, home.vectors), 0, rtol=0, atol=1e-9)
 
 
 @law(home_position.calibrate)
@@ -432,7 +432,7 @@ def test_a_home_catalog_is_of_the_lights_that_were_shown(
     magnitude=NUMBERS,
     position=some.integers(0, 2),
 )
-def test_any_sightings_are_a_catalog_or_refused(
+def test_any_sightings_give_a_catalog_or_are_refused(
     led: NDArray, xy: NDArray, magnitude: NDArray, position: int
 ) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())

@@ -74,7 +74,7 @@ def test_right_model_keeps_its_covariance(tracker: StarTracker) -> None:
 @pytest.mark.parametrize(
     "times", [3, *(pytest.param(times, marks=pytest.mark.slow) for times in (2, 5))]
 )
-def test_noise_that_is_claimed_too_small_is_found(tracker: StarTracker, times: int) -> None:
+def test_understated_noise_is_found_from_the_misfit(tracker: StarTracker, times: int) -> None:
     assert 2 < errors_squared(tracker, CAMERA, 1 / times).mean() < 4.5
 
 
@@ -83,7 +83,7 @@ def test_noise_that_is_claimed_too_small_is_found(tracker: StarTracker, times: i
     [CAMERA.zoomed(1.003), replace(CAMERA, distortion=(0.15, 0.0, 0.0, 0.0, 0.0))],
     ids=["focal", "distortion"],
 )
-def test_lens_that_drifted_is_found(tracker: StarTracker, lens: Camera) -> None:
+def test_a_drifted_lens_is_found_from_the_misfit(tracker: StarTracker, lens: Camera) -> None:
     assert 2 < errors_squared(tracker, lens).mean() < 4
     _, centroids = field(tracker, 3, lens)
     found = tracker.solve_centroids(centroids).camera
@@ -96,7 +96,7 @@ def test_lens_that_drifted_is_found(tracker: StarTracker, lens: Camera) -> None:
 
 
 @pytest.mark.parametrize("claimed", [1.0, 0.8])
-def test_wider_errors_without_new_matches_need_no_match(
+def test_wider_errors_in_closed_form_match_the_full_evaluation(
     tracker: StarTracker, claimed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The closed form agrees with the evaluation of every factor, which an unmatched light beside a star asks for."""
@@ -131,7 +131,7 @@ def test_wider_errors_without_new_matches_need_no_match(
 
 @law(misfit.refit, misfit.with_lens, misfit.variance_of, StarTracker.refit, slow=True)
 @given(seed=some.integers(0, 10**6), claimed=some.floats(0.2, 3.0))
-def test_no_covariance_is_less_than_the_model_s(
+def test_the_covariance_is_never_below_the_model_s(
     tracker: StarTracker, seed: int, claimed: float
 ) -> None:
     _, centroids = field(tracker, seed, CAMERA, claimed)

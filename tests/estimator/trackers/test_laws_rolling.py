@@ -57,7 +57,7 @@ def error_arcsec(attitude: Attitude, seen: Moving) -> Floats:
     return (attitude.cam_from_ref * seen.cam_from_ref.inv()).as_rotvec() / ARCSEC_RAD
 
 
-def test_a_rolling_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker) -> None:
+def test_a_rolling_shutter_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker) -> None:
     blind = StarTracker(
         replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
     )
@@ -78,7 +78,7 @@ def test_a_rolling_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker
     assert signs == 6
 
 
-def test_an_uncorrected_shear_turns_the_field_by_what_it_should(tracker: StarTracker) -> None:
+def test_an_uncorrected_shear_rotates_the_field_as_predicted(tracker: StarTracker) -> None:
     """A shear s of x by y is best met by the roll -s sum(y^2) / sum(x^2 + y^2): of a slow rate, which still solves."""
     slow_deg_s = np.array([0.0, 0.05, 0.0])
     blind = StarTracker(
@@ -130,7 +130,7 @@ def test_of_two_signs_the_one_with_more_evidence_is_kept(
     assert [rate.sign_known for rate in tried] == [False, False]
 
 
-def test_rows_alone_tell_a_slow_rate_with_its_sign(tracker: StarTracker) -> None:
+def test_row_times_alone_determine_a_slow_rate_with_its_sign(tracker: StarTracker) -> None:
     for seed in range(3):
         seen, found = star_frame(tracker, seed, np.array([0.3, -0.2, 0.1]))
         attitude = tracker.solve_centroids(replace(found, streak_px=None), exposure_s=EXPOSURE_S)
@@ -140,28 +140,28 @@ def test_rows_alone_tell_a_slow_rate_with_its_sign(tracker: StarTracker) -> None
         assert_allclose(attitude.rate.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-5)
 
 
-def test_a_global_frame_s_rate_has_the_sign_that_a_gyro_tells(tracker: StarTracker) -> None:
+def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(tracker: StarTracker) -> None:
     still = StarTracker(
         replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
     )
     seen, _ = star_frame(tracker, 1)
     found = replace(seen, camera=still.camera).centroids()
     rough = RateEstimate(1.2 * seen.rate_rad_s, 1e-4 * np.eye(3))
-    told, open_sign = (
+    signed, open_sign = (
         still.solve_centroids(found, exposure_s=EXPOSURE_S, rate=rate).rate
         for rate in (rough, None)
     )
-    assert told is not None
+    assert signed is not None
     assert open_sign is not None
-    assert (told.sign_known, open_sign.sign_known) == (True, False)
-    assert_allclose(told.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-4)
+    assert (signed.sign_known, open_sign.sign_known) == (True, False)
+    assert_allclose(signed.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-4)
     assert_allclose(np.abs(open_sign.rate_rad_s), np.abs(seen.rate_rad_s), rtol=0, atol=1e-4)
     assert still.solve_centroids(found).rate is None
     with pytest.raises(ImageError, match=r"exposure_s: 0.0; allowed: finite, above 0"):
         still.solve_centroids(found, exposure_s=0.0)
 
 
-def test_leds_of_a_rolling_frame_are_solved_at_the_middle_row_s_time() -> None:
+def test_leds_of_a_rolling_shutter_frame_are_solved_at_the_middle_row_s_time() -> None:
     """On a dome of two radii, with the camera on its lever arm: the images of near LEDs move more."""
     rng = np.random.default_rng(4)
     camera = Camera(1600, 1200, 8000.0, (799.5, 599.5), row_time_s=80e-6)
@@ -200,7 +200,9 @@ def test_leds_of_a_rolling_frame_are_solved_at_the_middle_row_s_time() -> None:
     StarTracker.with_errors,
 )
 @given(rng=SEEDS)
-def test_candidates_hold_the_rate_and_refusals_stay(rng: np.random.Generator) -> None:
+def test_rolling_shutter_candidates_include_the_true_rate_and_refusals_stay(
+    rng: np.random.Generator,
+) -> None:
     stars = catalog.brighter_than(catalog.hipparcos(), 3.0)
     tracker = StarTracker(WIDE, stars, stars.vectors, SETTINGS)
     seen, found = star_frame(tracker, int(rng.integers(1000)))

@@ -85,10 +85,10 @@ class World:
     rng=SEEDS,
     name=some.sampled_from(sorted(IDENTIFIERS)),
     false=some.integers(0, 6),
-    told=some.booleans(),
+    with_magnitudes=some.booleans(),
 )
-def test_what_is_identified_is_what_is_there(
-    rng: np.random.Generator, name: str, false: int, told: bool
+def test_identified_stars_are_the_true_stars(
+    rng: np.random.Generator, name: str, false: int, with_magnitudes: bool
 ) -> None:
     """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
     world = World(rng)
@@ -96,7 +96,7 @@ def test_what_is_identified_is_what_is_there(
     seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
     mag = np.concatenate([world.mag[world.star], np.full(false, 6.0)])
     star = np.concatenate([world.star, np.full(false, -1)])
-    more = {"magnitude": mag, "epsilon_mag": 0.1} if told else {}
+    more = {"magnitude": mag, "epsilon_mag": 0.1} if with_magnitudes else {}
     match = IDENTIFIERS[name](seen, world.index, tolerance_rad, **more)
     # None is better than a guess.
     match = match or StarMatch(np.arange(len(world.star)), world.star, world.truth, -9.0)
@@ -121,15 +121,15 @@ def test_what_is_identified_is_what_is_there(
     mag=NUMBERS,
     name=some.sampled_from(sorted(IDENTIFIERS)),
 )
-def test_directions_of_nothing_are_no_stars(
+def test_random_directions_match_each_star_once_or_none(
     rng: np.random.Generator, rays: NDArray, tolerance: float, mag: NDArray, name: str
 ) -> None:
     world = World(rng, 60)
     count = len(rays)
     for light in (None, mag):
         more = {"max_checks": 100_000, "magnitude": light}
-        told = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
-        assert told is None or (len(set(told.observed.tolist())) == len(told.observed) <= count)
+        match = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
+        assert match is None or (len(set(match.observed.tolist())) == len(match.observed) <= count)
     with pytest.raises(ImageError, match="focal length is uncertain"):
         Options(focal_unknown=True).require_known_focal(name)
 
@@ -157,16 +157,16 @@ def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, 
 @law(Options.magnitudes, Options.require_known_focal)
 @given(mag=NUMBERS, count=some.integers(0, 6))
 @example(mag=np.array(3.0), count=1)
-def test_magnitudes_are_one_a_star_or_unknown(mag: NDArray, count: int) -> None:
-    told = answered(lambda: Options(magnitude=mag).magnitudes(count), ImageError)
-    assert (told is not None) == (mag.shape == (count,))
+def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> None:
+    magnitudes = answered(lambda: Options(magnitude=mag).magnitudes(count), ImageError)
+    assert (magnitudes is not None) == (mag.shape == (count,))
     assert np.isnan(Options().magnitudes(count)).tolist() == [True] * count
     Options().require_known_focal("any")
 
 
 @law(AssumptionPool.log10_chance, AssumptionPool.best_match)
 @given(rng=SEEDS)
-def test_a_pool_without_assumptions_answers_nothing(rng: np.random.Generator) -> None:
+def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) -> None:
     world = World(rng, 60)
     known = world.index
     unknown = np.full(len(world.seen), np.nan)
@@ -233,7 +233,7 @@ def seen_by(
 
 @law(FieldMatcher.nearest, FieldMatcher.refine)
 @given(rng=SEEDS)
-def test_a_field_is_matched_from_a_near_attitude(
+def test_a_field_is_matched_from_a_nearby_attitude(
     eye: StarTracker, rng: np.random.Generator
 ) -> None:
     truth = turn(rng)
@@ -248,7 +248,7 @@ def test_a_field_is_matched_from_a_near_attitude(
 
 @law(FieldMatcher.misfits, FieldMatcher.near_misses, FieldMatcher.fits, FieldMatcher.lens_radii_px)
 @given(rng=SEEDS, aside=some.booleans())
-def test_stars_beside_detections_tell_a_wrong_camera(
+def test_stars_beside_detections_reveal_a_wrong_camera(
     eye: StarTracker, rng: np.random.Generator, aside: bool
 ) -> None:
     truth = turn(rng)
@@ -282,7 +282,7 @@ def test_stars_beside_detections_tell_a_wrong_camera(
     Attitude.solved,
 )
 @given(rng=SEEDS, false=some.integers(0, 8))
-def test_an_attitude_is_the_sky_s_or_none(
+def test_an_attitude_is_correct_or_none(
     eye: StarTracker, rng: np.random.Generator, false: int
 ) -> None:
     truth = turn(rng)
@@ -296,15 +296,15 @@ def test_an_attitude_is_the_sky_s_or_none(
     assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
     xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
     mixed = Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
-    told = eye.solve_centroids(mixed)
+    solution = eye.solve_centroids(mixed)
     assert (
-        told.solved
-        == (told.status == "solved")
-        == (told.match is not None)
-        == (told.camera is not None)
+        solution.solved
+        == (solution.status == "solved")
+        == (solution.match is not None)
+        == (solution.camera is not None)
     )
-    assert not told.solved or (told.cam_from_ref * truth.inv()).magnitude() < 0.02
-    assert not told.solved or set(told.match.observed.tolist()) <= set(range(len(xy)))
+    assert not solution.solved or (solution.cam_from_ref * truth.inv()).magnitude() < 0.02
+    assert not solution.solved or set(solution.match.observed.tolist()) <= set(range(len(xy)))
 
 
 @pytest.mark.long
@@ -314,7 +314,7 @@ def test_an_attitude_is_the_sky_s_or_none(
     sigma_px=arrays("f8", 9, elements=ANY),
     flux=arrays("f8", 9, elements=ANY),
 )
-def test_any_lights_are_told_apart_from_a_sky(
+def test_any_valid_lights_get_an_answer_and_invalid_ones_are_refused(
     eye: StarTracker, xy_px: NDArray, sigma_px: NDArray, flux: NDArray
 ) -> None:
     lights = Centroids(xy_px, sigma_px, flux)
@@ -389,16 +389,18 @@ def test_mutual_neighbors_are_each_other_s_nearest(
     rows = rng.permutation(100)[: len(there)]
     hit, row = refinement.mutual_nearest(seen, there, radius_px, rows)
     between = np.linalg.norm(seen[:, None] - there, axis=2)
-    told = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
+    mutual = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
-    assert told == {
+    assert mutual == {
         (a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px
     }
 
 
 @law(refinement.log10_chance)
 @given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
-def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
+def test_more_matches_are_less_likely_by_chance(
+    blobs: int, predicted: int, radius_px: float
+) -> None:
     chances = [
         refinement.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000)
         for n in range(2, blobs + 1)
@@ -432,9 +434,9 @@ def test_a_tracker_s_answer_has_a_covariance(settings_: Settings) -> None:
     rng = np.random.default_rng(5)
     stars = drawn(rng, 800)
     eye = StarTracker(CAMERA, stars, stars.vectors, settings_)
-    told = eye.solve_centroids(seen_by(eye, rng, turn(rng))[0])
-    assert told.solved
-    assert_covariance(told.covariance_rad2)
+    solution = eye.solve_centroids(seen_by(eye, rng, turn(rng))[0])
+    assert solution.solved
+    assert_covariance(solution.covariance_rad2)
 
 
 @law(StarTracker.for_sky, catalog.hipparcos)

@@ -18,7 +18,7 @@ from tests.helpers.laws import law
 @given(
     array=some.sampled_from(["u1", "u2", ">u2", "?", "i1", "i2", ">i4", "i8", "f2", "f4", ">f8"])
 )
-def test_a_frame_of_a_type_is_looped_over_in_its_loop_type(array: str) -> None:
+def test_a_frame_is_converted_to_the_type_of_its_compiled_loop(array: str) -> None:
     assert to_native(np.ones((3, 3), array)).dtype == warm_up.loop_type(array)
 
 
@@ -31,7 +31,7 @@ def test_three_types_of_pixels_are_compiled(dtype: str, loops: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["c16", "U3", "no type", object])
-def test_pixels_that_are_no_numbers_are_refused(dtype: object) -> None:
+def test_pixels_that_are_not_numbers_are_refused(dtype: object) -> None:
     with pytest.raises(
         ImageError, match=r"warm_up: dtype is .*; allowed: the type of the frames' pixels"
     ):
@@ -40,7 +40,7 @@ def test_pixels_that_are_no_numbers_are_refused(dtype: object) -> None:
 
 @law(warm_up.draw, warm_up.run)
 @given(x_px=some.floats(12, 50), y_px=some.floats(12, 40))
-def test_spots_are_drawn_where_they_belong(x_px: float, y_px: float) -> None:
+def test_warm_up_spots_are_drawn_at_their_positions(x_px: float, y_px: float) -> None:
     camera = Camera.from_fov(64, 48, fov_deg=5)
     image = warm_up.draw(
         camera, np.array([[x_px, y_px], [1.0, 47.0]]), np.array([1e7, 1e6]), np.dtype("f8")

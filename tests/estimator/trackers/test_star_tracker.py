@@ -85,7 +85,7 @@ def test_true_centroids_give_the_true_attitude(tracker: StarTracker) -> None:
         assert answer.rms_px < 1e-9
 
 
-def test_the_answer_s_covariance_and_rms_are_true(tracker: StarTracker) -> None:
+def test_covariance_and_rms_of_the_answer_match_the_errors(tracker: StarTracker) -> None:
     # The settings' floor of 0.1 px and the centroids' own 0.1 add: sqrt(2) of it is the noise.
     rng = np.random.default_rng(81)
     nees = []
@@ -111,7 +111,7 @@ def test_the_match_names_the_tracker_s_own_stars(tracker: StarTracker) -> None:
     assert len(match.star) == len(pixels)
 
 
-def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
+def test_false_centroids_do_not_change_the_answer(tracker: StarTracker) -> None:
     rng = np.random.default_rng(83)
     for _ in range(25):
         truth, pixels, _ = starfield(tracker, rng, CAMERA)
@@ -126,7 +126,7 @@ def test_false_centroids_do_not_spoil_the_answer(tracker: StarTracker) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
+def test_too_few_stars_give_a_failure_status(tracker: StarTracker, count: int) -> None:
     answer = tracker.solve_centroids(
         centroids(np.random.default_rng(84).uniform(0, 400, (count, 2)))
     )
@@ -136,7 +136,7 @@ def test_too_few_stars_are_a_status(tracker: StarTracker, count: int) -> None:
     assert not answer.solved
 
 
-def test_spots_that_are_no_stars_are_a_status(tracker: StarTracker) -> None:
+def test_spots_that_are_no_stars_give_a_failure_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(85)
     answers = [
         tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(10)
@@ -145,7 +145,7 @@ def test_spots_that_are_no_stars_are_a_status(tracker: StarTracker) -> None:
     assert {answer.cam_from_ref for answer in answers} == {None}
 
 
-def test_a_mirrored_field_is_a_status(tracker: StarTracker) -> None:
+def test_a_mirrored_field_gives_a_failure_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(86)
     fields = [starfield(tracker, rng, CAMERA, 5.0)[1] for _ in range(6)]
     mirrored = [tracker.solve_centroids(centroids(xy * [-1, 1] + [658, 0])) for xy in fields]
@@ -154,7 +154,7 @@ def test_a_mirrored_field_is_a_status(tracker: StarTracker) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
-def test_a_picture_gives_its_attitude(tracker: StarTracker, centroider: str) -> None:
+def test_an_image_gives_its_attitude(tracker: StarTracker, centroider: str) -> None:
     rng = np.random.default_rng(87)
     tracker = replaced(
         tracker, replace(tracker.settings, centroider=centroider, centroid_sigma_px=0.05)
@@ -177,7 +177,7 @@ def replaced(tracker: StarTracker, settings: Settings) -> StarTracker:
 
 
 @pytest.mark.slow
-def test_a_dark_frame_is_a_status(tracker: StarTracker) -> None:
+def test_a_dark_frame_gives_a_failure_status(tracker: StarTracker) -> None:
     report = tracker.solve(np.random.default_rng(88).normal(300, 5, (493, 659)))
     assert report.attitude.status == NO_STARS
     assert len(report.centroids) == 0
@@ -220,7 +220,7 @@ def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> N
         assert apart_rad(answer, truth) < 1e-3
 
 
-def test_a_lamp_beside_a_faint_star_does_not_turn_the_field(uncertain: StarTracker) -> None:
+def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(uncertain: StarTracker) -> None:
     """Where the lens may be off by as much as the lamp is from the star, its brightness alone tells them apart."""
     rng = np.random.default_rng(96)
     for _ in range(5):
@@ -255,7 +255,7 @@ def test_a_radial_distortion_is_found_with_the_focal_length(uncertain: StarTrack
     assert np.median(found) == pytest.approx(-0.15, abs=0.01)
 
 
-def test_the_residual_is_the_rms_of_its_coordinates(
+def test_the_residual_is_the_rms_of_the_coordinates(
     tracker: StarTracker, uncertain: StarTracker
 ) -> None:
     rng = np.random.default_rng(98)
@@ -295,7 +295,7 @@ def test_a_focal_length_beyond_its_uncertainty_is_refused() -> None:
     assert not any(wrong.solve_centroids(centroids(xy)).solved for xy in fields)
 
 
-def test_pairs_are_each_other_s_nearest_within_the_radius() -> None:
+def test_pairs_are_mutual_nearest_neighbors_within_the_radius() -> None:
     # Two seen points by one prediction: the nearer has it. A third is out of reach.
     seen = np.array([[0.0, 0], [1.0, 0], [50.0, 0]])
     predicted = np.array([[0.8, 0], [54.0, 0]])
@@ -377,7 +377,9 @@ def test_true_centroids_under_a_dome_give_the_true_attitude(lever: str, shape: s
         (WIDE_CAMERA, 60, "tappe"),
     ],
 )
-def test_the_dome_tracker_s_covariance_is_true(camera: Camera, count: int, solver: str) -> None:
+def test_the_dome_tracker_s_covariance_matches_its_errors(
+    camera: Camera, count: int, solver: str
+) -> None:
     leds = dome("ellipsoid", count)
     lever = LEVERS["askew"]
     tracker = DomeTracker(
@@ -406,7 +408,7 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
 
 
 @pytest.mark.slow
-def test_a_dome_seen_as_stars_at_infinity_is_not_assumed(tracker: StarTracker) -> None:
+def test_a_star_tracker_does_not_solve_a_dome_at_finite_distance(tracker: StarTracker) -> None:
     leds = dome("sphere")
     rng = np.random.default_rng(98)
     fields = [under_the_dome(rng, leds, LEVERS["axial"], 0.1)[1] * 0.41 for _ in range(2)]

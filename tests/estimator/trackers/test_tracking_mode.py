@@ -65,7 +65,7 @@ def off_rad(report, truth: Rotation) -> float:
     return float((report.attitude.cam_from_ref * truth.inv()).magnitude())
 
 
-def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
+def test_the_tracker_searches_once_and_then_tracks(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     reports = [
         follower.solve(photograph(tracker, attitude(t), n), t)
@@ -89,7 +89,7 @@ def error(report, truth: Rotation) -> float:
     return float(turn @ np.linalg.solve(report.attitude.covariance_rad2, turn))
 
 
-def test_the_last_rate_leads_to_the_next_frame(tracker: StarTracker) -> None:
+def test_the_last_rate_predicts_the_next_frame(tracker: StarTracker) -> None:
     """At 5 deg/s the stars move 22 px a frame: a prediction without the rate, or with its inverse, misses them."""
     follower = TrackingMode(tracker)
     turns = [Rotation.from_rotvec(n * STEP_S * 10 * RATE_RAD_S) for n in range(3)]
@@ -132,7 +132,7 @@ def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker)
         assert report.chi2_per_dof == pytest.approx(2 * count / (2 * count - 3), rel=1e-6)
 
 
-def test_the_gyros_turn_is_followed_at_once(tracker: StarTracker) -> None:
+def test_the_rotation_measured_by_the_gyros_is_followed_at_once(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, attitude(0)), 0.0)
     turn = attitude(STEP_S) * attitude(0).inv()
@@ -141,7 +141,7 @@ def test_the_gyros_turn_is_followed_at_once(tracker: StarTracker) -> None:
     assert off_rad(report, attitude(STEP_S)) < 2e-4
 
 
-def test_a_jump_is_searched_and_never_answered_wrongly(tracker: StarTracker) -> None:
+def test_after_a_jump_the_tracker_searches_and_never_answers_wrongly(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     jumped = Rotation.from_rotvec([0.2, -0.1, 1.0]) * START
     follower.solve(photograph(tracker, START), 0.0)
@@ -150,7 +150,7 @@ def test_a_jump_is_searched_and_never_answered_wrongly(tracker: StarTracker) -> 
     assert off_rad(report, jumped) < 2e-4
 
 
-def test_a_frame_without_stars_is_lost_and_the_next_one_followed(tracker: StarTracker) -> None:
+def test_a_frame_without_stars_is_lost_and_the_next_one_is_tracked(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     still = [follower.solve(photograph(tracker, START, n), n * STEP_S) for n in range(2)]
     dark = follower.solve(photograph(tracker, START, 5, light=0.0), 0.2)
@@ -161,7 +161,7 @@ def test_a_frame_without_stars_is_lost_and_the_next_one_followed(tracker: StarTr
     assert [still[1].expected > 0, again.expected > 0] == [True, True]
 
 
-def test_a_memory_that_is_stale_is_none(tracker: StarTracker) -> None:
+def test_an_outdated_attitude_is_not_used_for_prediction(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker, max_age_s=1.0)
     follower.solve(photograph(tracker, START), 0.0)
     assert follower.solve(photograph(tracker, START, 1), 1.5).health & Health.SEARCHED
@@ -195,9 +195,9 @@ def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
         truth = turn * truth
         if gap == "knock":
             truth = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * truth
-        told = truth * then.inv() if gap != "knock" else Rotation.identity()
+        motion = truth * then.inv() if gap != "knock" else Rotation.identity()
         report = follower.solve(
-            photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, told
+            photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, motion
         )
         if gap == "dark":
             assert report.health == Health.LOST
@@ -228,13 +228,13 @@ def clouded(tracker: StarTracker, share: float) -> TrackedReport:
     return report
 
 
-def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) -> None:
+def test_missing_stars_are_reported_and_too_few_start_a_search(tracker: StarTracker) -> None:
     """A few of many expected stars may be so by chance, and are searched for in the whole frame."""
     assert clouded(tracker, 0.42).health & ~Health.FEW == Health.MISSING
     assert clouded(tracker, 0.25).health & ~Health.FEW == Health.SEARCHED
 
 
-def test_saturated_and_smeared_stars_are_told(tracker: StarTracker) -> None:
+def test_saturated_and_smeared_stars_have_their_statuses(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)
     bright = follower.solve(photograph(tracker, START, 1, light=2e7), STEP_S)
@@ -252,7 +252,7 @@ def shifted(x_px: float) -> Rotation:
     return Rotation.from_rotvec([0, x_px / CAMERA.focal_px, 0]) * START
 
 
-def test_an_uncertain_camera_cannot_be_followed() -> None:
+def test_tracking_with_an_uncertain_camera_is_refused() -> None:
     stars = catalog.brighter_than(catalog.read(FILE), 5.0)
     with pytest.raises(ValueError, match=r"focal_uncertainty is 0\.05; allowed: 0"):
         TrackingMode(StarTracker(CAMERA, stars, stars.vectors, focal_uncertainty=0.05))

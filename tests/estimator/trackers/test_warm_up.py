@@ -75,7 +75,7 @@ for n in range(3):
             pass
 assert solved > 15, solved
 """
-TOLD = """
+PRINT_COUNTS = """
 new = {name: len(kinds) - len(before.get(name, ())) for name, kinds in compiled().items()}
 print(sorted(name for name, more in new.items() if more))
 """
@@ -86,7 +86,10 @@ print(sorted(name for name, more in new.items() if more))
 def test_no_frame_compiles_anything_after_the_warm_up(work: str) -> None:
     """In a process of its own: other tests compile what a warm-up might leave out."""
     done = subprocess.run(
-        [sys.executable, "-c", COUNT + work + TOLD], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", COUNT + work + PRINT_COUNTS],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"

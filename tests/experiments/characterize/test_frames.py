@@ -91,7 +91,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("dark_3s.fits", {"EXPOSURE": 0.5}, Setting(0.5, None)),
     ],
 )
-def test_exposure_and_temperature_of_names_and_headers(
+def test_exposure_and_temperature_are_read_from_names_and_headers(
     tmp_path: Path, name: str, header: dict[str, float], expected: Setting
 ) -> None:
     write(tmp_path / name, np.full((8, 9), 100, np.uint16), **header)
@@ -100,7 +100,7 @@ def test_exposure_and_temperature_of_names_and_headers(
     assert pixels.shape == (8, 9)
 
 
-def test_a_table_beside_the_frames_comes_first(tmp_path: Path) -> None:
+def test_a_table_beside_the_frames_precedes_names_and_headers(tmp_path: Path) -> None:
     write(tmp_path / "a_3s.png", np.full((8, 9), 100, np.uint16))
     write(tmp_path / "b_3s.png", np.full((8, 9), 100, np.uint16))
     (tmp_path / "frames.csv").write_text(
@@ -118,7 +118,7 @@ def test_numbers_in_the_upper_bits_are_shifted_back(tmp_path: Path, good: Path) 
         assert one.greatest_dn == other.greatest_dn <= 4095
 
 
-def test_frames_of_an_independent_camera_come_back(good: Path) -> None:
+def test_parameters_of_an_independent_camera_are_recovered(good: Path) -> None:
     config, raw = characterize_camera.read_camera(str(good / "camera.yaml"))
     found = characterize_camera.measure_sensor(config, good / "darks", good / "flats").estimates
     for key, truth in (
@@ -292,7 +292,7 @@ BAD: list[tuple[Callable[[Path], None], str]] = [
 
 
 @pytest.mark.parametrize(("spoil", "message"), BAD, ids=[one.__name__ for one, _ in BAD])
-def test_frames_that_do_not_tell_are_refused_in_one_line(
+def test_uninformative_frames_are_refused_in_one_line(
     tmp_path: Path, spoil: Callable[[Path], None], message: str
 ) -> None:
     lab(tmp_path)
@@ -324,13 +324,13 @@ def test_a_table_of_exposures_is_refused_in_one_line(
         list(read_frames(tmp_path))
 
 
-def test_a_folder_without_images(tmp_path: Path) -> None:
+def test_a_folder_without_images_is_refused(tmp_path: Path) -> None:
     for folder, message in ((tmp_path, "no images"), (tmp_path / "x", "no such folder")):
         with pytest.raises(InputError, match=message):
             read_stack(folder, SHAPE, BITS)
 
 
-def test_hot_pixels_are_no_stars(tmp_path: Path) -> None:
+def test_hot_pixels_are_not_taken_for_stars(tmp_path: Path) -> None:
     """One pixel in fifty hot: many touch by chance."""
     rng = np.random.default_rng(6)
     hot = np.where(rng.random(SHAPE) < 0.02, 3000.0, 0.0)
@@ -368,10 +368,10 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
     )
     code, out, _ = command(capsys, monkeypatch, *folders, "--out", tmp_path, "--json")
     assert code == 0
-    told = json.loads(out)
-    rows = {row["what"]: row for row in told["values"]}
+    report = json.loads(out)
+    rows = {row["what"]: row for row in report["values"]}
     assert rows["gain_e_dn"]["file"] == 2.64
-    assert told == json.loads((tmp_path / "characterize.json").read_text())
+    assert report == json.loads((tmp_path / "characterize.json").read_text())
     preset = str(tmp_path / "camera.yaml")
     scene = loader.load(
         "shefex2", {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"}
@@ -394,7 +394,7 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
         (("--frames-to", "x", "--flats", "y"), "--flats: has no effect with --frames-to"),
     ],
 )
-def test_options_that_do_not_go_together(
+def test_contradicting_options_are_refused(
     words: tuple[str, ...],
     message: str,
     good: Path,

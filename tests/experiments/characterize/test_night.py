@@ -68,7 +68,7 @@ def fitted(rng: np.random.Generator, *law: float) -> tuple[StarImages, Floats]:
 
 
 @pytest.mark.slow
-def test_sizes_over_the_field_are_those_drawn_within_their_errors() -> None:
+def test_image_sizes_over_the_field_are_recovered_within_their_errors() -> None:
     pulls = []
     for seed in range(6):
         stars, places = fitted(np.random.default_rng(seed), 0.7, 0.5)
@@ -118,7 +118,7 @@ def test_trails_are_measured_and_refused() -> None:
     assert np.median(night_sky.without_trail(still).variance_px2) == pytest.approx(0.64, rel=0.01)
 
 
-def test_slopes_of_the_image_are_differences() -> None:
+def test_image_slopes_match_finite_differences() -> None:
     p = np.array([[7.2, 6.7, 900.0, 12.0, np.log(0.8), np.log(1.1)]])
     _, slopes = night_sky.model(p)
     for n in range(6):
@@ -130,7 +130,7 @@ def test_slopes_of_the_image_are_differences() -> None:
         )
 
 
-def test_a_tilt_is_seen() -> None:
+def test_a_tilt_of_the_chip_is_detected() -> None:
     """An image with the covariance c: drawn as many small Gaussians along the diagonal."""
     span = np.arange(2 * night_sky.HALF_PX + 1.0)
     light = np.zeros((len(span), len(span)))
@@ -207,7 +207,7 @@ def rendered(folder: Path, camera: dict[str, Any], seed: int) -> list[tuple[Fram
 
 
 @pytest.mark.slow
-def test_lens_and_star_images_come_back_and_frames_with_them_are_indistinguishable(
+def test_lens_and_star_images_are_recovered_and_reproduce_the_frames(
     tmp_path: Path,
 ) -> None:
     truth = rendered(tmp_path, TRUE, 1)

@@ -158,7 +158,7 @@ def test_linear_signal_is_the_inverse_of_the_amplifier() -> None:
         )
 
 
-def test_the_lamp_s_flicker_is_what_noise_does_not_explain() -> None:
+def test_the_lamp_s_flicker_is_the_variance_beyond_noise() -> None:
     rng = np.random.default_rng(3)
     pixels = 4000
     flicker = 0.004
@@ -186,7 +186,7 @@ def drawn_rates(
 
 
 @pytest.mark.parametrize("reading", [0.001, 0.3])
-def test_the_law_of_the_dark_current_is_that_of_drawn_pixels(reading: float) -> None:
+def test_the_dark_current_s_law_matches_drawn_pixels(reading: float) -> None:
     rng = np.random.default_rng(4)
     noise = RateNoise(reading, 0.01)
     rates = drawn_rates(rng, 400_000, noise)
@@ -237,7 +237,7 @@ def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
     assert fixed_pattern.is_resolved(drawn_rates(rng, 50_000, noise), noise)
 
 
-def test_the_light_s_distribution_is_no_prnu() -> None:
+def test_uneven_illumination_is_not_counted_as_prnu() -> None:
     """A slope of 20 % over the flat, of which the polynomial leaves nothing."""
     y, x = np.mgrid[0:96, 0:128]
     image = 500 * (1 + 0.1 * (x - 64) / 64 - 0.06 * ((y - 48) / 48) ** 2)
@@ -245,7 +245,7 @@ def test_the_light_s_distribution_is_no_prnu() -> None:
     np.testing.assert_allclose(trend, image, rtol=3e-4)  # means of a block are not its center's
 
 
-def test_propagation_of_errors_is_that_of_a_product() -> None:
+def test_error_propagation_matches_that_of_a_product() -> None:
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
     value, sigma = propagate(lambda p: p[0] * p[1], np.array([2.0, 5.0]), covariance)
     slope = np.array([5.0, 2.0])
@@ -253,7 +253,7 @@ def test_propagation_of_errors_is_that_of_a_product() -> None:
     assert sigma == pytest.approx(np.sqrt(slope @ covariance @ slope), rel=1e-6)
 
 
-def test_intervals_are_those_of_their_laws() -> None:
+def test_intervals_match_their_sampling_laws() -> None:
     assert Estimate.normal(3.0, 0.5)[2:] == pytest.approx((3 - 0.5 * Z_95, 3 + 0.5 * Z_95))
     assert Estimate.lognormal(3.0, 0.3)[2:] == pytest.approx(
         (3 * np.exp(-0.1 * Z_95), 3 * np.exp(0.1 * Z_95))
@@ -269,7 +269,7 @@ def test_intervals_are_those_of_their_laws() -> None:
 
 
 @pytest.mark.slow
-def test_a_chip_comes_back_within_two_percent() -> None:
+def test_a_chip_s_parameters_are_recovered_within_two_percent() -> None:
     """All but the hot pixels and the columns, whose number on a chip limits them: those within 3 sigma."""
     found = measured(400, 1, darks=16)
     assert set(found.estimates) == {*CHIP} - {"quantum_efficiency", "bits", "dark_temperature_c"}
@@ -284,14 +284,14 @@ def test_a_chip_comes_back_within_two_percent() -> None:
 
 
 @pytest.mark.slow
-def test_a_converter_that_ends_before_the_well_bounds_it() -> None:
+def test_a_converter_that_saturates_first_bounds_the_full_well() -> None:
     found = measured(128, 2, full_well_e=30_000.0, gain_e_dn=2.0, nonlinearity=0.0)
     assert found.estimates["full_well_e"].value == pytest.approx((4095 - 100) * 2.0, rel=0.02)
     assert found.estimates["gain_e_dn"].value == pytest.approx(2.0, rel=0.03)
 
 
 @pytest.mark.slow
-def test_the_linearity_error_is_that_of_a_parabola() -> None:
+def test_the_linearity_error_matches_that_of_a_parabola() -> None:
     found = measured(128, 3)
     t = np.array([one for one in FLAT_S if 0.04 < one < 0.95])
     x = np.minimum(t, 1.0) * (1 - 0.03 * np.minimum(t, 1.0))

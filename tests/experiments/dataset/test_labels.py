@@ -42,7 +42,7 @@ def decoded(counts: list[int], shape: tuple[int, int]) -> np.ndarray:
     return flat.reshape(shape[::-1]).T
 
 
-def test_run_lengths_are_those_of_the_columns() -> None:
+def test_run_lengths_encode_the_mask_by_columns() -> None:
     rng = np.random.default_rng(2)
     masks = [rng.random((7, 5)) < share for share in (0.1, 0.5, 0.9) for _ in range(20)]
     masks += [np.zeros((3, 4), bool), np.ones((3, 4), bool)]
@@ -56,7 +56,7 @@ def test_run_lengths_are_those_of_the_columns() -> None:
 @pytest.mark.parametrize(
     ("sigma_px", "streak_px"), [(0.8, 0.0), (1.0, 1.5), (1.0, 3.0), (1.0, 6.0), (0.8, 25.0)]
 )
-def test_the_width_of_a_streak_is_that_of_its_blur(sigma_px: float, streak_px: float) -> None:
+def test_the_width_of_a_streak_is_its_blur(sigma_px: float, streak_px: float) -> None:
     """Drawn five times finer: a line of light, blurred."""
     fine = 5
     shape = (150, 400)
@@ -68,7 +68,7 @@ def test_the_width_of_a_streak_is_that_of_its_blur(sigma_px: float, streak_px: f
     assert found == pytest.approx(sigma_px, rel=0.08)
 
 
-def test_streak_vectors_are_those_of_the_turning_camera() -> None:
+def test_streak_vectors_match_the_rotating_camera() -> None:
     """Stars' directions from mid-exposure pixels by the estimator's camera, turned by the rate over the exposure."""
     setup = setup_with(trial={"rate_deg_s": 3.0})
     one = dataset_labels.label_frame(setup, 5)
@@ -158,7 +158,7 @@ def test_the_outline_of_the_moon_is_about_its_saturated_disc(
             assert min(along.min(), 1 - along.max()) * np.linalg.norm(side) < slack_px
 
 
-def test_a_detection_is_that_of_the_brightest_source_near_it_and_of_one_alone() -> None:
+def test_a_detection_belongs_to_the_brightest_nearby_source_alone() -> None:
     xy = np.array([[10.0, 10], [11, 10], [50, 50]])
     one = np.ones(3)
     truth = SourceTruth(
@@ -189,7 +189,7 @@ def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     ).all()
 
 
-def test_a_frame_with_labels_is_that_of_the_trial() -> None:
+def test_labels_do_not_change_the_frame_of_the_trial() -> None:
     setup = setup_with(PARTICLE)
     frame, truth, _ = trials.render_trial_frame(setup, 4)
     image = frame.image_dn.copy()

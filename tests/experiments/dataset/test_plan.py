@@ -49,7 +49,7 @@ def test_draws_are_independent_of_one_another_and_of_the_number_of_frames(tmp_pa
     assert len({long.seed(n) for n in range(500)}) == 500
 
 
-def test_the_last_shard_has_what_is_left() -> None:
+def test_the_last_shard_has_the_remaining_frames() -> None:
     made = small(frames=7, frames_per_shard=3)
     assert [list(made.frames_of(shard)) for shard in range(made.shards)] == [
         [0, 1, 2],
@@ -58,7 +58,7 @@ def test_the_last_shard_has_what_is_left() -> None:
     ]
 
 
-def test_all_that_changes_the_frames_changes_the_digest(tmp_path: Path) -> None:
+def test_every_setting_that_changes_the_frames_changes_the_digest(tmp_path: Path) -> None:
     vary = variations(tmp_path)
     others = [
         small(vary, frames=6),
@@ -107,15 +107,13 @@ def test_all_that_changes_the_frames_changes_the_digest(tmp_path: Path) -> None:
         (VARY.replace("trial: {dec_deg: [-60, 60]}", "set: 3"), "set: 3"),
     ],
 )
-def test_what_is_wrong_in_the_variations_is_told_in_one_line(
-    tmp_path: Path, text: str, message: str
-) -> None:
-    with pytest.raises(InputError, match=message) as told:
+def test_wrong_variations_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
         small(variations(tmp_path, text))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
-def test_what_is_wrong_in_the_options_is_told() -> None:
+def test_wrong_options_are_refused() -> None:
     for more, message in (
         ({"frames": 0}, "dataset.frames: 0; allowed: 1 or more"),
         ({"frames_per_shard": 0}, "dataset.frames_per_shard: 0; allowed: 1 or more"),

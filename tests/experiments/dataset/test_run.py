@@ -89,7 +89,7 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
     np.testing.assert_allclose(rate, [json.loads(row["levels"])["rate"] for row in rows], rtol=1e-9)
 
 
-def test_the_table_of_sources_has_those_of_the_frames(whole: Path) -> None:
+def test_the_table_of_sources_has_the_sources_of_the_frames(whole: Path) -> None:
     made = samples(whole)
     found = [pyarrow.read_table(path) for path in sorted((whole / "sources").glob("*.parquet"))]
     ids = [
@@ -158,7 +158,7 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
     assert len(set(ids)) == len(ids)
 
 
-def test_numbers_with_two_decimals_are_written_as_json_writes_them() -> None:
+def test_numbers_with_two_decimals_are_written_as_by_json() -> None:
     rng = np.random.default_rng(3)
     numbers = np.round(rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2)
     numbers[0] = [0.0, -0.0, 100.0, -0.05]
@@ -190,7 +190,7 @@ class Stopped(Exception):
 
 
 @pytest.mark.slow
-def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
+def test_a_dataset_killed_at_any_file_and_resumed_has_the_same_bytes(
     whole: Path, vary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before and after each file; a temporary file that was half written stays behind."""
@@ -239,13 +239,13 @@ from tests.helpers.small_dataset import small
 from skysim.experiments import dataset_run
 from skysim.experiments.study.execution import engines
 if __name__ == "__main__":
-    told = small(Path(sys.argv[1]), 40)
-    dataset_run.run(told, sys.argv[2], engines.Pool(2), lambda progress: print(progress.done, flush=True))
+    plan = small(Path(sys.argv[1]), 40)
+    dataset_run.run(plan, sys.argv[2], engines.Pool(2), lambda progress: print(progress.done, flush=True))
 """
 
 
 @pytest.mark.long
-def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(
+def test_a_dataset_killed_with_its_workers_and_resumed_has_the_same_bytes(
     vary: Path, tmp_path: Path
 ) -> None:
     """Twice by kill -9 in the middle of a shard, on two workers; then one process makes the rest."""
@@ -328,7 +328,7 @@ def test_an_object_store_holds_the_same_bytes(
         server.stop()
 
 
-def test_a_complete_dataset_is_left_as_it_is(whole: Path, vary: Path) -> None:
+def test_a_complete_dataset_is_unchanged(whole: Path, vary: Path) -> None:
     before = contents(whole)
     assert dataset_run.run(small(vary), str(whole), engines.Serial()).now == 0
     assert contents(whole) == before
@@ -372,7 +372,7 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
         ),
     ],
 )
-def test_another_dataset_is_not_written_over(
+def test_another_dataset_is_not_overwritten(
     vary: Path, tmp_path: Path, change: Callable[[Path], object], message: str
 ) -> None:
     made = dataset_shards.Storage(str(tmp_path / "frames"))
@@ -385,7 +385,7 @@ def test_another_dataset_is_not_written_over(
 
 
 @pytest.mark.parametrize("url", ["nowhere://x/y", "s4://bucket"])
-def test_an_unknown_url_is_told(url: str) -> None:
+def test_an_unknown_url_is_refused(url: str) -> None:
     with pytest.raises(InputError, match=rf"^{url}: .*allowed"):
         dataset_shards.Storage(url)
 
@@ -396,7 +396,7 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
         dataset_shards.Storage("out/frames")
 
 
-def test_frames_of_several_sizes_fit_no_zarr_array(tmp_path: Path) -> None:
+def test_frames_of_several_sizes_are_refused_for_zarr(tmp_path: Path) -> None:
     vary = tmp_path / "sizes.yaml"
     vary.write_text(
         "schema: 1\nfactors: {width: {key: camera.width_px, values: [240, 230, 220, 210]}}\n"
@@ -410,7 +410,7 @@ def test_frames_of_several_sizes_fit_no_zarr_array(tmp_path: Path) -> None:
         dataset_run.run(made, str(tmp_path / "frames"), engines.Serial())
 
 
-def test_a_shard_that_kills_its_workers_is_told_and_left_out() -> None:
+def test_a_shard_that_kills_its_workers_is_reported_and_left_out() -> None:
     made = small(formats=("coco",))
     (chunk,) = dataset_run.ShardQueue([2]).next()
     failed = dataset_run.DatasetJob(made, "x").failed(chunk, engines.DIED)

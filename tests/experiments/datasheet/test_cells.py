@@ -19,7 +19,7 @@ from skysim.scene.loader import load
 
 
 @pytest.mark.parametrize("scene", ["shefex2", "afit_simsat", "thermal_drift"])
-def test_every_cell_is_another(scene):
+def test_every_cell_is_different(scene):
     """Names are distinct; only frames that are compared share their noise: a change, and the draw before it."""
     cells = list(Designer(load(scene, {}), QUICK).cells())
     assert len({cell.name for cell in cells}) == len(cells)
@@ -35,7 +35,7 @@ def test_every_cell_is_another(scene):
     }
 
 
-def test_the_total_has_the_units_of_the_terms_in_turn():
+def test_the_total_cells_use_the_units_of_the_terms_in_turn():
     """As often each, so that terms and total can agree with few units; the probabilities' frames are of others."""
     designer = Designer(load("afit_simsat", {}), FULL)
     cells = list(designer.cells())
@@ -55,7 +55,7 @@ def test_the_total_has_the_units_of_the_terms_in_turn():
     assert not set(seeds["terms"]) & set(seeds["sky"])
 
 
-def test_units_and_thermal_states_are_combined_as_often_each():
+def test_units_and_thermal_states_are_combined_equally_often():
     designer = Designer(load("thermal_drift", {}), QUICK)
     draws = [cell.settings for cell in designer.cells() if cell.experiment == "total"]
     combined = Counter(
@@ -66,7 +66,7 @@ def test_units_and_thermal_states_are_combined_as_often_each():
     assert set(combined.values()) == {1}
 
 
-def test_only_a_tracker_with_a_tracking_mode_has_its_limits():
+def test_only_a_tracker_with_a_tracking_mode_has_tracking_limits():
     rolling = {"camera.shutter": "{kind: rolling, row_time: 20 us}"}
     for scene, overrides, has in (
         ("shefex2", {}, True),

@@ -26,7 +26,7 @@ def generated(rng, shape, bias=0.0, **sigma):
     return errors
 
 
-def test_injected_terms_come_back_to_five_percent():
+def test_injected_terms_are_recovered_to_five_percent():
     """Over many experiments, whose mean is the expectation; only the units' own draws are few."""
     rng = np.random.default_rng(1)
     sizes = {
@@ -49,7 +49,7 @@ def test_injected_terms_come_back_to_five_percent():
 
 
 @pytest.mark.parametrize("name", ["bias", *Components._fields[2:]])
-def test_a_term_alone_comes_back_alone(name):
+def test_a_single_injected_term_is_recovered_alone(name):
     """One large experiment for each: to 5 %, and nothing of it in the others."""
     rng = np.random.default_rng(2)
     shape = (2000, 2, 1, 4, 2)
@@ -80,7 +80,7 @@ def test_a_factor_with_one_level_is_left_out(units, states):
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
+def test_intervals_cover_the_truth_as_often_as_stated():
     """Over 60 experiments 95 % hold each variance: or a little fewer: the bootstrap of 60 fields is short."""
     rng = np.random.default_rng(5)
     held = []
@@ -95,7 +95,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert (np.mean(held, axis=0) > 0.85).all()
 
 
-def test_a_ratio_is_sharp_where_both_have_the_same_fields():
+def test_a_ratio_is_precise_if_both_terms_share_their_fields():
     rng = np.random.default_rng(6)
     squares = rng.lognormal(0, 1, 200)
     assert mean_square_ratio(0.5 * squares, squares) == pytest.approx((0.5, 0.5, 0.5), rel=1e-12)
@@ -114,7 +114,7 @@ def experiment(rng, fields):
     return errors, field + np.hypot(np.hypot(0.5, 0.8), 1.5) * rng.standard_normal((1, fields, 20))
 
 
-def test_terms_add_up_to_what_independent_frames_have():
+def test_terms_sum_to_the_error_of_independent_frames():
     """Within 3 %: the mean of 40 experiments, and the interval of one."""
     rng = np.random.default_rng(7)
     ratios = [

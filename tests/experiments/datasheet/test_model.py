@@ -57,7 +57,7 @@ def test_a_process_is_stationary_and_forgets_exponentially():
         assert np.mean(values[lag:] * values[:-lag]) == pytest.approx(np.exp(-0.1 * lag), abs=0.03)
 
 
-def test_all_is_constant_at_rest_but_the_noise(model):
+def test_at_rest_only_the_noise_changes(model):
     """Of one state: the mean is the slow part, the deviation the noise at the field's scale."""
     state = State(
         np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]), 1.0
@@ -77,7 +77,7 @@ def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.08)
 
 
-def test_steps_have_the_statistics_of_draws(model):
+def test_steps_of_a_process_have_the_statistics_of_independent_draws(model):
     """Mean square and correlation from one step to the next at 2 degrees per second."""
     rng = np.random.default_rng(7)
     pairs = []
@@ -109,7 +109,7 @@ def test_noise_is_larger_about_the_axis_of_the_rate(model):
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 0.05, 3.0])
-def test_correlations_are_those_of_draws(model, turned_deg):
+def test_correlations_match_those_of_simulated_draws(model, turned_deg):
     """Of pairs of errors that the boresight's turn separates, at rest and at a rate: each pair in another field."""
     rate_deg_s = 2.0
     count = 150_000
@@ -142,7 +142,7 @@ def test_more_than_a_hundred_thousand_errors_a_second(model):
     assert min(seconds) < 1.0
 
 
-def test_the_module_stands_alone(tmp_path: Path) -> None:
+def test_the_error_model_runs_without_skysim(tmp_path: Path) -> None:
     """Copied away it needs NumPy and its constants, and nothing of skysim."""
     model_fit.write_model(tmp_path, CONSTANTS)
     code = (
@@ -162,9 +162,7 @@ def test_the_module_stands_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_unit_runs_in_another_tool_with_the_same_errors(
-    tmp_path: Path, model: ErrorModel
-) -> None:
+def test_the_fmu_gives_the_same_errors_in_another_tool(tmp_path: Path, model: ErrorModel) -> None:
     """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu3")
@@ -243,7 +241,7 @@ def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Gene
 
 
 @pytest.mark.slow
-def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(
+def test_a_model_agrees_with_new_fields_of_its_own_errors_and_not_with_others(
     monkeypatch: pytest.MonkeyPatch,
 ):
     """Fitted to half of 300 fields that a model drew; wrong noise and wrong memory are noticed in the other half.

@@ -22,7 +22,7 @@ from skysim.experiments.datasheet.performance import (
 )
 
 
-def test_runs_without_a_failure_are_those_of_the_formula():
+def test_the_number_of_runs_without_failure_follows_the_formula():
     """ln 0.05 / ln 0.997 = 997.1: 997 runs show 99.7 % at 94.999 %, and 998 at 95 %."""
     assert math.log(0.05) / math.log(0.997) == pytest.approx(997.07, abs=0.01)
     assert runs_needed(0.997) == 998
@@ -48,7 +48,7 @@ def test_a_claim_says_how_many_more_runs_it_needs():
     assert scipy.stats.binom.cdf(1, 399 + found[0.997]["more"], 0.003) > 0.05
 
 
-def test_bounds_hold_the_truth_as_often_as_they_say():
+def test_bounds_cover_the_truth_as_often_as_stated():
     """Each one-sided bound at 95 %, of a share of 0.9 in 40 frames."""
     hits = np.random.default_rng(1).binomial(40, 0.9, 4000)
     shares = [Counts(40, int(n), 40 - int(n), 0).share("right") for n in hits]
@@ -56,7 +56,7 @@ def test_bounds_hold_the_truth_as_often_as_they_say():
     assert np.mean([one.high >= 0.9 for one in shares]) >= 0.945
 
 
-def test_noise_is_told_from_all_that_two_frames_share():
+def test_noise_is_separated_from_errors_that_two_frames_share():
     rng = np.random.default_rng(2)
     shared = 30 * rng.standard_normal(4000)
     first, second = (shared + 2.5 * rng.standard_normal(4000) for _ in range(2))
@@ -75,7 +75,7 @@ def test_a_limit_lies_between_what_is_shown_above_and_below():
     assert math.isnan(bracket(rows[3:], "rate").above)
 
 
-def test_a_limit_is_of_the_highest_share_that_so_many_frames_can_show():
+def test_a_limit_uses_the_highest_share_that_its_frames_can_demonstrate():
     """59 frames without a failure show 95 %, and 29 show 90 %."""
     for frames, share, above in ((59, 0.95, 1), (58, 0.9, 1), (29, 0.9, 1), (28, 0.9, math.nan)):
         found = bracket([{"rate": 1, "counts": Counts(frames, frames, 0, 0)}], "rate")
@@ -106,7 +106,7 @@ def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> datasheet_run.Me
     return datasheet_run.MeasuredFrames(unused, "", {}, unused, unused, cells, columns, unused)
 
 
-def test_an_honest_covariance_is_found_honest():
+def test_a_correct_covariance_is_confirmed():
     found = performance.consistency(sky_sheet((1, 1, 1)))
     assert found["nees"].low < 3 < found["nees"].high
     for one in found["within"]:
@@ -116,7 +116,7 @@ def test_an_honest_covariance_is_found_honest():
     assert found["y_over_x"].low < 1 < found["y_over_x"].high
 
 
-def test_a_covariance_that_is_too_small_for_y_is_found_so():
+def test_a_covariance_too_small_about_y_is_detected():
     found = performance.consistency(sky_sheet((1, 1.5, 1)))
     assert found["nees"].value == pytest.approx(2 + 1.5**2, abs=0.2)
     assert found["within"][1]["share"].high < 0.954

@@ -62,7 +62,7 @@ def untimed(statement: Statement) -> str:
     return json.dumps(numbers(statement._replace(times_s=[])))
 
 
-def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path) -> None:
+def test_a_stopped_datasheet_resumes_with_the_same_result(small: None, tmp_path: Path) -> None:
     whole = state(measured(tmp_path / "whole"))
     assert len(whole.times_s) == 3
     assert min(whole.times_s) > 0
@@ -97,7 +97,7 @@ def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Pat
         state(measured(tmp_path, fields=4))
 
 
-def test_a_bias_and_a_thermal_drift_that_were_put_in_come_back() -> None:
+def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
     """The mount turns by 10" per kelvin about x and 4" about roll: at 20, 22 and 27 C with the reference at 20.
 
     The states' effects are 0, 20 and 70" about x; about y there is nothing but what the tracker has.

@@ -147,7 +147,7 @@ def result(folder: Path, frames: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_the_folder_alone_gives_the_dome_as_built(
+def test_a_folder_of_images_alone_gives_the_dome_as_built(
     result: dict[str, Any], folder: Path, built: Lab
 ) -> None:
     """Only here is the truth known: places, focal length and lever within their errors, and better than the list."""
@@ -175,7 +175,7 @@ def test_the_folder_alone_gives_the_dome_as_built(
 
 
 @pytest.mark.slow
-def test_each_fault_is_named_and_no_other(result: dict[str, Any]) -> None:
+def test_exactly_the_injected_faults_are_named(result: dict[str, Any]) -> None:
     faults = result["faults"]
     assert faults["dark"] == [DEAD]
     assert list(faults["displaced"]) == [str(FAR)]
@@ -243,7 +243,7 @@ def test_without_an_imu_the_tracker_identifies_the_images(
 
 
 @pytest.mark.slow
-def test_a_watch_ends_with_the_survey_of_what_is_there(
+def test_a_watch_ends_with_the_survey_of_the_images_at_hand(
     folder: Path,
     frames: Path,
     result: dict[str, Any],
@@ -331,7 +331,7 @@ def write_images(folder: Path, count: int, size: tuple[int, int] = (480, 640)) -
         ),
     ],
 )
-def test_images_that_cannot_be_surveyed_are_one_line(
+def test_images_that_cannot_be_surveyed_are_refused_in_one_line(
     folder: Path, tmp_path: Path, prepare: Any, says: str
 ) -> None:
     prepare(tmp_path / "in")
@@ -363,7 +363,7 @@ def test_images_that_cannot_be_surveyed_are_one_line(
         (["--plan", "--repeat", "3"], "--repeat: has no effect with --plan; allowed: one of them"),
     ],
 )
-def test_options_that_exclude_one_another_are_one_line(words: list[str], says: str) -> None:
+def test_contradicting_survey_options_are_refused_in_one_line(words: list[str], says: str) -> None:
     code, _, err = command("survey", "afit_simsat", *words)
     assert (code, err.count("\n")) == (2, 1)
     assert says in err
@@ -372,7 +372,7 @@ def test_options_that_exclude_one_another_are_one_line(words: list[str], says: s
 HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"
 
 
-def test_attitudes_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
     held = survey_frames.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
     survey_images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
     read = survey_images.read_attitudes(tmp_path / "a.csv")
@@ -394,7 +394,7 @@ def test_attitudes_are_read_as_they_were_written(tmp_path: Path) -> None:
         (HEAD + "a.fits,1,2,3\na.fits,1,2,3\n", "'a.fits' occurs twice; allowed: once"),
     ],
 )
-def test_attitudes_with_a_slip_are_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_faulty_attitudes_are_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError) as refused:
         survey_images.read_attitudes(tmp_path / "a.csv")

@@ -16,7 +16,7 @@ from skysim.experiments.dome_survey import adjust, survey_prior, survey_procedur
 from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
-def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_survey_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of three fails; the rms of the others is that of their mean squares."""
     found = iter(
         [
@@ -46,7 +46,7 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("parameter", "refused"), [("focal px", True), ("lever z mm", True), ("focal px", False)]
 )
-def test_a_survey_that_contradicts_what_was_assumed_is_refused(
+def test_a_survey_that_contradicts_its_assumptions_is_refused(
     parameter: str, refused: bool
 ) -> None:
     """The frames alone give a value of sigma s, before that one of sigma p was assumed: they differ by hypot(s, p), and

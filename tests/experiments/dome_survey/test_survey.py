@@ -109,7 +109,7 @@ def lab(folder: Path) -> Lab:
 
 
 @pytest.mark.long
-def test_the_survey_makes_the_tracker_s_error_smaller_by_much(statistics: dict[str, Any]) -> None:
+def test_a_survey_reduces_the_tracker_s_error_substantially(statistics: dict[str, Any]) -> None:
     """1000″ before. After: what one frame's lights are off, 0.2 mm at 0.8 m over the root of some twenty, and the
     turn of the lab, which the map of 2 mm before holds to 2 mm / (0.3 m sqrt(240)) = 90″.
     """
@@ -155,9 +155,7 @@ def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_be
 
 
 @pytest.mark.slow
-def test_the_leds_are_off_by_what_their_sigmas_say(
-    statistics: dict[str, Any], folder: Path
-) -> None:
+def test_led_errors_match_their_sigmas(statistics: dict[str, Any], folder: Path) -> None:
     """The moves that all LEDs share keep the mean square from settling at 1: a factor of 2 either way."""
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
     assert len(table) == statistics["surveyed"] < statistics["leds"]
@@ -169,7 +167,7 @@ def test_the_leds_are_off_by_what_their_sigmas_say(
 
 
 @pytest.mark.slow
-def test_a_scene_beside_the_file_believes_it(statistics: dict[str, Any], folder: Path) -> None:
+def test_a_scene_beside_the_map_file_uses_it(statistics: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
     (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")
     lab = build_lab(loader.load(folder / "mapped.yaml"))
@@ -211,7 +209,7 @@ def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> N
 # --- stops and names ----------------------------------------------------------------------------------------
 
 
-def test_stops_lean_evenly_over_the_cap_and_turn_any_way(lab: Lab) -> None:
+def test_stops_tilt_uniformly_over_the_cap_with_any_yaw(lab: Lab) -> None:
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 2000, 25.0)
     up = stops.apply([0.0, 0.0, 1.0])
     least = np.cos(np.radians(25))
@@ -235,7 +233,7 @@ def test_the_imu_errs_by_its_sigma_about_each_axis(lab: Lab) -> None:
         assert low < np.sum(axis**2) < high
 
 
-def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(lab: Lab) -> None:
+def test_a_frame_of_a_stop_shows_the_vehicle_at_rest(lab: Lab) -> None:
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 3, 18.0)
     ((_, first), *_, (frame, last)) = survey_frames.render_stops(lab, stops, 7)
     assert frame.index == 9
@@ -245,7 +243,7 @@ def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_an_imu_error_shifts_a_frame_by_what_is_predicted(lab: Lab) -> None:
+def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
     prior = survey_prior.calibration_prior(lab)
     sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
@@ -282,7 +280,7 @@ def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) -> None:
+def test_a_common_shift_beyond_the_led_spacing_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     predicted = rng.uniform(0, 1000, (60, 2))
     shift = rng.normal(0, 100, 2)
@@ -294,7 +292,7 @@ def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) 
 
 
 @pytest.mark.slow
-def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
+def test_leds_of_unknown_position_do_not_bias_the_shift() -> None:
     """Two thirds of a field are known to 25 px, so that many of them lie near any light; the others to 7 px."""
     rng = np.random.default_rng(1)
     missed = 0
@@ -347,7 +345,7 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
     assert error_m[board].max() < 0.005
 
 
-def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
+def test_pairs_have_the_least_total_cost() -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
         seen = rng.uniform(0, 10, (4, 2))
@@ -367,7 +365,7 @@ def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
         )
 
 
-def test_frames_that_hang_on_no_others_are_left_out() -> None:
+def test_frames_without_common_leds_are_left_out() -> None:
     """Three share three lights in a chain; two share three of their own; one shows two of the chain's."""
     shown = [[0, 1, 2, 3], [1, 2, 3, 4, 5, 6], [4, 5, 6, 7], [10, 11, 12], [10, 11, 12], [0, 1]]
     table = np.zeros((len(shown), 13), dtype=bool)
@@ -381,7 +379,7 @@ def test_frames_that_hang_on_no_others_are_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_a_map_is_read_as_it_was_written(
+def test_a_written_map_is_read_unchanged(
     statistics: dict[str, Any], folder: Path, tmp_path: Path
 ) -> None:
     first = dome_map_file.read_dome_map(folder / "leds.ecsv")
@@ -410,7 +408,7 @@ def test_a_map_is_read_as_it_was_written(
         ("# %ECSV", "# ECSW", "not an ECSV table"),
     ],
 )
-def test_a_map_with_a_slip_is_one_line(
+def test_a_faulty_map_is_refused_in_one_line(
     statistics: dict[str, Any], folder: Path, tmp_path: Path, right: str, wrong: str, says: str
 ) -> None:
     text = (folder / "leds.ecsv").read_text()
@@ -428,7 +426,7 @@ def test_a_map_with_a_slip_is_one_line(
         ("id", None, "occurs 2 times; allowed: once"),
     ],
 )
-def test_a_map_with_a_wrong_led_is_one_line(
+def test_a_map_with_a_wrong_led_is_refused_in_one_line(
     statistics: dict[str, Any],
     folder: Path,
     tmp_path: Path,
@@ -474,7 +472,7 @@ def refusal(folder: Path, tmp_path: Path, text: str) -> str:
         ),
     ],
 )
-def test_a_map_that_is_not_there_or_not_alone_is_one_line(
+def test_a_missing_or_ambiguous_map_is_refused_in_one_line(
     folder: Path, tmp_path: Path, changes: dict[str, str], says: str
 ) -> None:
     (tmp_path / "leds.ecsv").write_text("")
@@ -502,6 +500,8 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
         (["afit_simsat", "--frames", "2", "--attitudes", "random"], "survey: "),
     ],
 )
-def test_a_survey_that_cannot_be_is_one_line(tmp_path: Path, words: list[str], says: str) -> None:
+def test_an_impossible_survey_is_refused_in_one_line(
+    tmp_path: Path, words: list[str], says: str
+) -> None:
     assert says in complaint(*words, "--out", tmp_path / "out")
     assert not (tmp_path / "out" / "leds.ecsv").exists()

@@ -49,7 +49,7 @@ def dropping(tmp_path: Path) -> threading.Thread:
     return threading.Thread(target=drop)
 
 
-def test_every_image_is_read_once_and_bad_ones_are_a_line_each(
+def test_every_image_is_read_once_and_each_bad_one_is_one_line(
     tmp_path: Path, dropping: threading.Thread
 ) -> None:
     folder = watched(tmp_path)
@@ -82,7 +82,7 @@ def test_a_file_is_read_when_it_no_longer_grows(tmp_path: Path) -> None:
     assert folder.look() == ([], [])
 
 
-def test_an_image_that_is_mended_is_read_again(tmp_path: Path) -> None:
+def test_a_repaired_image_is_read_again(tmp_path: Path) -> None:
     folder = watched(tmp_path)
     path = tmp_path / "a.png"
     path.write_bytes(b"no image")
@@ -110,7 +110,7 @@ def test_an_image_that_is_removed_or_replaced_by_a_better_format_is_not_counted_
     assert [picture.name for picture in folder.pictures] == ["a.png"]
 
 
-def test_attitudes_with_a_slip_are_a_line_and_the_watch_goes_on(tmp_path: Path) -> None:
+def test_faulty_attitudes_are_one_line_and_the_watch_continues(tmp_path: Path) -> None:
     folder = watched(tmp_path)
     write(tmp_path / "a.png")
     (tmp_path / ATTITUDES).write_text(HEAD + "a.png,1,2\n")
@@ -126,6 +126,6 @@ def test_attitudes_with_a_slip_are_a_line_and_the_watch_goes_on(tmp_path: Path) 
     assert folder.pictures[0].lab_from_body is not None
 
 
-def test_no_folder_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_folder_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         next(watched(tmp_path / "none").arrivals(3))

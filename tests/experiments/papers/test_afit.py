@@ -30,7 +30,7 @@ def pair() -> Lab:
     return build_test_stand(test2.scene(0.3))
 
 
-def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Lab) -> None:
+def test_the_angle_of_a_pair_at_the_apex_follows_eq_45(pair: Lab) -> None:
     """y is half the pair, x the root of (R - M)^2 - y^2; the camera's M is added: an angle about the bearing."""
     y = PAIR_M / 2
     angle = 2 * np.arctan(y / (np.sqrt((R_M - M_M) ** 2 - y**2) + M_M))
@@ -51,7 +51,7 @@ def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
     assert share == pytest.approx(np.cos(own + np.radians(5)) / np.cos(own), abs=2e-5)
 
 
-def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> None:
+def test_a_dome_moved_away_shows_pairs_smaller_by_the_distance(pair: Lab) -> None:
     """The range from the camera grows; the pair in the image plane at R - M shrinks by as much."""
     places = [BoardPlace(28.0), BoardPlace(28.0, 0.0, 0.125)]
     camera_m = M_M * np.array([np.sin(np.radians(28)), 0, np.cos(np.radians(28))])
@@ -62,7 +62,7 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> No
     assert angle[1] < angle[0] - 4
 
 
-def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
+def test_rendered_pairs_have_the_geometric_angle(pair: Lab) -> None:
     board = test2.place_pair(pair, BoardPlace(28.0))
     frame, truth = render_at_attitude(
         board, test2.point_at(BoardPlace(28.0)), np.random.default_rng(1)
@@ -82,12 +82,12 @@ def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() ->
     assert found["height_by_axes"].ours.value == pytest.approx(48 - rim, abs=1e-9)
 
 
-def test_an_led_that_is_not_seen_is_in_no_order() -> None:
+def test_an_unseen_led_is_left_out_of_the_order() -> None:
     """Of three images one has all LEDs, falling; one lacks the last; one has two in the wrong order."""
-    told = led_tests.fraction_in_order(
+    share = led_tests.fraction_in_order(
         np.array([[3.0, 2.0, 1.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0]])
     )
-    assert told.value == pytest.approx(1 / 3)
+    assert share.value == pytest.approx(1 / 3)
 
 
 def test_a_magnitude_is_light_over_the_median_area() -> None:
@@ -99,7 +99,7 @@ def test_a_magnitude_is_light_over_the_median_area() -> None:
     assert lights.magnitude * np.median(lights.area_px) == pytest.approx([160_000, 40_000, 40_000])
 
 
-def test_a_threshold_parts_leds_glare_and_noise() -> None:
+def test_a_threshold_separates_leds_from_glare_and_noise() -> None:
     image = np.zeros((400, 400), np.uint8)
     image[195:206, 195:206] = 100  # an LED of 121 px
     image[200, 225:228] = 6  # glare beside it
@@ -115,7 +115,7 @@ def test_a_threshold_parts_leds_glare_and_noise() -> None:
     ]
 
 
-def test_one_led_of_nine_is_lit_at_any_time() -> None:
+def test_one_led_in_nine_is_lit_at_any_time() -> None:
     """Whatever the phase: the nine share 100 ms, and each has eleven pulses of 1 ms or a twelfth or a part of it."""
     rng = np.random.default_rng(2)
     level = Rotation.identity()
@@ -134,7 +134,7 @@ def test_one_led_of_nine_is_lit_at_any_time() -> None:
         assert lit_ms.max() < 12 + 1e-3
 
 
-def test_a_relative_decrease_has_the_interval_of_the_mean_the_other_way_round() -> None:
+def test_a_relative_decrease_has_the_reversed_interval_of_the_mean() -> None:
     angles = np.array([96.0, 92.0, 94.0, 95.0, 93.0])
     fall = test2.relative_decrease(100.0, angles)
     mean = confidence_interval(angles)

@@ -33,28 +33,28 @@ def sightings(lab: Lab) -> list[Sighting]:
     return test3.ImageSeries(lab, seen).sightings
 
 
-def test_every_position_shows_all_five(sightings: list[Sighting]) -> None:
+def test_every_position_shows_all_five_leds(sightings: list[Sighting]) -> None:
     assert [one.stop for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
-def test_the_epsilons_are_those_of_the_thesis_s_calibration(
-    lab: Lab, sightings: list[Sighting]
-) -> None:
+def test_the_epsilons_match_the_thesis_s_calibration(lab: Lab, sightings: list[Sighting]) -> None:
     measurements = measure(lab, sightings)
     believed = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)  # type: ignore[arg-type]
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
-    told = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
+    calibration = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
     found = [
         test3.largest_std(measurements.magnitude),
         test3.largest_std(measurements.lab_m.reshape(len(sightings), -1)),
         np.radians(test3.largest_std(measurements.separation_arcsec) / 3600),
     ]
     # The thesis divides by n - 1, ours by n: most of the spread is what differs between positions.
-    theirs = np.array([told.epsilon_mag, told.epsilon_pos_m, told.epsilon_sep_rad])
+    theirs = np.array(
+        [calibration.epsilon_mag, calibration.epsilon_pos_m, calibration.epsilon_sep_rad]
+    )
     np.testing.assert_allclose(found, theirs * np.sqrt(1 - 1 / len(sightings)), rtol=1e-9)
 
 
-def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
+def test_an_imu_error_at_one_of_five_stops_spreads_a_position_by_two_fifths(
     lab: Lab, sightings: list[Sighting]
 ) -> None:
     """A shift d of one in five: sd = d sqrt(1/5 4/5), 48 in times the IMU's .239 deg (Table 14); n - 1 aside."""
@@ -67,7 +67,7 @@ def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
 
 
 @pytest.mark.long
-def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(lab: Lab) -> None:
+def test_the_fitted_positions_are_table_8_s_with_an_8_mm_cross(lab: Lab) -> None:
     place_m = test3.fit_positions(lab)
     rows = experiments()["afit-table-6-9"].rows
     published = [rows[f"separation_{n}"].published for n in range(1, 11)]
@@ -76,7 +76,7 @@ def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(lab: Lab
     assert np.abs(arms_mm - 8).max() < 0.25  # set by hand
 
 
-def test_intervals_draw_the_images_of_a_position_and_not_the_positions(
+def test_intervals_resample_images_within_positions_not_positions(
     lab: Lab, sightings: list[Sighting]
 ) -> None:
     """What differs between positions alone has no interval."""
@@ -86,7 +86,7 @@ def test_intervals_draw_the_images_of_a_position_and_not_the_positions(
     assert found[:3] == (2.0, 2.0, 2.0)
 
 
-def test_another_draw_is_in_its_interval_as_often_as_it_says() -> None:
+def test_a_new_draw_is_in_its_interval_as_often_as_stated() -> None:
     draws = np.random.default_rng(71).standard_normal((4000, 5))
     inside = 0
     for row in draws:
@@ -102,7 +102,7 @@ def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(lab: Lab) -
     found = test3_attitude.algorithm_errors(lab, 1, 2, np.random.default_rng(72))
     assert np.abs(found.error_deg[:, 0]).max() < 1e-9
     assert found.named == (5, 5)
-    assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
+    assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the error of eq. 44
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_an_imu_drifts_by_the_earth_s_rate() -> None:
 
 
 @pytest.mark.long
-def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
+def test_gyros_lose_only_the_rate_beyond_their_limit() -> None:
     calm = test3_attitude.simulate_bump(None, 74)
     knocked = test3_attitude.simulate_bump(test3_attitude.FITTED_BUMP, 74)
     assert calm.saturated_s == 0
@@ -136,14 +136,14 @@ def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
     assert test3_attitude.filter_errors_after(knocked).max() < 0.01
 
 
-def test_the_vehicle_stands_where_the_tables_say() -> None:
+def test_the_vehicle_has_the_tables_attitudes() -> None:
     for angles in IMU_DEG:
         np.testing.assert_allclose(
             lab_from_body(angles).as_euler("ZYX", degrees=True)[::-1], angles, rtol=0, atol=1e-12
         )
 
 
-def test_images_are_the_same_by_the_same_seed(lab: Lab) -> None:
+def test_the_same_seed_gives_the_same_images(lab: Lab) -> None:
     first, again = (
         photograph(lab, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px
         for _ in range(2)

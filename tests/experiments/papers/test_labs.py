@@ -27,7 +27,7 @@ def test_with_the_true_attitude_the_distances_are_true(level: nps.OnboardModel) 
     assert apart.max() < 0.5 * 243 * ARCSEC_RAD  # half a pixel
 
 
-def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) -> None:
+def test_one_update_removes_most_of_the_error(level: nps.OnboardModel) -> None:
     """A wrong distance moves a point almost along its direction: two degrees become less than a tenth of that."""
     rays = nps.rays_body(level.lab, 11)
     found = nps.solve(level, rays, nps.initial_error(2.0))
@@ -37,7 +37,7 @@ def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) ->
     assert abs(again.error_deg - exact.error_deg) < 1e-3
 
 
-def test_a_camera_in_the_center_sees_no_shell() -> None:
+def test_a_camera_at_the_center_has_no_parallax() -> None:
     """(r / R)(dR / R) is nothing for r = 0, and proportional to r."""
     scene = other_domes.shell_scene(0.004, 5)
     lab = build_lab(scene)

@@ -50,7 +50,7 @@ def interval(low: float, high: float) -> Summary:
         (1, 20, True),
     ],
 )
-def test_ours_agrees_where_its_interval_and_the_tolerance_meet(
+def test_a_result_agrees_if_its_interval_overlaps_the_tolerance(
     low: float, high: float, agrees: bool
 ) -> None:
     assert compare.verdict(TEN, RowResult(interval(low, high))) == (
@@ -58,13 +58,13 @@ def test_ours_agrees_where_its_interval_and_the_tolerance_meet(
     )
 
 
-def test_a_number_without_an_interval_is_held_by_itself() -> None:
+def test_a_number_without_an_interval_is_compared_alone() -> None:
     nan = float("nan")
     assert compare.verdict(TEN, RowResult(Summary(10.4, nan, nan, 5))) == "agrees"
     assert compare.verdict(TEN, RowResult(Summary(10.6, nan, nan, 5))) == "disagrees"
 
 
-def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_there() -> None:
+def test_a_cause_explains_only_a_disagreement_that_it_removes() -> None:
     off = exact(12.0)
     near = exact(10.1)
     assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", near))) == "explained"
@@ -83,21 +83,21 @@ def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_ther
         (PublishedRow(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
     ],
 )
-def test_a_bound_is_held_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
+def test_a_bound_is_compared_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
     assert (compare.verdict(row, RowResult(exact(ours))) == "agrees") == agrees
 
 
-def test_an_interval_wider_than_the_tolerance_is_told() -> None:
+def test_an_interval_wider_than_the_tolerance_is_noted() -> None:
     line = compare.Comparison("x", TEN, RowResult(interval(8, 12), note="few"), "agrees")
     assert line.note == "interval wider than the tolerance; few"
     assert line._replace(result=RowResult(interval(9.8, 10))).note == ""
 
 
-def test_machines_get_the_keys_that_were_promised() -> None:
+def test_the_json_of_a_row_has_the_documented_keys() -> None:
     bound = PublishedRow(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
-    told = line.as_dict()
-    assert list(told) == [
+    row = line.as_dict()
+    assert list(row) == [
         "id",
         "quantity",
         "published",
@@ -107,12 +107,12 @@ def test_machines_get_the_keys_that_were_promised() -> None:
         "verdict",
         "note",
     ]
-    assert told["published"] == [0.9, None]
-    assert told["ours"] == 0.95
-    assert told["interval"][0] < 0.95 < told["interval"][1]
+    assert row["published"] == [0.9, None]
+    assert row["ours"] == 0.95
+    assert row["interval"][0] < 0.95 < row["interval"][1]
 
 
-def test_an_answer_to_every_row_and_no_other() -> None:
+def test_every_published_row_has_one_answer() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN})
     with pytest.raises(ValueError, match="eleven, ten"):
         compare.compare("x", one, ExperimentResult({"eleven": RowResult(exact(1))}), 0.0)
@@ -128,15 +128,15 @@ def covered(
     hits = 0
     for n in range(TRIED):
         rng = np.random.default_rng([7, n])
-        told = interval(rng.normal(3.0, 2.0, 4))
-        hits += told.low <= target(rng) <= told.high
+        estimate = interval(rng.normal(3.0, 2.0, 4))
+        hits += estimate.low <= target(rng) <= estimate.high
     return hits / TRIED
 
 
 TRIED = 1500
 
 
-def test_intervals_of_four_hold_what_they_promise() -> None:
+def test_intervals_of_four_values_have_their_stated_coverage() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
     assert abs(covered(compare.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
     assert (
@@ -145,10 +145,10 @@ def test_intervals_of_four_hold_what_they_promise() -> None:
 
 
 @pytest.mark.slow
-def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
+def test_a_bootstrap_of_four_values_is_widened_to_its_stated_coverage() -> None:
     """Efron's own percentiles hold a mean of four in some 80 %."""
     few = np.random.default_rng(3).normal(3.0, 2.0, (300, 4))
-    held = [[told.low <= 3.0 <= told.high for told in pair] for pair in map(both, few)]
+    held = [[estimate.low <= 3.0 <= estimate.high for estimate in pair] for pair in map(both, few)]
     bare, wide = np.mean(held, axis=0)
     assert bare < 0.88
     assert wide > 0.91
@@ -161,7 +161,7 @@ def both(values: np.ndarray) -> tuple[Summary, Summary]:
 # What was published.
 
 
-def test_a_row_says_a_number_or_bounds() -> None:
+def test_a_row_has_a_number_or_bounds() -> None:
     for wrong in (
         {"quantity": "x"},
         {"quantity": "x", "published": 1, "at_most": 2},
@@ -171,7 +171,7 @@ def test_a_row_says_a_number_or_bounds() -> None:
             PublishedRow.model_validate(wrong)
 
 
-def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(
         "paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n"
@@ -180,7 +180,7 @@ def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
         published.read(path)
 
 
-def test_every_published_experiment_is_run_and_none_else() -> None:
+def test_exactly_the_published_experiments_are_run() -> None:
     assert set(published.experiments()) == set(EXPERIMENTS)
     assert all(one.title and one.source and one.paper for one in published.experiments().values())
 
@@ -194,12 +194,12 @@ def asked(*words: str) -> str:
     return done.output
 
 
-def test_without_an_id_it_lists_them() -> None:
+def test_without_an_id_the_papers_are_listed() -> None:
     assert [line.split()[0] for line in asked().splitlines()] == list(published.experiments())
     assert json.loads(asked("--json"))[0].keys() == {"id", "title", "source"}
 
 
-def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
+def test_an_unknown_id_is_answered_with_the_allowed_ones() -> None:
     with pytest.raises(
         InputError, match=r"unknown experiment 'afit-table-99'; allowed: all, .*afit-table-1"
     ):
@@ -209,7 +209,7 @@ def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
 
 
 @pytest.mark.slow
-def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None:
+def test_report_and_page_show_the_numbers_of_the_json(tmp_path: Path) -> None:
     markdown = tmp_path / "papers.md"
     words = ["afit-table-1", "--report", "--out", str(tmp_path), "--markdown", str(markdown)]
     shown = asked(*words)
@@ -226,7 +226,7 @@ def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None
     assert html.count("data:image/png") == 1
 
 
-def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
+def test_disagreements_are_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
@@ -267,13 +267,13 @@ def parts() -> dict[str, list[dict[str, str]]]:
     return found
 
 
-def told(cells: dict[str, str]) -> Summary:
+def our_summary(cells: dict[str, str]) -> Summary:
     """Our number with its interval."""
     value, low, high = (float(cells[name]) for name in ("ours", "low", "high"))
     return Summary(value, low, high, 1)
 
 
-def told_with_cause(text: str) -> Summary:
+def summary_with_cause(text: str) -> Summary:
     """The number with a cause, `name: number (low..high)`, of four digits."""
     found = CAUSE.search(text)
     assert found is not None, text
@@ -307,9 +307,9 @@ def test_the_table_has_every_published_row_as_it_is_published() -> None:
 def test_the_table_s_verdicts_follow_from_its_numbers() -> None:
     slack = 1e-3
     for id, row, cells in rows():
-        ours = told(cells)
+        ours = our_summary(cells)
         explains = bool(cells["cause"]) and compare.intervals_overlap(
-            row, eased(told_with_cause(cells["cause"]), slack)
+            row, eased(summary_with_cause(cells["cause"]), slack)
         )
         allowed = {
             "agrees": compare.intervals_overlap(row, eased(ours, slack)),
@@ -360,14 +360,14 @@ QUICK = ("afit-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second ea
         for id in published.experiments()
     ],
 )
-def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
+def test_a_shortened_experiment_has_correct_intervals(id: str) -> None:
     """Each inside its interval; the whole experiment's, on the page, within the two intervals' widths of it; and what
     agrees on the page does not disagree."""
     done = reproduce(id, ExperimentOptions(quick=True))
     lines = list(zip(done.comparisons, parts()[id], strict=True))
     for line, cells in lines:
         ours = line.result.ours
-        whole = told(cells)
+        whole = our_summary(cells)
         assert not ours.low > ours.value + 1e-12, line.row.quantity
         assert not ours.high < ours.value - 1e-12, line.row.quantity
         assert ours.trials > 0, line.row.quantity

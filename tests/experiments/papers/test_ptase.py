@@ -47,13 +47,13 @@ def sky() -> PairIndex:
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
+def test_simulated_errors_match_the_covariance(sky: PairIndex) -> None:
     """P = sigma^2 [sum(I - b b')]^-1: across 1 / sqrt(N), roll by the stars' distance from the axis."""
-    truly, told, stars = ptase_monte_carlo.simulate(
+    truly, estimated, stars = ptase_monte_carlo.simulate(
         sky, ptase_monte_carlo.version("fialho_2"), 600, 7
     )
-    found = np.isfinite(told[:, 0, 0])
-    off = np.einsum("nij,nkj->nik", told[found], truly[found])
+    found = np.isfinite(estimated[:, 0, 0])
+    off = np.einsum("nij,nkj->nik", estimated[found], truly[found])
     x, y, roll = (off[:, a, b] - off[:, b, a] for a, b in ((2, 1), (0, 2), (1, 0)))
     n = stars[found]
     # Of a square field of half-width a the mean of x^2 + y^2 is 2 a^2 / 3 (tangents), a little less of sines.
@@ -78,7 +78,7 @@ def test_the_earth_turns_once_in_a_sidereal_day_about_its_pole() -> None:
     assert turned[2] == pytest.approx(-np.pi / 2, abs=1e-5)
 
 
-def test_the_paper_s_angles_are_those_of_its_matrix() -> None:
+def test_the_paper_s_angles_match_its_matrix() -> None:
     """Eq. 5 written out; its x points right when ours, seen from inside, is turned by half."""
     ra, dec, phi = np.radians([-49.3924, -41.2645, -27.7198])
     sa, ca, sd, cd, sf, cf = (f(one) for one in (ra, dec, phi) for f in (np.sin, np.cos))
@@ -90,11 +90,11 @@ def test_the_paper_s_angles_are_those_of_its_matrix() -> None:
         ]
     )
     ours = np.diag([-1.0, -1.0, 1.0]) @ theirs
-    told = ptase_ground.paper_angles_deg(Rotation.from_matrix(ours))
-    np.testing.assert_allclose(told, [-49.3924, -41.2645, -27.7198], rtol=0, atol=1e-9)
+    angles_deg = ptase_ground.paper_angles_deg(Rotation.from_matrix(ours))
+    np.testing.assert_allclose(angles_deg, [-49.3924, -41.2645, -27.7198], rtol=0, atol=1e-9)
 
 
-def test_a_catalog_tells_machines_of_itself() -> None:
+def test_a_catalog_s_json_describes_it() -> None:
     """It raised: its path is none of JSON's kinds."""
     done = CliRunner().invoke(app, ["catalog", "info", "--json"])
     assert done.exit_code == 0

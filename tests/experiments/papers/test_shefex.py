@@ -24,7 +24,7 @@ from skysim.tracking.factory import ExposureController
 pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
 
 
-def test_the_bootstrap_of_means_is_that_of_theory_and_leaves_out_what_is_missing() -> None:
+def test_the_bootstrap_of_means_matches_theory_and_skips_missing_values() -> None:
     """A mean's 95 % interval is 1.96 sigma / sqrt(N) to either side; a NaN is as if it had not been."""
     values = np.random.default_rng(1).normal(3.0, 2.0, 4000)
     found = bootstrap_of_means(values[:, None], lambda m: m[..., 0])
@@ -53,32 +53,32 @@ def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> Non
 @pytest.mark.long
 def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
     field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
-    told = shefex_identification.identify(
+    result = shefex_identification.identify(
         field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1)
     )
-    assert (told.right, told.wrong) == (1.0, 0.0)
-    assert np.abs(told.error_deg).max() < 1e-3
+    assert (result.right, result.wrong) == (1.0, 0.0)
+    assert np.abs(result.error_deg).max() < 1e-3
 
 
 def test_three_stars_are_no_success() -> None:
     field = StarField(
         np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity()
     )
-    told = shefex_identification.identify(
+    result = shefex_identification.identify(
         field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1)
     )
-    assert (told.right, told.wrong) == (0.0, 0.0)
+    assert (result.right, result.wrong) == (0.0, 0.0)
 
 
 def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
     assert shefex_identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
 
 
-def test_equation_5_fails_as_printed_and_holds_when_mended() -> None:
+def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
     assert shefex_identification.eq5_failures(np.random.default_rng(3), 500) == (500, 0)
 
 
-def test_where_a_line_passes_the_limit() -> None:
+def test_the_crossing_of_a_line_and_a_limit_is_interpolated() -> None:
     """0.2 deg a pixel passes 0.1 deg at half a pixel; one that stays below ends at the last."""
     yaw_deg = 0.2 * shefex_identification.ERRORS_PX
     assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
@@ -90,7 +90,7 @@ def test_where_a_line_passes_the_limit() -> None:
 
 
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
-def test_smear_is_rate_times_time_and_the_peak_falls_as_a_line_s(rate_deg_s: float) -> None:
+def test_smear_is_rate_times_time_and_the_peak_falls_as_that_of_a_line(rate_deg_s: float) -> None:
     """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
     length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
     assert shefex_nights.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
@@ -106,11 +106,11 @@ def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
 
 def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    told = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
-    np.testing.assert_allclose(told, np.degrees(2 * np.arctan(half)), rtol=1e-9)
+    field_deg = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    np.testing.assert_allclose(field_deg, np.degrees(2 * np.arctan(half)), rtol=1e-9)
 
 
-def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:
+def test_a_poisson_sky_has_the_expected_unevenness_and_an_even_sky_less() -> None:
     rng = np.random.default_rng(5)
     poisson = rng.poisson(8, (20_000, 2))
     even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
@@ -121,7 +121,7 @@ def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:
         )
 
 
-def test_the_two_scans_have_the_same_objects() -> None:
+def test_both_scans_have_the_same_objects() -> None:
     rng = np.random.default_rng(6)
     image = rng.normal(100, 3, (200, 300))
     for x, y in rng.uniform(20, 180, (10, 2)):
@@ -138,7 +138,7 @@ def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
     assert controller.exposure_s == pytest.approx(0.042, abs=1e-12)
 
 
-def test_a_planet_s_light_is_pogson_s() -> None:
+def test_a_planet_s_light_follows_pogson_s_law() -> None:
     loop = shefex_camera.ExposureLoop({}, shefex_camera.random_attitudes(1, 1)[0], 40)
     before = loop.lab.camera.sources
     after = shefex_camera.with_planets(loop.lab.camera, loop.rest, 3)

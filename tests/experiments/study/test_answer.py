@@ -57,7 +57,7 @@ def said(texts: list[str], start: str) -> str:
     return text
 
 
-def test_nowhere_ambiguous_has_a_confidence() -> None:
+def test_without_ambiguity_the_answer_has_a_confidence() -> None:
     """1 - 0.05^(1 / 10,000) is 0.02995 %."""
     texts = answer.headline(study(), [line(0, 500, 10_000)], True)
     assert said(texts, "Is it ambiguous anywhere?") == (
@@ -69,7 +69,7 @@ def test_nowhere_ambiguous_has_a_confidence() -> None:
     ] == []
 
 
-def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
+def test_ambiguity_is_located_and_the_rest_has_a_confidence() -> None:
     """Misled attitudes count as ambiguous ones that the tracker did not notice."""
     lines = [line(0, 500, 200, ambiguous=20, misled=10), line(1, 900, 400)]
     interval = metrics.proportion(30, 200)
@@ -96,7 +96,7 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
     assert said(solved, "Is every frame solved?").startswith("Is every frame solved? Yes. Refused")
 
 
-def test_misidentification_and_roll_noise_are_kept_apart() -> None:
+def test_misidentification_and_roll_noise_are_distinguished() -> None:
     texts = answer.headline(study(), [line(0, 500, 1000, roll_noise=50)], True)
     assert said(texts, "Misidentified").endswith(
         "none in 1,000 (less than 0.3 % at 95 % confidence)."
@@ -109,7 +109,7 @@ def test_misidentification_and_roll_noise_are_kept_apart() -> None:
     )
 
 
-def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
+def test_the_bound_on_unseen_events_uses_the_point_with_fewest_trials() -> None:
     texts = answer.headline(study(), [line(0, 500, 100), line(1, 900, 1000)], False)
     assert said(texts, "Misidentified").endswith(
         "none in 100 a point (less than 3 % at 95 % confidence)."
@@ -138,7 +138,7 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
     )
 
 
-def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
+def test_a_tracker_without_matches_has_no_correctness_claim() -> None:
     unknown = line(0, 500, 100)
     unknown.responses["misidentified"] = metrics.NO_VALUE
     assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith(
@@ -146,12 +146,12 @@ def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
     )
 
 
-def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_values() -> None:
+def test_ranges_name_the_extreme_points_and_skip_points_of_few_values() -> None:
     lines = [line(0, 500, 200, identified=100), line(1, 900, 200, identified=200)]
     few = line(2, 200, 200, identified=3)
     few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
-    told = answer.ranges(study(), [*lines, few])
-    assert told == [
+    ranges = answer.ranges(study(), [*lines, few])
+    assert ranges == [
         "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.985..1) at leds = 900.",
         "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
     ]
@@ -192,7 +192,7 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
         ),
     ],
 )
-def test_claimed_errors_that_are_false_are_called_so(
+def test_understated_errors_are_reported(
     nees: list[tuple[float, float, float]], expected: str
 ) -> None:
     """The factor is sqrt(NEES / 3): 1.3 at 5.07, and 2 too large at 0.75."""
@@ -241,7 +241,7 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None:
+def test_the_tracker_s_knowledge_is_stated_as_in_the_check(tmp_path: Path) -> None:
     station = {
         "kind": "total_station",
         "position": ["1 m", "0 m", "-0.5 m"],
@@ -256,14 +256,14 @@ def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None
     plan = loaded(tmp_path, set=STUDY["set"] | survey)
     scene, _ = resolve_point(plan.spec, plan.points[0].settings)
     (fact,) = [one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"]
-    told = dict(overview.overview(plan).rows)["tracker knows"]
-    assert told == "; ".join(fact.lines)
-    assert "measured by a total station" in told
-    assert "LEDs to 0.1 mm" not in told
+    knowledge = dict(overview.overview(plan).rows)["tracker knows"]
+    assert knowledge == "; ".join(fact.lines)
+    assert "measured by a total station" in knowledge
+    assert "LEDs to 0.1 mm" not in knowledge
 
 
 @pytest.mark.slow
-def test_intervals_of_one_dome_say_which_hardware_is_fixed(tmp_path: Path) -> None:
+def test_intervals_of_one_dome_name_the_fixed_hardware(tmp_path: Path) -> None:
     survey = "tracker.survey.seed"
     layout = "light.layout.hardware_seed"
     (said_,) = answer.one_unit(overview.overview(loaded(tmp_path)).fixed)
@@ -289,31 +289,31 @@ def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
 
     def warned(tilt_deg: int) -> list[str]:
         trial = {"kind": "centroids", "tilt_deg": [0, tilt_deg]}
-        told = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
-        return [one for one in told.findings if "LEDs end at 27 deg" in one]
+        summary = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
+        return [one for one in summary.findings if "LEDs end at 27 deg" in one]
 
     assert not warned(10)
     assert "at a tilt of 25.0 deg" in warned(25)[0]
 
 
 @pytest.mark.slow
-def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(
+def test_checks_run_at_every_level_and_name_the_levels_of_findings(
     tmp_path: Path,
 ) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}
-    told = overview.overview(
+    summary = overview.overview(
         loaded(tmp_path, trial={"kind": "frames"}, factors={"disk": {"levels": levels}})
     )
-    wide = [one for one in told.findings if "px wide; local treats" in one]
+    wide = [one for one in summary.findings if "px wide; local treats" in one]
     assert len(wide) == 1
     assert wide[0].endswith("[disk = large]")
-    assert told.may_be_ambiguous
+    assert summary.may_be_ambiguous
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("texts", "told"),
+    ("texts", "expected"),
     [
         (["12 px of 3"] * 3, "12 px of 3"),
         (
@@ -323,12 +323,12 @@ def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(
         (["12 px of 3", "13 px of 3"], "12 px of 3 [a = 1; a = 2]"),
     ],
 )
-def test_a_finding_that_differs_in_its_numbers_is_told_once(texts: list[str], told: str) -> None:
+def test_findings_that_differ_only_in_numbers_are_merged(texts: list[str], expected: str) -> None:
     at = [(text, f"a = {n}") for n, text in enumerate(texts, 1)]
-    assert overview.finding_text(at, checked=3) == told
+    assert overview.finding_text(at, checked=3) == expected
 
 
-def test_a_place_has_its_unit() -> None:
+def test_the_location_of_an_extreme_has_its_unit() -> None:
     rates = study(
         factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}}, trial={"kind": "frames"}
     )
@@ -347,7 +347,7 @@ def test_a_rounding_error_of_zero_is_zero() -> None:
 
 
 @pytest.mark.slow
-def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
+def test_findings_of_many_levels_are_summarized(tmp_path: Path) -> None:
     """Three widths of LEDs, all of them too wide: one warning, not three that differ in their numbers."""
     sizes = {"key": "light.led.disk_diameter", "values": ["20 mm", "25 mm", "30 mm"]}
     found = overview.overview(

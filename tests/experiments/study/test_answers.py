@@ -38,7 +38,7 @@ def columns(**given):
     return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
 
 
-def test_responses_are_of_what_their_names_say():
+def test_responses_compute_the_named_quantity():
     c = columns(
         frames=[1, 1, 1, 1, 0],
         solved=[1, 1, 1, 0, 0],
@@ -85,10 +85,10 @@ def test_responses_are_of_what_their_names_say():
     assert metrics.response("filter_arcsec_rms")(c) == metrics.NO_VALUE
 
 
-def test_honest_answers_are_not_called_overconfident():
+def test_correct_covariances_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
-    told = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
-    assert told.value == 0
+    share = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
+    assert share.value == 0
     assert stats.chi2.sf(stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3) == pytest.approx(
         1e-8, rel=1e-6
     )
@@ -97,14 +97,14 @@ def test_honest_answers_are_not_called_overconfident():
 @pytest.mark.parametrize(
     "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
 )
-def test_a_response_that_is_none_is_refused_with_those_that_are(name):
+def test_an_unknown_response_is_refused_with_the_known_ones(name):
     with pytest.raises(
         InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"
     ):
         metrics.response(name, "responses.2")
 
 
-def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
+def test_sobol_indices_of_two_outputs_match_a_hand_calculation():
     """f = (2 x + y, 3 z + x y) over the unit cube: V = 175/144; x: 51/175, y: 15/175, z: 108/175, x with y: 1/175."""
     shares = qmc.Sobol(6, rng=1).random(4096)
     a = shares[:, :3]
@@ -140,12 +140,12 @@ responses: [identified]
 
 
 @pytest.mark.long
-def test_the_error_budget_blames_whom_it_should(tmp_path):
+def test_the_error_budget_attributes_errors_to_their_factors(tmp_path):
     """A survey turned about z is roll alone, one about x is cross alone; a lever across is mostly cross: 0.2 mm at
     33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""
-    told, kept = done(tmp_path, ERRORS)
+    study_plan, kept = done(tmp_path, ERRORS)
     with kept as rows:
-        found = {(one.response, one.factor): one for one in table.indices(told, rows)}
+        found = {(one.response, one.factor): one for one in table.indices(study_plan, rows)}
     assert found["roll_arcsec", "turn_z"].total.value > 0.9
     assert found["cross_arcsec", "turn_z"].total.value < 0.05
     assert found["roll_arcsec", "turn_x"].total.value < 0.1
@@ -157,13 +157,13 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
 
 
-def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
+def test_a_budget_without_trials_is_nan_and_no_error(tmp_path):
     path = tmp_path / "question.yaml"
     path.write_text(ERRORS)
-    told = study_file.load(path)
+    study_plan = study_file.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
-        runner.prepare_store(told, rows, resume=False)
-        found = table.indices(told, rows)
+        runner.prepare_store(study_plan, rows, resume=False)
+        found = table.indices(study_plan, rows)
     assert len(found) == 6
     assert all(math.isnan(one.total.value) for one in found)
 
@@ -172,48 +172,48 @@ def done(folder, text):
     """A study's plan, and its finished store to be opened."""
     path = folder / "question.yaml"
     path.write_text(text)
-    told = study_file.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
+    study_plan = study_file.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
     with store.writing(folder / "study.sqlite") as kept:
-        runner.prepare_store(told, kept, resume=False)
-        runner.run(told, kept, engines.Serial())
-    return told, store.open_store(folder / "study.sqlite")
+        runner.prepare_store(study_plan, kept, resume=False)
+        runner.run(study_plan, kept, engines.Serial())
+    return study_plan, store.open_store(folder / "study.sqlite")
 
 
 def loaded_with_a_fault(path):
     """A plan with a level that makes no scene, which `load` would refuse before the first trial."""
     good = path.with_name("good.yaml")
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
-    told = study_file.load(good)
+    study_plan = study_file.load(good)
     bad = [
         point._replace(
             settings={
                 key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()
             }
         )
-        for point in told.points
+        for point in study_plan.points
     ]
-    told.points[:] = bad
-    return told
+    study_plan.points[:] = bad
+    return study_plan
 
 
 @pytest.mark.long
-def test_exports_say_what_the_store_says(tmp_path):
+def test_exports_have_the_values_of_the_store(tmp_path):
     pandas = pytest.importorskip("pandas")
     pyarrow = pytest.importorskip("pyarrow.parquet")
     xarray = pytest.importorskip("xarray")
-    told, kept = done(tmp_path, STUDY)
+    study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
         for suffix in ("csv", "parquet", "zarr"):
-            study_export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
+            study_export.export(rows, study_plan.study.responses, tmp_path / f"trials.{suffix}")
         columns = rows.columns()
-        lines = table.table(rows, told.study.responses)
+        lines = table.table(rows, study_plan.study.responses)
         with pytest.raises(
             InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"
         ):
-            study_export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
+            study_export.export(rows, study_plan.study.responses, tmp_path / "trials.xlsx")
     with (tmp_path / "trials.csv").open() as file:
         written = list(csv.DictReader(file))
-    assert len(written) == told.trials == 16
+    assert len(written) == study_plan.trials == 16
     assert [float(row["x_arcsec"] or "nan") for row in written] == pytest.approx(
         columns["x_arcsec"].tolist(), abs=0, nan_ok=True
     )
@@ -232,9 +232,9 @@ def test_exports_say_what_the_store_says(tmp_path):
 
 def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
     """A study of centroids has no pointing error and no streak; the columns that are left are the store's, in order."""
-    told, kept = done(tmp_path, STUDY)
+    study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
-        study_export.export(rows, told.study.responses, tmp_path / "trials.csv")
+        study_export.export(rows, study_plan.study.responses, tmp_path / "trials.csv")
         columns = table.trial_columns(rows)
     written = (tmp_path / "trials.csv").read_text().splitlines()[0].split(",")
     empty = {"pointing_arcsec", "filter_arcsec", "streak_px", "body_tilt_deg"}
@@ -246,22 +246,22 @@ def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
 
 @pytest.mark.slow
 def test_a_trial_is_replayed_with_its_frames(tmp_path):
-    told, kept = done(tmp_path, STUDY)
+    study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
-        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(study_plan, rows, 9, tmp_path / "trial_9")
         assert again.changed == []
         assert again.row.seed == rows.trial(9)["seed"]
         assert [path.name for path in again.files] == ["frame_0000.fits"]
         assert all(path.is_file() for path in again.files + again.pictures)
-        failed = runner.replay(told, rows, 5, tmp_path / "trial_5")
+        failed = runner.replay(study_plan, rows, 5, tmp_path / "trial_5")
         assert "camera.focal_length" in failed.row.error
         assert failed.files == []
         with pytest.raises(InputError, match="trial 16: not in the study; allowed: 0 to 15"):
-            runner.replay(told, rows, 16, tmp_path)
+            runner.replay(study_plan, rows, 16, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("value", "text"),
     [
         ("1.59728308212 m", "1.597 m"),
         ("48 in", "48 in"),
@@ -270,63 +270,63 @@ def test_a_trial_is_replayed_with_its_frames(tmp_path):
         ([0, 30], "0, 30"),
     ],
 )
-def test_a_level_is_told_shortly(value, told):
-    assert table.format_level(value) == told
+def test_a_level_is_formatted_briefly(value, text):
+    assert table.format_level(value) == text
 
 
 def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path, monkeypatch):
-    told, kept = done(tmp_path, STUDY)
+    study_plan, kept = done(tmp_path, STUDY)
 
     def broken(self, centroids, *_):
         raise ZeroDivisionError("in the tracker")
 
     monkeypatch.setattr(StarTracker, "solve_centroids", broken)
     with kept as rows:
-        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(study_plan, rows, 9, tmp_path / "trial_9")
     assert "in the tracker" in again.row.error
     assert str(SCENES.parent) not in again.row.error
     assert [path.name for path in again.files] == ["frame_0000.fits"]
     assert again.pictures[0].is_file()
 
 
-def test_a_store_of_a_scene_that_was_changed_is_not_gone_on_with(tmp_path):
+def test_a_store_of_a_changed_scene_is_not_resumed(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
-    told, _ = done(
+    study_plan, _ = done(
         tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
     )
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.prepare_store(told, kept, resume=True)
+        runner.prepare_store(study_plan, kept, resume=True)
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ncamera: {f_number: 2.0}\n")
     with (
         store.writing(tmp_path / "study.sqlite") as kept,
         pytest.raises(InputError, match="the scene of point 0 has changed"),
     ):
-        runner.prepare_store(told, kept, resume=True)
+        runner.prepare_store(study_plan, kept, resume=True)
 
 
 def test_failed_trials_can_be_forgotten(tmp_path):
-    told, _ = done(tmp_path, STUDY)
+    study_plan, _ = done(tmp_path, STUDY)
     with store.writing(tmp_path / "study.sqlite") as kept:
         assert kept.counts() == {"done": 16, "failed": 8, "wrong": 0}
         kept.delete_failed()
         assert kept.done(16).sum() == 8
-        runner.run(told, kept, engines.Serial())
+        runner.run(study_plan, kept, engines.Serial())
         assert kept.counts()["done"] == 16
 
 
-def test_frames_of_a_flight_are_counted_as_one_another_s_like():
+def test_frames_of_one_flight_count_as_one_trial():
     """Two flights of a hundred frames each, all identified: the interval is of two, not of two hundred."""
     c = columns(frames=[100, 100], solved=[100, 100], wrong=[0, 0], nees=[500, 500])
-    told = metrics.response("identified")(c)
-    assert (told.value, told.trials) == (1.0, 2)
-    assert told.low == pytest.approx(metrics.proportion(2, 2).low)
+    share = metrics.response("identified")(c)
+    assert (share.value, share.trials) == (1.0, 2)
+    assert share.low == pytest.approx(metrics.proportion(2, 2).low)
     assert metrics.response("overconfident")(c).trials == 0  # a flight's NEES is a mean
 
 
-def test_a_table_is_of_every_point(tmp_path):
-    told, kept = done(tmp_path, STUDY)
+def test_a_table_has_a_row_for_every_point(tmp_path):
+    study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
-        lines = table.table(rows, told.study.responses)
+        lines = table.table(rows, study_plan.study.responses)
     heads, cells = table.cells(lines)
     assert heads == ["point", "strays", "focal", "identified", "cross_arcsec_p95"]
     assert [line[1:3] for line in cells] == [

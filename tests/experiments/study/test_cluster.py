@@ -156,7 +156,7 @@ def test_the_commands_of_the_pods_run_a_study(
 
 
 @pytest.mark.long
-def test_a_worker_that_hangs_is_given_up(
+def test_a_hanging_worker_is_abandoned(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
     """Stopped by a signal it answers no more; its trials are repeated by the other one, and none is stored twice."""

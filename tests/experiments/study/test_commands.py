@@ -1,4 +1,4 @@
-"""`skysim study` as it is typed: run, status, resume, report, export, replay, and what it says to a slip."""
+"""`skysim study` as it is typed: run, status, resume, report, export, replay, and its messages for wrong input."""
 
 import json
 import re
@@ -32,30 +32,30 @@ def typed(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["skysim", *words])
         with pytest.raises(SystemExit) as end:
             main.main()
-        told = capsys.readouterr()
-        return end.value.code, told.out, told.err
+        printed = capsys.readouterr()
+        return end.value.code, printed.out, printed.err
 
     return enter
 
 
 @pytest.mark.long
-def test_a_study_from_its_run_to_its_replay(typed, tmp_path):
+def test_a_study_is_run_reported_exported_and_replayed(typed, tmp_path):
     code, out, _ = typed("study", "run", "question.yaml", "--engine", "serial")
     assert code == 0
     assert "60 of 60 trials, 0 failed, 0 wrong" in out
     assert (tmp_path / "out/question/report.html").is_file()
     code, out, _ = typed("study", "status", "question.yaml", "--json")
-    told = json.loads(out)
-    assert (code, told["done"], told["trials"], told["failures"]) == (0, 60, 60, [])
+    report = json.loads(out)
+    assert (code, report["done"], report["trials"], report["failures"]) == (0, 60, 60, [])
     code, out, _ = typed("study", "report", "question.yaml", "--json")
     assert json.loads(out)["points"]["strays"] == [0, 5]
     assert "skysim study run question.yaml" in (tmp_path / "out/question/report.html").read_text()
     assert typed("study", "export", "question.yaml", "all.csv")[0] == 0
     assert len((tmp_path / "all.csv").read_text().splitlines()) == 61
     code, out, _ = typed("study", "replay", "question.yaml", "31", "--json")
-    told = json.loads(out)
-    assert (code, told["point"], told["replicate"], told["changed"]) == (0, 1, 1, [])
-    assert (tmp_path / told["pictures"][0]).is_file()
+    report = json.loads(out)
+    assert (code, report["point"], report["replicate"], report["changed"]) == (0, 1, 1, [])
+    assert (tmp_path / report["pictures"][0]).is_file()
 
 
 @pytest.mark.long
@@ -74,7 +74,7 @@ def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
 
 
 @pytest.mark.slow
-def test_what_was_overridden_is_remembered(typed):
+def test_overrides_are_kept_on_resume(typed):
     words = ("question.yaml", "--engine", "serial", "--out", "here")
     assert typed("study", "run", *words, "--set", "replicates=3")[0] == 0
     assert (
@@ -86,7 +86,7 @@ def test_what_was_overridden_is_remembered(typed):
 
 
 @pytest.mark.slow
-def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
+def test_a_study_named_by_its_folder_can_be_grown(typed, tmp_path):
     assert (
         typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0]
         == 0
@@ -108,23 +108,23 @@ def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
 
 
 @pytest.mark.long
-def test_the_worst_are_named_with_what_repeats_them(typed):
+def test_the_worst_trials_are_listed_with_their_replay_command(typed):
     assert typed("study", "run", "question.yaml", "--engine", "serial")[0] == 0
     code, out, _ = typed(
         "study", "worst", "question.yaml", "--response", "cross_arcsec_p95", "--json"
     )
-    told = json.loads(out)
-    assert (code, len(told)) == (0, 3)
-    assert [one["cross_arcsec"] for one in told] == sorted(
-        (one["cross_arcsec"] for one in told), reverse=True
+    worst = json.loads(out)
+    assert (code, len(worst)) == (0, 3)
+    assert [one["cross_arcsec"] for one in worst] == sorted(
+        (one["cross_arcsec"] for one in worst), reverse=True
     )
-    assert told[0]["command"] == f"skysim study replay question.yaml {told[0]['trial']}"
+    assert worst[0]["command"] == f"skysim study replay question.yaml {worst[0]['trial']}"
     again = json.loads(
-        typed("study", "replay", "question.yaml", str(told[0]["trial"]), "--json")[1]
+        typed("study", "replay", "question.yaml", str(worst[0]["trial"]), "--json")[1]
     )
     assert (again["boresight_ra_deg"], again["boresight_dec_deg"]) == (
-        told[0]["ra_deg"],
-        told[0]["dec_deg"],
+        worst[0]["ra_deg"],
+        worst[0]["dec_deg"],
     )
     words = ("study", "worst", "question.yaml", "--where", "strays=5", "--count", "2")
     _, out, _ = typed(*words, "--response", "cross_arcsec_p95")
@@ -196,7 +196,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
         ),
     ],
 )
-def test_a_slip_is_told_in_one_line(typed, words, complaint):
+def test_wrong_input_is_refused_in_one_line(typed, words, complaint):
     code, _, err = typed("study", *words)
     assert code == 2
     assert complaint in err

@@ -1,4 +1,4 @@
-"""Whoever does a study's trials, and whoever of them dies on the way: the store is that of one process, row for row."""
+"""Any engine leaves the store of one process, row for row, even if workers die on the way."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from pathlib import Path
 from skysim.experiments.study import loader
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution import engines, runner
-told = loader.load(sys.argv[1])
+study_plan = loader.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:
-    runner.prepare_store(told, kept, kept.counts()["done"] > 0)
-    runner.run(told, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
+    runner.prepare_store(study_plan, kept, kept.counts()["done"] > 0)
+    runner.run(study_plan, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))
 """
 
 
@@ -49,7 +49,7 @@ def plan_(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
 
 @pytest.fixture(scope="module")
 def serial_contents(plan_: plan.Plan) -> str:
-    """What one process leaves that nobody disturbs."""
+    """Contents of the store of one uninterrupted process."""
     path = plan_.path.with_name("whole.sqlite")
     assert done(plan_, path, engines.Serial()).failed == 0
     return contents(path)
@@ -182,7 +182,7 @@ class FakePool:
 
 
 @pytest.mark.parametrize(("deaths", "failed"), [(0, []), (1, []), (3, []), (4, [2])])
-def test_trials_that_are_lost_with_a_worker_are_retried_alone(
+def test_trials_lost_with_a_worker_are_retried_one_by_one(
     plan_: plan.Plan, monkeypatch: pytest.MonkeyPatch, deaths: int, failed: list[int]
 ) -> None:
     """Four chunks of three trials. The first death counts for no trial, as others run; the next three for trial 2."""
@@ -205,9 +205,9 @@ class Run:
     """A pool's run in a process of its own, with a process group of its own as a shell would make it."""
 
     def __init__(self, plan_: plan.Plan, path: Path, workers: int) -> None:
-        told_to = [sys.executable, "-c", DRIVER, str(plan_.path), str(path), str(workers)]
+        command = [sys.executable, "-c", DRIVER, str(plan_.path), str(path), str(workers)]
         self.process = subprocess.Popen(
-            told_to,
+            command,
             env=ENVIRONMENT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -341,7 +341,7 @@ def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
 
 
 def recipes() -> list[str]:
-    """The runs that a worker was told of."""
+    """Names of the runs that a worker has received."""
     from skysim.experiments.study.execution import dask_engine
 
     return list(dask_engine.JOBS)
@@ -372,7 +372,7 @@ def change_code(version: str) -> None:
 
 
 @pytest.mark.long
-def test_dask_loses_a_worker_and_makes_the_same_rows(
+def test_dask_gives_the_same_rows_after_losing_a_worker(
     cluster: Cluster, plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
     engine = on_dask(cluster, 2)
@@ -397,7 +397,7 @@ def test_dask_loses_a_worker_and_makes_the_same_rows(
 @pytest.mark.parametrize(
     "scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"]
 )
-def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
+def test_an_invalid_address_is_refused_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786") as refused:
         dask(scheduler)
@@ -405,7 +405,7 @@ def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
 
 
 @pytest.mark.long
-def test_where_nobody_answers_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     from skysim.experiments.study.execution import dask_engine
 
@@ -443,7 +443,7 @@ def test_a_trial_that_kills_dask_workers_fails_and_no_other(
 
 
 @pytest.mark.long
-def test_a_lost_scheduler_is_told_and_what_came_is_kept(
+def test_a_lost_scheduler_is_reported_and_received_rows_are_kept(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "lost.sqlite"

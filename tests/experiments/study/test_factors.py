@@ -17,18 +17,18 @@ READ = TypeAdapter(Factor).validate_python
     ("value", "number", "unit"),
     [(3, 3.0, ""), ("48 in", 48.0, "in"), ("-1.5e-3 N m", -1.5e-3, "N m"), (".5", 0.5, "")],
 )
-def test_a_quantity_comes_apart(value, number, unit):
+def test_a_quantity_splits_into_number_and_unit(value, number, unit):
     assert split_quantity(value) == (number, unit)
 
 
 @given(some.floats(-1e9, 1e9, allow_nan=False), some.sampled_from(["", "mm", "N m", "deg"]))
-def test_a_quantity_comes_together_to_twelve_digits(number, unit):
+def test_a_quantity_is_formatted_to_twelve_digits(number, unit):
     again, its_unit = split_quantity(join_quantity(number, unit))
     assert its_unit == unit
     assert again == pytest.approx(number, rel=1e-11, abs=1e-300)
 
 
-def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
+def test_a_range_includes_its_ends_and_may_be_logarithmic():
     even = READ({"key": "a.b", "from": "1 m", "to": "3 m", "steps": 3})
     assert [value for value, _ in even.options()] == ["1 m", "2 m", "3 m"]
     ratios = READ({"key": "a.b", "from": 1, "to": 100, "steps": 3, "scale": "log"})
@@ -39,7 +39,7 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("told", "law"),
+    ("factor", "law"),
     [
         ({"distribution": "normal", "mean": 3.0, "sigma": 2.0}, stats.norm(3, 2)),
         ({"distribution": "lognormal", "median": 3.0, "sigma": 0.5}, stats.lognorm(0.5, scale=3)),
@@ -62,17 +62,20 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
         ({"from": 2.0, "to": 50.0, "scale": "log"}, stats.loguniform(2, 50)),
     ],
 )
-def test_a_factor_drawn_is_distributed_as_told(told, law):
+def test_a_drawn_factor_has_its_declared_distribution(factor, law):
     """Even shares through `at` against SciPy's law: mean and spread to the grid's own error."""
     drawn = np.array(
-        [READ(told | {"key": "x"}).value_at(share)[0] for share in (np.arange(4_000) + 0.5) / 4_000]
+        [
+            READ(factor | {"key": "x"}).value_at(share)[0]
+            for share in (np.arange(4_000) + 0.5) / 4_000
+        ]
     )
     assert np.mean(drawn) == pytest.approx(law.mean(), rel=2e-3)
     assert np.std(drawn) == pytest.approx(law.std(), rel=5e-3)
 
 
 @pytest.mark.parametrize(
-    ("told", "complaint"),
+    ("factor", "complaint"),
     [
         ({"key": "x", "from": "1 m", "to": "2 in"}, "have different units"),
         ({"key": "x", "from": 3, "to": 2}, "allowed: below to"),
@@ -108,21 +111,21 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
         ({"values": [1, 2]}, "key"),
     ],
 )
-def test_a_factor_that_makes_no_sense_is_refused(told, complaint):
+def test_an_invalid_factor_is_refused(factor, complaint):
     with pytest.raises(ValidationError, match=complaint):
-        READ(told)
+        READ(factor)
 
 
 @pytest.mark.parametrize("u", [0.0, 1e-9, 0.3, 1.0])
 def test_a_truncated_normal_stays_within_its_bounds(u):
-    told = {
+    factor = {
         "key": "x",
         "distribution": "truncated_normal",
         "mean": "1 mm",
         "sigma": "5 mm",
         "low": "0 mm",
     }
-    value, settings = READ(told | {"high": "3 mm"}).value_at(u)
+    value, settings = READ(factor | {"high": "3 mm"}).value_at(u)
     assert settings == {"x": value}
     assert 0 <= float(value.removesuffix(" mm")) <= 3
 
@@ -189,7 +192,7 @@ def test_saltellis_blocks_are_a_b_and_a_with_a_column_of_b():
 
 
 @pytest.mark.parametrize("kind", ["lhs", "sobol", "saltelli"])
-def test_a_drawn_design_is_its_seeds(kind):
+def test_a_drawn_design_depends_on_its_seed_alone(kind):
     design = Design(kind=kind, points=8)
     assert points(design, THREE, 1) == points(design, THREE, 1)
     assert points(design, THREE, 1) != points(design, THREE, 2)
@@ -208,6 +211,6 @@ def test_a_drawn_design_is_its_seeds(kind):
         ),
     ],
 )
-def test_factors_and_design_that_do_not_go_together_are_refused(design, factors, complaint):
+def test_incompatible_factors_and_design_are_refused(design, factors, complaint):
     with pytest.raises(InputError, match=complaint):
         points(design, factors, 1)

@@ -37,7 +37,7 @@ def loaded(folder: Path, **keys: Any) -> plan.Plan:
     return study_file.load(path)
 
 
-def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
+def test_every_replicate_has_its_own_hardware_the_same_at_every_point(
     tmp_path: Path,
 ) -> None:
     spec = loaded(tmp_path).spec
@@ -54,20 +54,20 @@ def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
 @pytest.mark.slow
 def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
     """Each replicate's scene has its own hash; the table has a row for a noise, none for a dome."""
-    told = loaded(tmp_path)
-    assert done(told, tmp_path / "study.sqlite").failed == 0
+    study_plan = loaded(tmp_path)
+    assert done(study_plan, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
         columns = kept.columns()
-        lines = table.table(kept, told.study.responses)
+        lines = table.table(kept, study_plan.study.responses)
         assert len(set(columns["scene"])) == 6
         assert np.ptp(columns["stars"]) > 0
         assert [line.levels for line in lines] == [{"noise": 0.1}, {"noise": 0.2}]
         assert lines[0].responses["stars_mean"].trials == 6
-        again = runner.replay(told, kept, 8, tmp_path / "trial_8")
+        again = runner.replay(study_plan, kept, 8, tmp_path / "trial_8")
     assert again.changed == []
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.prepare_store(
-            told, kept, resume=True
+            study_plan, kept, resume=True
         )  # its first and last scenes are those of their own hardware
 
 
@@ -106,7 +106,7 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(
+def test_hardware_that_cannot_be_drawn_is_refused(
     tmp_path: Path, change: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(InputError, match=complaint):

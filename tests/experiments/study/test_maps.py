@@ -143,7 +143,7 @@ def test_a_cell_of_too_few_values_is_hatched() -> None:
 # Projections.
 
 
-def test_the_sky_keeps_its_areas() -> None:
+def test_the_sky_projection_preserves_areas() -> None:
     """Hammer's projection: the whole sky is an ellipse of area 4 pi; every cell has the area of its solid angle."""
     for low, high, left, right in maps.partition(-90, 90, 2000, True):
         polygon = maps.outline(maps.MapCell(low, high, left, right, 0.0, 9), True)
@@ -155,7 +155,7 @@ def test_the_sky_keeps_its_areas() -> None:
         assert area == pytest.approx(solid, rel=0.01)
 
 
-def test_directions_are_where_the_projection_puts_them() -> None:
+def test_directions_have_their_projected_positions() -> None:
     """Hammer: RA 0 in the middle, 90 deg at the left, (90, 0) at x = -2 sqrt 2 sin 45 / sqrt(1 + cos 45); the poles at
     y = +- sqrt 2. Under the dome, tilt 20 at azimuth 90 is (0, 20)."""
     assert maps.place(0.0, 360.0, True) == pytest.approx([0, 0], abs=1e-12)
@@ -184,7 +184,7 @@ LINES = [PointRow(n, {"leds": leds}, {}) for n, leds in enumerate((500, 900))]
 
 
 @pytest.mark.slow
-def test_a_map_has_a_panel_for_each_level_and_is_a_picture() -> None:
+def test_a_map_is_a_picture_with_a_panel_for_each_level() -> None:
     tables = columns(400), columns(400, wrong=np.ones(400))
     for by, labels, wrong in (("leds", ["500", "900"], [0.0, 1.0]), (None, [""], [0.0])):
         figure = Map(kind="map", value="wrong", by=by)
@@ -202,7 +202,7 @@ def test_a_map_has_a_panel_for_each_level_and_is_a_picture() -> None:
     )
 
 
-def test_the_colors_of_a_proportion_are_the_same_whatever_its_values() -> None:
+def test_the_color_scale_of_a_proportion_is_fixed() -> None:
     """A share of 0.3 everywhere has the color of 0.3 on a scale from 0 to 1, not of the middle of its own range."""
     from matplotlib import colormaps
 
@@ -253,7 +253,7 @@ def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
         ),
     ],
 )
-def test_a_map_that_cannot_be_is_refused(
+def test_an_impossible_map_is_refused(
     tmp_path: Any, change: dict[str, Any], complaint: str
 ) -> None:
     path = tmp_path / "study.yaml"
@@ -282,7 +282,7 @@ def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
 # The worst.
 
 
-def test_the_worst_are_the_largest_errors_in_different_places() -> None:
+def test_the_worst_trials_are_the_largest_errors_in_different_cells() -> None:
     table = columns(500)
     roll = np.linspace(1, 2, 500)
     roll[[7, 8, 40, 90]] = [90, 80, 70, 60]
@@ -299,7 +299,7 @@ def test_the_worst_are_the_largest_errors_in_different_places() -> None:
     )
 
 
-def test_the_worst_of_a_proportion_count_for_it() -> None:
+def test_the_worst_trials_of_a_proportion_are_its_failures() -> None:
     """Ambiguous ones first by being unsolved, then by the fewest lights; `identified` names those that are not."""
     table = columns(300, low=0, high=90)
     apart = np.linspace(0, 300, 300) % 360
@@ -341,7 +341,7 @@ def test_a_plain_quantity_ranks_single_trials() -> None:
     assert worst.worst_trials(fewest, "stars")[0].trial == 0
 
 
-def test_the_worst_can_be_pasted_as_a_start() -> None:
+def test_the_worst_trials_are_printed_as_a_start_section() -> None:
     """`motion.start` turns the body by the stored attitude, to the digits printed."""
     lab_from_body = Rotation.random(60, rng=np.random.default_rng(4))
     quaternion = dict(zip("wxyz", lab_from_body.as_quat(scalar_first=True).T, strict=True))
@@ -354,7 +354,7 @@ def test_the_worst_can_be_pasted_as_a_start() -> None:
 
 
 @pytest.mark.slow
-def test_the_worst_of_real_trials_are_found_again_by_their_number() -> None:
+def test_the_worst_trials_are_replayed_by_their_number() -> None:
     """A trial is replayed from the number in the list, with the same attitude and error."""
     plan = study_file.load("led_count", {"replicates": "40"})
     point = next(

@@ -48,7 +48,7 @@ def with_match(report: Report, star: Floats) -> Report:
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME])
-def test_a_light_matched_with_another_star_is_a_misidentification(spec: TrialSpec) -> None:
+def test_a_light_matched_with_a_wrong_star_is_a_misidentification(spec: TrialSpec) -> None:
     """One of the matches is given the star of another: in a field of degrees that is tens of pixels off."""
     setup, report, lights = solved(spec)
     assert scored(setup, report, lights).misidentified == 0
@@ -69,7 +69,7 @@ def test_a_light_matched_with_another_star_is_a_misidentification(spec: TrialSpe
 @pytest.mark.parametrize(
     ("distance_px", "wrong"), [(SAME_LIGHT_PX - 0.6, 0), (SAME_LIGHT_PX + 0.6, 1)]
 )
-def test_a_light_is_the_stars_own_within_three_pixels(
+def test_a_light_belongs_to_a_star_within_three_pixels(
     spec: TrialSpec, distance_px: float, wrong: int
 ) -> None:
     setup, report, lights = solved(spec)
@@ -82,7 +82,7 @@ def test_a_light_is_the_stars_own_within_three_pixels(
 
 
 @pytest.mark.parametrize(("sigmas", "misled"), [(5.0, 0), (7.0, 1)])
-def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(
+def test_wrong_lights_count_as_harmful_if_the_error_exceeds_its_claim(
     sigmas: float, misled: int
 ) -> None:
     """NEES 25 is allowed, 49 is not (40.8 has the probability 1e-8); with the right lights neither is misled."""
@@ -100,7 +100,7 @@ def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(
     assert (planted.misidentified, planted.wrong_matches, planted.misled) == (1, 2, misled)
 
 
-def test_a_light_displaced_in_the_exposure_is_still_its_stars() -> None:
+def test_a_light_displaced_by_motion_still_belongs_to_its_star() -> None:
     """Pulses and rolling shutters displace the mean image of a light: centroids there are right, others are not."""
     setup, report, lights = solved(SKY)
     shift_px = np.array([9.0, -4.0])
@@ -119,7 +119,7 @@ def test_a_light_displaced_in_the_exposure_is_still_its_stars() -> None:
     ("roll_arcmin", "sigma_arcmin", "noise", "wrong"),
     [(12, 5, 1, 0), (9, 5, 0, 0), (12, 1, 0, 1), (70, 40, 1, 1)],
 )
-def test_honest_roll_noise_is_beyond_ten_arcminutes_and_within_the_covariance(
+def test_correctly_claimed_roll_noise_beyond_ten_arcminutes_is_not_wrong(
     roll_arcmin: float, sigma_arcmin: float, noise: int, wrong: int
 ) -> None:
     """NEES is (roll / sigma)^2: 5.8 and 3.2 and 3.1 are allowed, 144 is not."""
@@ -145,7 +145,7 @@ def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
     assert all(one.solved == 0 and one.status.startswith("ambiguous") for one in ambiguous)
 
 
-def test_centroids_scatter_as_the_trial_says() -> None:
+def test_centroids_scatter_as_declared_in_the_trial() -> None:
     """RMS about each axis over 200 trials of some 20 lights each: to 4 standard errors, 0.3 / sqrt(2 * 4000)."""
     rows = trials.run_segments(SKY, (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),))
     weighted = [
@@ -207,7 +207,7 @@ def median_path_px(flight: Flight, index: int) -> float:
     return float(np.median(np.hypot(*(ends_px[1] - ends_px[0]).T)))
 
 
-def test_a_row_has_the_attitude_of_its_trial() -> None:
+def test_each_row_has_the_attitude_of_its_trial() -> None:
     """The quaternion is that of the draw; under the dome tilt and azimuth are those of the body's axis."""
     for spec in (SKY, DOME):
         setup = setups.prepared_setup(spec, {})

@@ -57,7 +57,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
             0.1,
         )
     errors = rng.normal(size=3).tolist() if replicate % 7 else [np.nan] * 3
-    told = Outcome(
+    result = Outcome(
         "solved" if replicate % 7 else "refused",
         1,
         int(replicate % 7 > 0),
@@ -65,7 +65,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
         *errors,
     )
     for name in ("boresight_ra_deg", "boresight_dec_deg", "stars", "centroid_px"):
-        setattr_frozen(told, name, float(rng.uniform(0, 60)))
+        setattr_frozen(result, name, float(rng.uniform(0, 60)))
     return Row(
         trial,
         point,
@@ -73,7 +73,7 @@ def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
         7 * replicate,
         f"scene {point}",
         "code",
-        told,
+        result,
         None,
         1e-3 * (1 + replicate),
     )
@@ -151,7 +151,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 # One table.
 
 
-def test_rows_beyond_the_limit_are_in_parts(tmp_path: Path) -> None:
+def test_rows_beyond_the_limit_are_moved_to_parts(tmp_path: Path) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)
     files = sorted((tmp_path / "s.parts").iterdir())
     assert [file.name for file in files] == [f"{n:06d}.parquet" for n in range(1, 6)]
@@ -162,7 +162,7 @@ def test_rows_beyond_the_limit_are_in_parts(tmp_path: Path) -> None:
     assert whole(path)["trial"] == list(range(POINTS * EACH))
 
 
-def test_both_are_one_table(both: tuple[Path, Path]) -> None:
+def test_rows_of_store_and_parts_are_one_table(both: tuple[Path, Path]) -> None:
     one, other = both
     assert (in_sqlite(one), in_sqlite(other)) == (120, 20)
     assert whole(one) == whole(other)
@@ -196,7 +196,9 @@ def same(columns: Any, others: Any) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_exports_have_the_same_bytes(both: tuple[Path, Path], tmp_path: Path, suffix: str) -> None:
+def test_exports_with_and_without_parts_have_the_same_bytes(
+    both: tuple[Path, Path], tmp_path: Path, suffix: str
+) -> None:
     for path in both:
         with store.open_store(path) as kept:
             study_export.export(kept, ("identified",), tmp_path / f"{path.stem}.{suffix}")
@@ -205,7 +207,7 @@ def test_exports_have_the_same_bytes(both: tuple[Path, Path], tmp_path: Path, su
     assert len(one) > 4000
 
 
-def test_an_export_reads_some_trials_at_a_time(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_an_export_reads_the_trials_in_batches(both: tuple[Path, Path], tmp_path: Path) -> None:
     pyarrow = pytest.importorskip("pyarrow.parquet")
     with store.open_store(both[1]) as kept, pytest.MonkeyPatch.context() as patch:
         patch.delattr(store.Store, "columns")
@@ -218,7 +220,7 @@ def test_an_export_reads_some_trials_at_a_time(both: tuple[Path, Path], tmp_path
     assert found["strays"] == np.repeat([0, 1, 2], EACH).tolist()
 
 
-def test_tables_and_worst_trials_are_the_same(both: tuple[Path, Path]) -> None:
+def test_tables_and_worst_trials_do_not_depend_on_parts(both: tuple[Path, Path]) -> None:
     asked = plan.Study.model_validate(
         {
             "schema": 1,
@@ -305,7 +307,7 @@ def forked(does: Callable[[], object]) -> int:
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_a_kill_in_any_step_of_a_move_loses_nothing_and_doubles_nothing(
+def test_a_kill_in_any_step_of_a_move_loses_and_duplicates_no_row(
     step: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "s.sqlite"
@@ -336,9 +338,9 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told = study_file.load(tmp_path / "strays.yaml")
+    study_plan = study_file.load(tmp_path / "strays.yaml")
     draw = random.Random(2)
-    done(told, tmp_path / "whole.sqlite")
+    done(study_plan, tmp_path / "whole.sqlite")
     often = tmp_path / "often.sqlite"
     killed = 0
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
@@ -346,7 +348,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 
     def run(pause_s: float = 0.02) -> None:
         runs = engines.Serial() if engine == "serial" else engines.Pool(2)
-        done(told, often, runs, stored() > 0, lambda progress: time.sleep(pause_s))
+        done(study_plan, often, runs, stored() > 0, lambda progress: time.sleep(pause_s))
 
     def stored() -> int:
         try:
@@ -366,7 +368,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
                 run()
             finally:
                 os._exit(0)
-        while stored() == before < told.trials and time.monotonic() < end:
+        while stored() == before < study_plan.trials and time.monotonic() < end:
             time.sleep(0.005)
         time.sleep(draw.uniform(0.0, 0.3))
         os.kill(pid, signal.SIGKILL)
@@ -429,7 +431,7 @@ def test_failed_trials_are_run_again(tmp_path: Path) -> None:
     assert whole(path) == whole(filled(tmp_path / "whole.sqlite", ALL))
 
 
-def test_failed_trials_alone_never_move(tmp_path: Path) -> None:
+def test_failed_trials_stay_in_the_store(tmp_path: Path) -> None:
     path = filled(
         tmp_path / "s.sqlite", [row(trial, failed=True) for trial in range(POINTS * EACH)]
     )
@@ -437,7 +439,7 @@ def test_failed_trials_alone_never_move(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("s.parts/*"))
 
 
-def test_a_reader_sees_one_instant(tmp_path: Path) -> None:
+def test_a_reader_sees_one_consistent_state(tmp_path: Path) -> None:
     """Rows that move while it reads are seen once: neither twice nor not at all."""
     path = filled(tmp_path / "s.sqlite", ALL[:50])
     with store.writing(path) as kept, store.open_store(path) as reader:
@@ -455,7 +457,7 @@ def test_a_reader_sees_one_instant(tmp_path: Path) -> None:
         assert reader.point_columns(0)["replicate"].tolist() == list(range(EACH))
 
 
-def test_search_reads_the_rows_that_it_has_just_added(tmp_path: Path) -> None:
+def test_a_search_reads_the_rows_it_has_just_added(tmp_path: Path) -> None:
     """Points are read together with their neighbors, but never from before the last rows."""
     with begun(tmp_path / "s.sqlite") as kept:
         add_all(kept, ALL[:90])
@@ -511,7 +513,7 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
+def test_an_invalid_list_of_parts_is_refused_in_one_line(
     change: str, message: str, tmp_path: Path
 ) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)
@@ -531,7 +533,7 @@ def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
         ("replicate", lambda replicate: replicate[:1]),
     ],
 )
-def test_a_part_with_other_values_is_one_clear_line(
+def test_a_part_with_invalid_values_is_refused_in_one_line(
     column: str, values: Callable[[Any], Any], tmp_path: Path
 ) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)

@@ -26,34 +26,36 @@ def written(folder, text):
 
 
 def test_a_plan_has_every_trial_of_every_point(tmp_path):
-    told = study_file.load(written(tmp_path, STUDY))
-    assert (told.name, len(told.points), told.trials) == ("question", 6, 24)
-    scene, trial = plan.resolve_point(told.spec, told.points[4].settings)
+    study_plan = study_file.load(written(tmp_path, STUDY))
+    assert (study_plan.name, len(study_plan.points), study_plan.trials) == ("question", 6, 24)
+    scene, trial = plan.resolve_point(study_plan.spec, study_plan.points[4].settings)
     assert trial.false_lights == 5
     assert trial.noise_px == 0.1
     assert scene.camera.focal_length_m == pytest.approx(0.025, rel=1e-12)
     assert scene.exposure.frames == 1
 
 
-def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
-    told = study_file.load(written(tmp_path, STUDY))
+def test_the_digest_covers_exactly_what_determines_the_trials(tmp_path):
+    study_plan = study_file.load(written(tmp_path, STUDY))
     same = study_file.load(
         written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
     )
-    assert same.digest == told.digest
+    assert same.digest == study_plan.digest
     for change in (
         ("seed: 1", "seed: 2"),
         ("noise_px: 0.1", "noise_px: 0.2"),
         ("replicates: 4", "replicates: 5"),
     ):
-        assert study_file.load(written(tmp_path, STUDY.replace(*change))).digest != told.digest
+        assert (
+            study_file.load(written(tmp_path, STUDY.replace(*change))).digest != study_plan.digest
+        )
 
 
 def test_an_override_changes_the_study(tmp_path):
-    told = study_file.load(
+    study_plan = study_file.load(
         written(tmp_path, STUDY), {"replicates": "7", "factors.strays.values": "[1, 2, 3]"}
     )
-    assert told.trials == 3 * 3 * 7
+    assert study_plan.trials == 3 * 3 * 7
 
 
 @pytest.mark.parametrize(
@@ -120,20 +122,22 @@ def test_an_override_changes_the_study(tmp_path):
         ),
     ],
 )
-def test_a_slip_is_told_in_one_line_with_its_place(tmp_path, change, complaint):
-    with pytest.raises(InputError, match=complaint) as told:
+def test_an_error_in_a_study_is_one_line_with_its_place(tmp_path, change, complaint):
+    with pytest.raises(InputError, match=complaint) as raised:
         study_file.load(written(tmp_path, STUDY.replace(*change)))
-    assert "\n" not in str(told.value)
-    assert "question.yaml" in str(told.value)
+    assert "\n" not in str(raised.value)
+    assert "question.yaml" in str(raised.value)
 
 
 def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ntitle: mine\n")
-    told = study_file.load(written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml")))
-    assert plan.resolve_point(told.spec, {})[0].title == "mine"
+    study_plan = study_file.load(
+        written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml"))
+    )
+    assert plan.resolve_point(study_plan.spec, {})[0].title == "mine"
 
 
-def test_there_is_no_such_study():
+def test_an_unknown_study_is_refused():
     with pytest.raises(
         InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"
     ):
@@ -142,11 +146,11 @@ def test_there_is_no_such_study():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_study_that_comes_along_can_be_asked(path):
+def test_every_shipped_study_loads(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
-    told = study_file.load(path)
-    assert told.study.title
-    assert told.trials or told.study.optimize
+    study_plan = study_file.load(path)
+    assert study_plan.study.title
+    assert study_plan.trials or study_plan.study.optimize
 
 
 FLIGHT = """schema: 1
@@ -160,7 +164,7 @@ responses: [identified]
 """
 
 
-def test_codes_of_leds_need_a_flight(tmp_path):
+def test_led_codes_without_a_flight_are_refused(tmp_path):
     """One frame shows one bit."""
     assert (
         study_file.load(
@@ -214,7 +218,7 @@ def test_codes_of_leds_need_a_flight(tmp_path):
         ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
     ],
 )
-def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, tmp_path):
+def test_a_random_start_is_allowed_by_the_scene(scene, start, complaint, tmp_path):
     path = written(tmp_path, FLIGHT.format(scene=scene, start=start))
     if complaint is None:
         assert study_file.load(path).trials == 2
@@ -235,7 +239,7 @@ def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, 
         ("{lab: [1, 0, 0]}", "rate_axis.lab: unknown key"),
     ],
 )
-def test_an_axis_is_a_name_or_one_vector(axis, complaint, tmp_path):
+def test_an_axis_is_a_name_or_a_vector(axis, complaint, tmp_path):
     trial = f"{{kind: frames, rate_deg_s: 1, rate_axis: {axis}}}"
     text = STUDY.replace("{kind: centroids, noise_px: 0.1}", trial).replace(
         "trial.false_lights", "seed"

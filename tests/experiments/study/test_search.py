@@ -99,20 +99,20 @@ def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "check_scene", lambda *_: None)
 
 
-def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
+def loaded(folder: Path, keys: dict[str, Any]) -> plan.Plan:
     path = folder / "study.yaml"
-    path.write_text(yaml.safe_dump(told))
+    path.write_text(yaml.safe_dump(keys))
     made = study_file.load(path)
     search.check(made.study)
     return made
 
 
 def searched(
-    told: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None
+    study_plan: plan.Plan, out: Path, engine: engines.Engine, watch: Any = None
 ) -> search.SearchResult:
     with store.writing(out) as kept:
-        runner.prepare_store(told, kept, bool(kept.meta("digest")))
-        return search.search(told, kept, engine, watch)
+        runner.prepare_store(study_plan, kept, bool(kept.meta("digest")))
+        return search.search(study_plan, kept, engine, watch)
 
 
 def held(out: Path) -> tuple[list[Any], list[Any]]:
@@ -127,7 +127,7 @@ def changed(**keys: Any) -> dict[str, Any]:
     return STUDY | {"optimize": STUDY["optimize"] | keys}
 
 
-def test_one_objective_comes_near_to_its_least(tmp_path: Path) -> None:
+def test_one_objective_approaches_its_minimum(tmp_path: Path) -> None:
     """Nearer than the best of as many points drawn at random, as they come on the average over the square."""
     found = searched(loaded(tmp_path, STUDY), tmp_path / "s.db", Law(bowl))
     (best,) = found.front
@@ -137,23 +137,23 @@ def test_one_objective_comes_near_to_its_least(tmp_path: Path) -> None:
     assert found.candidates[0].levels == {"x": 0.6, "y": 0.5}
 
 
-def test_more_is_better_where_the_study_says_so(tmp_path: Path) -> None:
-    told = changed(objectives=[{"response": "angle_arcsec_median", "better": "more"}])
-    (best,) = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(bowl)).front
+def test_an_objective_is_maximized_if_more_is_better(tmp_path: Path) -> None:
+    keys = changed(objectives=[{"response": "angle_arcsec_median", "better": "more"}])
+    (best,) = searched(loaded(tmp_path, keys), tmp_path / "s.db", Law(bowl)).front
     farthest = 1 + 0.6**2 + 0.8**2  # the corner
     assert best.objectives[0] > 1 + 0.8 * (farthest - 1)
 
 
-def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
+def test_the_front_holds_the_nondominated_candidates(tmp_path: Path) -> None:
     """angle = 1 / x against a price of x: every x at y = 0 is on the true front, and its law is angle * price = 1."""
     cost = {"per": {"x": 1, "y": 1}}
-    told = changed(
+    keys = changed(
         objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}],
         cost=cost,
         candidates=40,
     )
     found = searched(
-        loaded(tmp_path, told), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"]))
+        loaded(tmp_path, keys), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"]))
     )
     on = {one.number for one in found.front}
     assert len(on) >= 5
@@ -173,19 +173,19 @@ def test_front_is_what_no_other_candidate_dominates(tmp_path: Path) -> None:
     )  # it has learnt that y costs and brings nothing
 
 
-def test_constraints_rule_out_what_would_be_best(tmp_path: Path) -> None:
+def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
     """The bowl's bottom answers too seldom: the best is on the border x = 0.5, at a height of 1.04."""
 
     def law(settings: Settings) -> Outcome:
         return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
 
-    told = changed(
+    keys = changed(
         constraints=[
             {"response": "identified", "at_least": 0.9},
             {"response": "cost", "at_most": 10},
         ]
     )
-    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
+    found = searched(loaded(tmp_path, keys), tmp_path / "s.db", Law(law))
     (best,) = found.front
     assert 1.04 <= best.objectives[0] < 1.14
     for one in found.candidates:
@@ -203,8 +203,8 @@ def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) 
             raise InputError("light.layout", "no room")
         return bowl(settings)
 
-    told = loaded(tmp_path, STUDY | {"budget": {"failures": 1}})
-    found = searched(told, tmp_path / "s.db", Law(law))
+    study_plan = loaded(tmp_path, STUDY | {"budget": {"failures": 1}})
+    found = searched(study_plan, tmp_path / "s.db", Law(law))
     refused = [one for one in found.candidates if one.refused]
     assert found.finished
     assert refused
@@ -214,7 +214,7 @@ def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) 
     with store.open_store(tmp_path / "s.db") as kept:
         assert kept.counts() == {"done": 120, "failed": 4 * len(refused), "wrong": 0}
         seeds = kept.point_columns(refused[0].number)["seed"]
-        again = [seed_of(told.spec, refused[0].number, k) for k in range(4)]
+        again = [seed_of(study_plan.spec, refused[0].number, k) for k in range(4)]
         assert seeds.tolist() == again
 
 
@@ -226,15 +226,15 @@ def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
             raise InputError("light.layout", "no room")
         return bowl(settings)
 
-    told = changed(objectives=[{"response": "cost"}], cost={"per": {"x": 1}}, candidates=20)
-    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(law))
+    keys = changed(objectives=[{"response": "cost"}], cost={"per": {"x": 1}}, candidates=20)
+    found = searched(loaded(tmp_path, keys), tmp_path / "s.db", Law(law))
     assert any(one.refused for one in found.candidates)
     assert (
         found.front[0].cost == min(one.cost for one in found.candidates if not one.refused) >= 0.5
     )
 
 
-def test_failures_end_it(tmp_path: Path) -> None:
+def test_a_search_ends_at_its_limit_of_failures(tmp_path: Path) -> None:
     def law(settings: Settings) -> Outcome:
         raise ArithmeticError("a fault")
 
@@ -247,7 +247,7 @@ def test_failures_end_it(tmp_path: Path) -> None:
     assert not found.front
 
 
-def test_time_ends_it(tmp_path: Path) -> None:
+def test_a_search_ends_at_its_limit_of_time(tmp_path: Path) -> None:
     found = searched(
         loaded(tmp_path, STUDY | {"budget": {"time": "1 us"}}), tmp_path / "s.db", Law(bowl)
     )
@@ -270,11 +270,11 @@ def killer(after: int) -> Callable[[Any], None]:
     return watch
 
 
-def killed_and_resumed(told: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
+def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
     """Kill a search at every nth batch until it ends by itself; how often it was."""
     for kills in itertools.count():
         try:
-            searched(told, out, engine, killer(every))
+            searched(study_plan, out, engine, killer(every))
         except Killed:
             continue
         return kills
@@ -283,7 +283,7 @@ def killed_and_resumed(told: plan.Plan, out: Path, engine: engines.Engine, every
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", [2, 9])
-def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int) -> None:
+def test_a_search_killed_and_resumed_leaves_the_same_store(tmp_path: Path, every: int) -> None:
     """Two objectives, a constraint, levels and a refusal: all that the sampler hears of comes back from the store."""
 
     def law(settings: Settings) -> Outcome:
@@ -291,14 +291,14 @@ def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int)
             raise InputError("light.layout", "no room")
         return bowl(settings)
 
-    told = changed(
+    keys = changed(
         objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}],
         cost={"per": {"x": 1}, "levels": {"z": {"3": 1, "5": 2}}},
         constraints=[{"response": "angle_arcsec_worst", "at_most": 1.2}],
         candidates=13,
     )
-    told["factors"] = STUDY["factors"] | {"z": {"key": "trial.lights", "values": [3, 5]}}
-    made = loaded(tmp_path, told)
+    keys["factors"] = STUDY["factors"] | {"z": {"key": "trial.lights", "values": [3, 5]}}
+    made = loaded(tmp_path, keys)
     whole = searched(made, tmp_path / "whole.db", Law(law))
     assert killed_and_resumed(made, tmp_path / "killed.db", Law(law), every) > 2
     assert held(tmp_path / "killed.db") == held(tmp_path / "whole.db")
@@ -307,9 +307,9 @@ def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int)
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_with_a_real_scene(tmp_path: Path) -> None:
-    told = changed(candidates=4) | {"replicates": 3}
-    made = loaded(tmp_path, told)
+def test_a_search_of_a_real_scene_killed_and_resumed_leaves_the_same_store(tmp_path: Path) -> None:
+    keys = changed(candidates=4) | {"replicates": 3}
+    made = loaded(tmp_path, keys)
     searched(made, tmp_path / "whole.db", engines.Serial())
     assert killed_and_resumed(made, tmp_path / "killed.db", engines.Serial(), 3) > 1
     points, rows = held(tmp_path / "killed.db")
@@ -318,7 +318,7 @@ def test_killed_and_resumed_with_a_real_scene(tmp_path: Path) -> None:
     assert all(error is None for *_, error in rows)
 
 
-def test_another_question_than_the_store_has_is_refused(tmp_path: Path) -> None:
+def test_a_store_of_another_search_is_refused(tmp_path: Path) -> None:
     """As of another version of the sampler: its rows would be taken for another point's."""
     made = loaded(tmp_path, changed(candidates=3))
     searched(made, tmp_path / "s.db", Law(bowl))
@@ -330,13 +330,13 @@ def test_another_question_than_the_store_has_is_refused(tmp_path: Path) -> None:
             search.search(made, kept, Law(bowl))
 
 
-def test_few_points_are_tried_once_each(tmp_path: Path) -> None:
-    told = changed(candidates=30)
-    told["factors"] = {
+def test_each_of_few_points_is_tried_once(tmp_path: Path) -> None:
+    keys = changed(candidates=30)
+    keys["factors"] = {
         "x": {"key": "trial.noise_px", "values": [0.1, 0.5, 0.9]},
         "y": {"key": "trial.magnitude_sigma", "values": [0.2, 0.4]},
     }
-    found = searched(loaded(tmp_path, told), tmp_path / "s.db", Law(bowl))
+    found = searched(loaded(tmp_path, keys), tmp_path / "s.db", Law(bowl))
     assert found.finished
     assert sorted((one.levels["x"], one.levels["y"]) for one in found.candidates) == [
         (x, y) for x in (0.1, 0.5, 0.9) for y in (0.2, 0.4)
@@ -348,7 +348,7 @@ def test_few_points_are_tried_once_each(tmp_path: Path) -> None:
     }  # as near to 0.7, but for rounding
 
 
-def test_watch_is_told_of_the_whole_search(tmp_path: Path) -> None:
+def test_the_callback_gets_the_progress_of_the_whole_search(tmp_path: Path) -> None:
     seen = []
     made = loaded(tmp_path, changed(candidates=5))
     searched(
@@ -359,7 +359,7 @@ def test_watch_is_told_of_the_whole_search(tmp_path: Path) -> None:
     assert seen[-1] == (20, 20, 20)
 
 
-def test_cost_is_in_si_units(tmp_path: Path) -> None:
+def test_cost_is_per_si_unit(tmp_path: Path) -> None:
     """base 1 + 2 a meter of 48 in + 0.01 of each of 300 + the level's 5."""
     wanted = plan.Search.model_validate(
         {
@@ -419,7 +419,7 @@ def test_other_prices_are_another_search(tmp_path: Path) -> None:
     assert prices[1] - prices[0] == pytest.approx(200 * 0.1, abs=0.01)
 
 
-def test_bad_prices_are_the_study_s_fault(tmp_path: Path) -> None:
+def test_bad_prices_are_reported_as_errors_of_the_study(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: .*study\.yaml"):
         priced(tmp_path, "none.csv")
     with pytest.raises(
@@ -463,7 +463,7 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("keys", "says"),
     [
         (
             {"cost": {"per": {"radius": 1}}},
@@ -498,8 +498,8 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
         ({"candidates": 300}, r"budget\.trials: 1000; allowed: at least 1200"),
     ],
 )
-def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], says: str) -> None:
-    study = changed(**told) | {
+def test_wrong_names_are_answered_with_the_allowed_ones(keys: dict[str, Any], says: str) -> None:
+    study = changed(**keys) | {
         "factors": STUDY["factors"] | {"z": LEVELS},
         "budget": {"trials": 1000},
     }
@@ -507,7 +507,7 @@ def test_wrong_names_are_answered_with_the_allowed_ones(told: dict[str, Any], sa
         search.check(plan.Study.model_validate(study))
 
 
-def test_a_distribution_is_not_chosen() -> None:
+def test_a_distribution_cannot_be_searched() -> None:
     drawn = {"key": "trial.noise_px", "distribution": "normal", "mean": 0.5, "sigma": 0.1}
     with pytest.raises(InputError, match=r"factors\.x: a distribution cannot be optimized"):
         search.check(plan.Study.model_validate(STUDY | {"factors": {"x": drawn}}))
@@ -540,7 +540,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
+def test_the_shipped_search_has_its_documented_settings(tmp_path: Path) -> None:
     made = study_file.load("dome_for_the_money")
     search.check(made.study)
     first = {name: factor.value_at(0.5) for name, factor in made.study.factors.items()}

@@ -29,22 +29,22 @@ from tests.helpers.study_stores import STRAYS, contents, done
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
+def study_plan(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
     path = tmp_path_factory.mktemp("study") / "strays.yaml"
     path.write_text(STRAYS)
     return study_file.load(path)
 
 
 @pytest.fixture(scope="module")
-def whole(told: plan.Plan) -> str:
-    """What a run that nobody disturbed leaves."""
-    path = told.path.with_name("whole.sqlite")
-    assert done(told, path).failed == 0
+def whole(study_plan: plan.Plan) -> str:
+    """Contents of the store of an uninterrupted run."""
+    path = study_plan.path.with_name("whole.sqlite")
+    assert done(study_plan, path).failed == 0
     return contents(path)
 
 
-def other(told: plan.Plan, **overrides: str) -> plan.Plan:
-    return study_file.load(told.path, overrides)
+def other(study_plan: plan.Plan, **overrides: str) -> plan.Plan:
+    return study_file.load(study_plan.path, overrides)
 
 
 def child(does: Callable[[], object]) -> int:
@@ -84,15 +84,15 @@ def until(path: Path, count: int) -> None:
 
 @pytest.mark.long
 def test_a_writer_killed_at_any_instant_leaves_whole_batches(
-    told: plan.Plan, whole: str, tmp_path: Path
+    study_plan: plan.Plan, whole: str, tmp_path: Path
 ) -> None:
-    """And a run that goes on after each of its deaths ends with the store of a run that nobody disturbed."""
+    """A run that is resumed after each kill ends with the store of an uninterrupted run."""
     often = tmp_path / "often.sqlite"
     draw = random.Random(1)
     left = [0]
     for _ in range(6):
-        pid = child(partial(done, told, often, resume=left[-1] > 0))
-        until(often, min(left[-1] + 1, told.trials))
+        pid = child(partial(done, study_plan, often, resume=left[-1] > 0))
+        until(often, min(left[-1] + 1, study_plan.trials))
         time.sleep(0.05 * draw.random())
         os.kill(pid, signal.SIGKILL)
         assert os.waitpid(pid, 0)[1] in (signal.SIGKILL, 0)
@@ -100,43 +100,43 @@ def test_a_writer_killed_at_any_instant_leaves_whole_batches(
             assert kept.db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
             left.append(kept.counts()["done"])
             assert kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0] == left[-1]
-    assert 0 < left[1] < told.trials
-    done(told, often, resume=True)
+    assert 0 < left[1] < study_plan.trials
+    done(study_plan, often, resume=True)
     assert contents(often) == whole
 
 
 @pytest.mark.long
-def test_one_run_at_a_time(told: plan.Plan, tmp_path: Path) -> None:
+def test_a_second_run_on_the_same_store_is_refused(study_plan: plan.Plan, tmp_path: Path) -> None:
     path = tmp_path / "one.sqlite"
-    pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.05)))
+    pid = child(lambda: done(study_plan, path, watch=lambda progress: time.sleep(0.05)))
     try:
         until(path, 1)
         with pytest.raises(
             InputError, match="in use by another run; allowed: one run at a time"
         ) as refused:
-            done(told, path, resume=True)
+            done(study_plan, path, resume=True)
         assert "\n" not in str(refused.value)
         with store.open_store(path) as kept:  # who only reads is welcome
-            assert 0 < kept.counts()["done"] < told.trials
+            assert 0 < kept.counts()["done"] < study_plan.trials
     finally:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
-    assert done(told, path, resume=True).done == told.trials
+    assert done(study_plan, path, resume=True).done == study_plan.trials
 
 
 @pytest.mark.long
-def test_interrupted_by_the_keyboard_it_resumes(
-    told: plan.Plan, whole: str, tmp_path: Path
+def test_a_run_interrupted_by_the_keyboard_resumes(
+    study_plan: plan.Plan, whole: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "interrupted.sqlite"
-    pid = child(lambda: done(told, path, watch=lambda progress: time.sleep(0.02)))
+    pid = child(lambda: done(study_plan, path, watch=lambda progress: time.sleep(0.02)))
     until(path, 5)
     os.kill(pid, signal.SIGINT)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 2
     with store.open_store(path) as kept:
         (run,) = kept.runs()  # that it ended by itself
-        assert 5 <= run["trials"] == kept.counts()["done"] < told.trials
-    done(told, path, resume=True)
+        assert 5 <= run["trials"] == kept.counts()["done"] < study_plan.trials
+    done(study_plan, path, resume=True)
     assert contents(path) == whole
 
 
@@ -145,33 +145,33 @@ def test_interrupted_by_the_keyboard_it_resumes(
 
 @pytest.mark.long
 def test_another_study_or_other_code_is_refused(
-    told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study_plan: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "kept.sqlite"
-    done(told, path)
+    done(study_plan, path)
     with pytest.raises(InputError, match="contains 120 trials; allowed: to resume the study"):
-        done(told, path)
+        done(study_plan, path)
     for key, value in {"seed": "2", "replicates": "39", "set": "{light.limit_mag: 5.5}"}.items():
         with pytest.raises(InputError, match="another study"):
-            done(other(told, **{key: value}), path, resume=True)
+            done(other(study_plan, **{key: value}), path, resume=True)
     for key, value in {"title": "another", "responses": "[wrong]", "budget": "{time: 1 h}"}.items():
-        assert done(other(told, **{key: value}), path, resume=True).now == 0
+        assert done(other(study_plan, **{key: value}), path, resume=True).now == 0
     monkeypatch.setattr(runner, "code_version", lambda: "0123456789abcdef")
     with pytest.raises(InputError, match=r"trials are of skysim .*; allowed: 0123456789abcdef"):
-        done(told, path, resume=True)
+        done(study_plan, path, resume=True)
     with pytest.raises(InputError, match="no trials to resume"):
-        done(told, tmp_path / "new.sqlite", resume=True)
+        done(study_plan, tmp_path / "new.sqlite", resume=True)
 
 
 @pytest.mark.slow
 def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
-    told: plan.Plan, tmp_path: Path
+    study_plan: plan.Plan, tmp_path: Path
 ) -> None:
-    more = other(told, replicates="5")
+    more = other(study_plan, replicates="5")
     whole = tmp_path / "whole.sqlite"
     grown = tmp_path / "grown.sqlite"
     done(more, whole)
-    done(other(told, replicates="2"), grown)
+    done(other(study_plan, replicates="2"), grown)
     assert done(more, grown, resume=True).now == 9
     assert contents(grown) == contents(whole)
     with store.open_store(whole) as kept, store.open_store(grown) as other_store:
@@ -182,10 +182,10 @@ def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
             == 15
         )
     with pytest.raises(InputError, match="another study"):
-        done(other(told, replicates="4"), grown, resume=True)
+        done(other(study_plan, replicates="4"), grown, resume=True)
 
 
-def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_store_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "text.sqlite"
     path.write_text("ten thousand identifications\n" * 100)
     for opened in (store.open_store, store.writing):
@@ -213,7 +213,7 @@ COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything b
 @pytest.mark.parametrize(
     ("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]]
 )
-def test_a_value_of_another_type_is_one_clear_line(
+def test_a_value_of_a_wrong_type_is_refused_in_one_line(
     table: str, column: str, value: str, tmp_path: Path
 ) -> None:
     """SQLite stores any type in any column, so a damaged file can hold bytes where skysim wrote text or numbers."""
@@ -261,18 +261,20 @@ def taken(folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_out_of_time_it_stops_and_resumes(told: plan.Plan, whole: str, tmp_path: Path) -> None:
+def test_a_run_out_of_time_stops_and_resumes(
+    study_plan: plan.Plan, whole: str, tmp_path: Path
+) -> None:
     path = tmp_path / "short.sqlite"
-    short = other(told, budget="{time: 1 us}")
-    assert 0 < done(short, path).now < told.trials
-    longer = other(told, budget="{time: 30 ms}")
-    while (progress := done(longer, path, resume=True)).done < told.trials:
+    short = other(study_plan, budget="{time: 1 us}")
+    assert 0 < done(short, path).now < study_plan.trials
+    longer = other(study_plan, budget="{time: 30 ms}")
+    while (progress := done(longer, path, resume=True)).done < study_plan.trials:
         assert progress.now > 0
     assert contents(path) == whole
 
 
-def test_trials_that_raise_are_rows_until_they_are_too_many(
-    told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_trials_that_raise_become_rows_up_to_a_limit(
+    study_plan: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fragile(ready: TrialSetup, seed: int) -> Outcome:
         if seed % 4 == 0:
@@ -282,14 +284,16 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
     monkeypatch.setitem(trials.TRIALS, "centroids", trials.one_by_one(fragile))
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
     path = tmp_path / "fragile.sqlite"
-    told = other(told, paired="false")
-    seeds = [setups.seed_of(told.spec, *divmod(trial, 40)) for trial in range(told.trials)]
+    study_plan = other(study_plan, paired="false")
+    seeds = [
+        setups.seed_of(study_plan.spec, *divmod(trial, 40)) for trial in range(study_plan.trials)
+    ]
     bad = [trial for trial, seed in enumerate(seeds) if seed % 4 == 0]
-    stopped = done(other(told, paired="false", budget="{failures: 3}"), path)
+    stopped = done(other(study_plan, paired="false", budget="{failures: 3}"), path)
     assert (stopped.failed, stopped.done) == (3, bad[2] + 1)
-    assert done(told, path, resume=True).failed == len(bad)
+    assert done(study_plan, path, resume=True).failed == len(bad)
     with store.open_store(path) as kept:
-        assert kept.counts() == {"done": told.trials, "failed": len(bad), "wrong": 0}
+        assert kept.counts() == {"done": study_plan.trials, "failed": len(bad), "wrong": 0}
         assert kept.failures() == [
             (trial, f"ZeroDivisionError: of {seeds[trial]}") for trial in bad
         ]
@@ -302,7 +306,7 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
 # Columns.
 
 
-def test_rows_come_back_as_they_went_in(tmp_path: Path) -> None:
+def test_rows_round_trip_through_the_store(tmp_path: Path) -> None:
     rows = [
         Row(1, 0, 1, 2**63 - 1, "scene", "code", Outcome("solved", 1, 1, 0, 1.5, -0.1), None, 2e-3),
         Row(0, 0, 0, 0, "", "code", Outcome("failed"), "Traceback\nboom", 1e-3),
@@ -320,7 +324,7 @@ def test_rows_come_back_as_they_went_in(tmp_path: Path) -> None:
         assert list(kept.done(3)) == [True, True, False]
 
 
-def test_rows_are_kept_all_or_none(tmp_path: Path) -> None:
+def test_a_batch_of_rows_is_stored_whole_or_not_at_all(tmp_path: Path) -> None:
     good = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
     with store.writing(tmp_path / "rows.sqlite") as kept:
         with pytest.raises(sqlite3.IntegrityError):
@@ -345,8 +349,8 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
     came = []
     size = 1
     while chunk := todo.next():
-        for point, told, number, which in chunk:
-            assert told == {"trial.lights": point}
+        for point, changes, number, which in chunk:
+            assert changes == {"trial.lights": point}
             assert 0 <= which.start < which.stop <= replicates
             assert number == point * replicates + which.start
             came += [point * replicates + replicate for replicate in which]
@@ -375,7 +379,9 @@ def test_chunks_are_sized_by_time() -> None:
 
 
 @pytest.mark.parametrize(("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)])
-def test_many_workers_complete_no_more_chunks_than_few(workers: int, rate_hz: float) -> None:
+def test_the_rate_of_completed_chunks_is_bounded_for_many_workers(
+    workers: int, rate_hz: float
+) -> None:
     """Of trials of 10 ms: the chunks of a second, from their size."""
     todo = runner.ChunkQueue(
         [Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers)

@@ -73,8 +73,8 @@ def filled(
     for trial in range(len(tried) * asked.replicates)[:done]:
         point, replicate = divmod(trial, asked.replicates)
         error = f"Traceback\nValueError: <b>{trial}</b>" if trial < failed else None
-        told = Outcome("failed") if error else outcome(point, replicate)
-        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
+        result = Outcome("failed") if error else outcome(point, replicate)
+        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", result, error, 0.001))
     with store.writing(path) as kept:
         kept.begin(
             kept.points(),
@@ -111,13 +111,13 @@ class Html(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = dict(attrs)
+        attributes = dict(attrs)
         self.tags.append(tag)
-        self.sources += [told[name] or "" for name in ("src", "href") if name in told]
+        self.sources += [attributes[name] or "" for name in ("src", "href") if name in attributes]
         if tag == "img":
-            self.images.append(told["src"] or "")
+            self.images.append(attributes["src"] or "")
         if tag in ("p", "code", "div", "pre"):
-            self._inside.append((told.get("id") or told.get("class") or tag).strip())
+            self._inside.append((attributes.get("id") or attributes.get("class") or tag).strip())
         if tag in ("h2", "summary"):
             self._in_title = True
             self._title = ""
@@ -132,8 +132,8 @@ class Html(HTMLParser):
             self._cell = True
             self.tables[self._section][-1].append("")
         if tag == "td" and self._section == POINTS:
-            self.keys[-1].append(told["data-key"] or "")
-            self.marked[-1] |= "marked" in (told["class"] or "")
+            self.keys[-1].append(attributes["data-key"] or "")
+            self.marked[-1] |= "marked" in (attributes["class"] or "")
 
     def handle_endtag(self, tag: str) -> None:
         if tag in ("p", "code", "div", "pre"):
@@ -175,7 +175,7 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("bare")
-def test_every_fact_is_the_stores(tmp_path: Path) -> None:
+def test_every_number_of_the_report_is_the_store_s(tmp_path: Path) -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
     path = filled(tmp_path / "s.sqlite", asked, failed=3)
     _, html = written(path, asked)
@@ -191,7 +191,7 @@ def test_every_fact_is_the_stores(tmp_path: Path) -> None:
     assert "Not finished" not in html.said["verdict bad"]
 
 
-def test_the_command_is_escaped_and_nothing_comes_from_outside(tmp_path: Path) -> None:
+def test_the_command_is_escaped_and_nothing_is_loaded_from_outside(tmp_path: Path) -> None:
     asked = study()
     text, html = written(filled(tmp_path / "s.sqlite", asked, failed=1), asked)
     assert html.said["command"] == COMMAND
@@ -204,7 +204,7 @@ def test_the_command_is_escaped_and_nothing_comes_from_outside(tmp_path: Path) -
 
 @pytest.mark.usefixtures("bare")
 @pytest.mark.parametrize("done", [0, 31])
-def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
+def test_a_half_finished_study_is_reported_as_such(tmp_path: Path, done: int) -> None:
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, done=done), asked)
     assert html.said["verdict warning"].startswith(f"{done} of 60 trials, ")
@@ -214,19 +214,19 @@ def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
 
 
 @pytest.mark.usefixtures("bare")
-def test_the_first_ten_failures_are_named_with_what_replays_them(tmp_path: Path) -> None:
+def test_the_first_ten_failures_are_listed_with_their_replay_command(tmp_path: Path) -> None:
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, failed=12), asked)
-    told = html.said["items bad"]
-    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [
+    items = html.said["items bad"]
+    assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", items) == [
         (str(n), str(n)) for n in range(10)
     ]
-    assert told.startswith("12 trials failed")
-    assert "skysim study replay FILE 0" in told
+    assert items.startswith("12 trials failed")
+    assert "skysim study replay FILE 0" in items
 
 
 @pytest.mark.usefixtures("bare")
-def test_a_run_that_was_killed_is_owned_up_to(tmp_path: Path) -> None:
+def test_a_killed_run_is_reported(tmp_path: Path) -> None:
     asked = study()
     path = filled(tmp_path / "s.sqlite", asked)
     with store.writing(path) as kept, kept.db:
@@ -272,7 +272,7 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
         ),
     ],
 )
-def test_figures_exist_of_every_kind(tmp_path: Path, keys: dict[str, Any], count: int) -> None:
+def test_every_kind_of_figure_is_drawn(tmp_path: Path, keys: dict[str, Any], count: int) -> None:
     asked = study(**keys)
     html = written(filled(tmp_path / "s.sqlite", asked), asked)[1]
     assert len(html.images) == count
@@ -280,7 +280,7 @@ def test_figures_exist_of_every_kind(tmp_path: Path, keys: dict[str, Any], count
 
 
 @pytest.mark.long
-def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
+def test_indices_and_a_search_have_figures(tmp_path: Path) -> None:
     part = Summary(0.4, 0.3, 0.5, 8)
     index = [Index("tilt", name, part, part, 1.0) for name in ("cross_arcsec", "roll_arcsec")]
     factors = {"tilt": {"key": "a", "from": 1, "to": 9}}
@@ -335,7 +335,7 @@ def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(
     assert "at ring = 10, 20" in layout.caption(curve, asked, lines)
 
 
-def test_what_is_drawn_is_what_was_arranged(tmp_path: Path) -> None:
+def test_figures_draw_the_arranged_data(tmp_path: Path) -> None:
     from matplotlib.figure import Figure as Canvas
 
     asked = study(replicates=10)  # too few for a median's interval at every point
@@ -350,7 +350,7 @@ def test_what_is_drawn_is_what_was_arranged(tmp_path: Path) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("tilt [deg]", "cross median [arcsec]")
 
 
-def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_needs() -> None:
+def test_a_point_without_an_interval_has_no_bar_and_the_caption_names_the_trials_needed() -> None:
     from matplotlib.figure import Figure as Canvas
 
     nan = math.nan
@@ -358,8 +358,8 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_nee
         [20, 0, 10], [(5, 4, 9, 70, 0), (3, 0, 6, 70, 0), (8, nan, nan, 40, 19)], strict=True
     )
     lines = [
-        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*told)}, 70)
-        for n, (one, told) in enumerate(levels)
+        PointRow(n, {"tilt": one}, {"roll_arcsec_p95": Summary(*summary)}, 70)
+        for n, (one, summary) in enumerate(levels)
     ]
     for log in (False, True):
         fig = Canvas()
@@ -380,7 +380,7 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_says_what_it_nee
         )
 
 
-def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
+def test_points_of_few_values_are_hollow_numbered_and_not_connected() -> None:
     """Of 60 trials each, 60, 12 and 50 have a value: the middle one has a marker of its own and parts the line."""
     from matplotlib.figure import Figure as Canvas
 
@@ -428,7 +428,7 @@ def test_few_survivors_are_hollow_numbered_and_joined_to_nothing() -> None:
         (0, 60, False),
     ],
 )
-def test_few_is_less_than_half_or_less_than_five_of_more(
+def test_points_have_few_values_below_half_or_below_five(
     values: int, trials: int, few: bool
 ) -> None:
     row = PointRow(0, {}, {"nees_mean": Summary(1.0, 1.0, 1.0, values)}, trials)
@@ -515,14 +515,14 @@ def test_axes_know_numbers_quantities_names_and_lists() -> None:
     ]
 
 
-def test_two_levels_said_in_two_ways_are_one() -> None:
+def test_equal_levels_in_different_units_are_one() -> None:
     assert axes.same("5 m", "5.0 m")
     assert axes.same([0, 10], [0.0, 10.0])
     assert not axes.same("5 m", "5 ft")
     assert not axes.same("5 m", 5)
 
 
-def test_where_names_what_is_there() -> None:
+def test_an_unknown_name_in_where_is_answered_with_the_known_ones() -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
     lines = [PointRow(n, point.levels, {}) for n, point in enumerate(points(asked))]
     for where, said in (
@@ -533,7 +533,7 @@ def test_where_names_what_is_there() -> None:
             axes.shown_points(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
 
 
-def test_figures_that_nobody_named_follow_from_the_factors() -> None:
+def test_default_figures_follow_from_the_factors() -> None:
     many = {"key": "x", "from": 0, "to": 1, "steps": 12}
 
     def chosen(**keys: Any) -> list[tuple[Any, ...]]:
@@ -559,7 +559,7 @@ def test_figures_that_nobody_named_follow_from_the_factors() -> None:
     assert chosen(**drawn) == [("curve", "n", "wrong", None), ("curve", "dome", "wrong", None)]
 
 
-def test_drawn_factors_part_points_into_equal_bands() -> None:
+def test_drawn_factors_divide_points_into_equal_bands() -> None:
     rng = np.random.default_rng(3)
     asked = study(
         factors={name: {"key": name, "from": 0, "to": 1} for name in "xb"},
@@ -601,7 +601,7 @@ def test_a_search_is_shown_by_candidate_with_its_bounds() -> None:
     assert panels["wrong"].high.tolist() == [0.3, 0.3]
 
 
-def test_a_figure_is_a_picture_by_itself(tmp_path: Path) -> None:
+def test_each_figure_is_a_file_of_its_own(tmp_path: Path) -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
     lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
     curve = Curve(kind="curve", x="tilt", y="identified", by="dome")

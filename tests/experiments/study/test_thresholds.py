@@ -49,7 +49,7 @@ def counted(hits: list[int], trials: int = 400, limit: float = 0.95, log: bool =
     )
 
 
-def test_a_line_between_two_levels_crosses_where_it_should() -> None:
+def test_the_threshold_between_two_levels_is_interpolated_linearly() -> None:
     """From 1 at 4 to 0.8 at 6: 0.95 at 4.5; rising, the same mirrored; in the logarithm, 5 (7 / 5)^(1 / 4)."""
     falling = counted([400, 400, 400, 400, 400, 320, 200, 100])
     assert falling.value == pytest.approx(4.5)
@@ -63,14 +63,14 @@ def test_a_line_between_two_levels_crosses_where_it_should() -> None:
     )
 
 
-def test_beyond_the_levels_there_is_no_number() -> None:
+def test_a_threshold_beyond_the_levels_has_no_number() -> None:
     above = counted([400] * 8)
     below = counted([320, 300, 200, 100, 50, 20, 10, 0])
     assert (above.value, above.low, above.high) == (math.inf, 10, math.inf)
     assert (below.value, below.low, below.high) == (-math.inf, -math.inf, 0)
 
 
-def test_levels_that_are_not_certain_leave_the_end_open_and_say_what_they_need() -> None:
+def test_uncertain_levels_leave_the_interval_open_and_name_the_trials_needed() -> None:
     """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough."""
     found = counted([60, 60, 60, 60, 39, 12, 5, 2], trials=60)
     assert metrics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
@@ -84,7 +84,7 @@ def test_a_curve_that_falls_and_rises_has_no_threshold() -> None:
     assert (found.low, found.high) == (-math.inf, math.inf)
 
 
-def test_noise_of_a_monotonic_curve_is_no_misfit() -> None:
+def test_noise_on_a_monotonic_curve_is_not_called_misfit() -> None:
     """Of 500 falling curves drawn with 100 trials a level, at most one in a hundred is called not monotonic."""
     rng = np.random.default_rng(4)
     truth = logistic(LEVELS, 5.0, 1.0)
@@ -96,7 +96,7 @@ def test_noise_of_a_monotonic_curve_is_no_misfit() -> None:
 
 
 @pytest.mark.parametrize(("middle", "width"), [(6.0, 0.6), (7.0, 1.2), (9.0, 0.2)])
-def test_the_interval_holds_the_truth_as_often_as_promised(middle: float, width: float) -> None:
+def test_the_interval_covers_the_truth_as_often_as_stated(middle: float, width: float) -> None:
     """Logistic curves cross 0.95 at middle - width ln 19. Of 600 draws each, at least 95 % to four standard errors."""
     rng = np.random.default_rng(7)
     truth = middle - width * math.log(19)
@@ -106,9 +106,7 @@ def test_the_interval_holds_the_truth_as_often_as_promised(middle: float, width:
     assert inside >= 0.95 - 4 * math.sqrt(0.95 * 0.05 / 600)
 
 
-def test_the_interval_is_wrong_no_more_often_than_promised_where_a_level_is_just_below_the_limit() -> (
-    None
-):
+def test_the_interval_keeps_its_coverage_for_a_level_just_below_the_limit() -> None:
     """The hardest case, a level at 0.949: it is called certainly above in at most 2.5 % of 2,000 draws."""
     rng = np.random.default_rng(8)
     truth = np.array([1.0, 1.0, 0.949, 0.5, 0.1, 0, 0, 0])
@@ -150,7 +148,7 @@ def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[
     ]
 
 
-def test_a_study_says_the_rate_at_which_95_percent_are_identified() -> None:
+def test_a_study_states_the_rate_at_which_95_percent_are_identified() -> None:
     study = Study.model_validate(STUDY)
     curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
     said = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 400))
@@ -171,7 +169,7 @@ def test_a_level_of_the_sentence_has_its_unit() -> None:
     assert [one.partition(":")[0] for one in said] == ["chain = 0.5 ms", "chain = 5 ms"]
 
 
-def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> None:
+def test_a_threshold_needs_trials_at_two_levels() -> None:
     """A point without trials is left out; two levels are the least."""
     study = Study.model_validate(STUDY)
     line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": metrics.proportion(9, 10)})
@@ -196,7 +194,7 @@ def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> No
         ({"where": {"rate": 99}}, "thresholds.0.where.rate: unknown level 99; allowed: 0, 1"),
     ],
 )
-def test_a_threshold_that_cannot_be_is_refused(
+def test_an_impossible_threshold_is_refused(
     tmp_path: Path, change: dict[str, Any], complaint: str
 ) -> None:
     tree = STUDY | {"thresholds": [STUDY["thresholds"][0] | change]}
@@ -225,7 +223,7 @@ def test_a_limit_needs_as_many_trials_as_its_exact_bound(
     assert thresholds.trials_needed(share, limit, above=share <= limit) == 0
 
 
-def test_a_level_on_the_wrong_side_is_closed_by_no_number_of_trials() -> None:
+def test_no_number_of_trials_closes_an_interval_at_a_level_on_the_wrong_side() -> None:
     """All levels are above: nothing is said to be needed at the last one, however many trials there are."""
     assert counted([60] * 8, trials=60).needs == ((0, 72),)
     assert counted([400] * 8).needs == ()
@@ -243,7 +241,7 @@ def test_two_trials_give_two_levels_and_no_number() -> None:
     assert not thresholds.too_few(np.array([20.0, 40]), 0.95)
 
 
-def test_a_threshold_is_one_of_a_proportion() -> None:
+def test_only_a_proportion_has_a_threshold() -> None:
     assert Threshold.model_validate(
         {"response": "coverage_4", "limit": 0.9, "along": "x"}
     ).axes == {

@@ -24,7 +24,7 @@ SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
 
 
-def test_a_trial_is_the_same_whatever_was_tried_before():
+def test_a_trial_does_not_depend_on_earlier_trials():
     settings = {"trial.false_lights": 3}
     first = trials.run_segments(SKY, (trials.Segment(5, settings, 500, range(0, 20)),))
     again = trials.run_segments(
@@ -45,13 +45,13 @@ def test_trials_without_noise_are_solved(spec: TrialSpec) -> None:
         assert (row.error, row.outcome.status, row.outcome.wrong) == (None, "solved", 0)
 
 
-def test_pairs_of_points_share_attitude_and_noise_unless_told_otherwise():
+def test_points_share_attitude_and_noise_by_default():
     unpaired = replace(SKY, paired=False)
     assert setups.seed_of(SKY, 1, 7) == setups.seed_of(SKY, 2, 7) != setups.seed_of(SKY, 1, 8)
     assert setups.seed_of(unpaired, 1, 7) != setups.seed_of(unpaired, 2, 7)
 
 
-def test_what_a_trial_raises_is_in_its_row_with_its_seed():
+def test_an_exception_of_a_trial_is_in_its_row_with_the_seed():
     row = trials.run_segments(
         SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),)
     )[0]
@@ -62,7 +62,7 @@ def test_what_a_trial_raises_is_in_its_row_with_its_seed():
 
 
 @pytest.mark.parametrize(("spec", "key"), [(SKY, "trial.dec_deg"), (DOME, "trial.tilt_deg")])
-def test_attitudes_are_even_over_what_is_allowed(spec, key):
+def test_attitudes_are_uniform_over_the_allowed_range(spec, key):
     """Boresights by area, turns about them evenly: Kolmogorov and Smirnov's test, one in 10^4."""
     low, high = (-60.0, 30.0) if spec is SKY else (10.0, 30.0)
     ready = setups.prepared_setup(spec, {key: [low, high]})
@@ -105,7 +105,7 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
 
 
 @pytest.mark.slow
-def test_attitudes_near_a_body_are_even_about_it():
+def test_attitudes_near_a_body_are_uniform_about_it():
     """By the cosine of the angle from the Moon's place and by the angle around it."""
     near = {"body": "moon", "off_deg": [2.0, 8.0]}
     ready = setups.prepared_setup(SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near})
@@ -123,7 +123,7 @@ def test_attitudes_near_a_body_are_even_about_it():
     assert (level <= 1 + 1e-9).all()
 
 
-def test_any_turn_about_the_boresight_is_as_likely_as_another():
+def test_the_roll_about_the_boresight_is_uniform():
     """The body's x axis against the meridian through the boresight; under the dome against its own lean."""
     ready = setups.prepared_setup(DOME, {"trial.tilt_deg": 20})
     rng = np.random.default_rng(4)
@@ -136,7 +136,7 @@ def test_any_turn_about_the_boresight_is_as_likely_as_another():
 
 
 @pytest.mark.parametrize("angles", [(0.3, 1.1, -2.0), (3.0, 0.0, 1.0), (-1.0, math.pi, 0.2)])
-def test_three_turns_are_scipys(angles):
+def test_three_successive_rotations_match_scipy(angles):
     off = (
         Rotation.from_quat(trials.zyz(*angles), scalar_first=True)
         * Rotation.from_euler("ZYZ", angles).inv()
@@ -145,7 +145,7 @@ def test_three_turns_are_scipys(angles):
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME])
-def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
+def test_lights_of_a_trial_match_the_renderer_s_positions_and_brightness(spec):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
     ready = setups.prepared_setup(spec, {"background": []})
     lab = ready.lab
@@ -166,7 +166,7 @@ def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
         )
 
 
-def test_what_is_spoilt_is_spoilt_as_told():
+def test_injected_faults_have_their_declared_size():
     """Noise, share missed, false lights: mean and spread over many fields."""
     ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(
@@ -189,7 +189,7 @@ def test_what_is_spoilt_is_spoilt_as_told():
     assert all((np.diff(one.flux) <= 0).all() for one in seen)
 
 
-def test_the_brightest_are_kept_where_only_so_many_may_be():
+def test_a_limited_number_of_lights_keeps_the_brightest():
     ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
     seen = detections.simulate_detections(
@@ -199,9 +199,9 @@ def test_the_brightest_are_kept_where_only_so_many_may_be():
     assert seen.flux * gain_e_dn == pytest.approx([8, 7, 6], rel=1e-12)
 
 
-def test_other_noise_leaves_the_attitude():
-    told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in told)
+def test_another_noise_seed_keeps_the_attitude():
+    prepared = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
+    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in prepared)
     assert (first.lab_from_body * again.lab_from_body.inv()).magnitude() == 0
     assert (first.xy_px == again.xy_px).all()
     assert not np.array_equal(seen.centroids.xy_px, other.centroids.xy_px)
@@ -257,7 +257,7 @@ def test_a_coded_trial_is_a_sequence_of_frames():
 
 
 @pytest.mark.slow
-def test_codes_without_light_to_read_them_are_refused_not_guessed():
+def test_unreadable_codes_give_no_wrong_attitude():
     """Half of all bits fail: no word can be read."""
     outcomes = coded({"light.led.code": {"kind": "gray", "dropout": 0.49, "depth": 0.1}}, 60)
     assert sum(one.solved for one in outcomes) < 30
@@ -265,7 +265,7 @@ def test_codes_without_light_to_read_them_are_refused_not_guessed():
 
 
 @pytest.mark.slow
-def test_centroid_trials_err_as_much_as_theory_says():
+def test_centroid_trials_have_the_theoretical_error():
     """QUEST's covariance holds: mean NEES of three degrees of freedom, to five standard errors."""
     spec = replace(
         SKY,
@@ -280,7 +280,7 @@ def test_centroid_trials_err_as_much_as_theory_says():
 
 
 @pytest.mark.slow
-def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
+def test_a_rotating_frame_is_smeared_by_the_gyro_s_rate():
     """Streak length in the truth against rate times exposure, at the middle of the field."""
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
     ready = setups.prepared_setup(spec, {})
@@ -310,13 +310,13 @@ def test_a_flight_counts_its_frames_after_it_settled():
 
 @pytest.mark.slow
 def test_a_flights_filter_is_scored_at_every_tick():
-    told = {
+    settings = {
         "vehicle.imu": {},
         "filter": {"start_deg": 0.1},
         "exposure.frames": 4,
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
-    spec = replace(DOME, base=told, trial={"kind": "flight"})
+    spec = replace(DOME, base=settings, trial={"kind": "flight"})
     ready = setups.prepared_setup(spec, {})
     came = trials.run_flight_trial(ready, 5)
     assert came.frames == came.solved == 4
@@ -330,7 +330,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
 
 
 @pytest.mark.slow
-def test_a_bench_is_kept_and_shared_where_only_the_trial_differs():
+def test_a_lab_is_reused_if_only_the_trial_differs():
     first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
     other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})
     assert first.lab is other.lab
@@ -345,11 +345,11 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     model = tmp_path / "ship.xml"
     text = (SCENES / "vehicles" / "shefex2.xml").read_text()
     model.write_text(text)
-    told = [
+    hashes = [
         setups.scene_hash(plan.resolve_point(SKY, sets)[0])
         for sets in ({}, {"camera.f_number": 1.5}, {})
     ]
-    assert told[0] == told[2] != told[1]
+    assert hashes[0] == hashes[2] != hashes[1]
     own = {"vehicle.model": str(model)}
     first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
     model.write_text(text.replace("<mujoco", "<!-- other --><mujoco", 1))
@@ -457,7 +457,7 @@ def test_a_turn_is_about_the_rates_axis():
     assert (other.cam_from_lab * first.cam_from_lab.inv()).magnitude() > 0.1
 
 
-def test_accelerated_lights_are_seen_where_the_law_puts_them():
+def test_accelerated_lights_are_at_their_predicted_positions():
     """From rest at mid-exposure they move by a t^2 / 2: their mean is a T^2 / 24 away, and they are a T^2 / 8 long."""
     acceleration = 200.0
     time_s = 0.04

@@ -29,7 +29,7 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "trial", "factors", "settings", "told"),
+    ("scene", "trial", "factors", "settings", "message"),
     [
         (
             "afit_simsat",
@@ -146,9 +146,9 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
     ],
 )
 def test_an_option_without_effect_is_refused(
-    scene: str, trial: str, factors: str, settings: str, told: str, tmp_path: Path
+    scene: str, trial: str, factors: str, settings: str, message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=told) as refused:
+    with pytest.raises(InputError, match=message) as refused:
         study_file.load(study(tmp_path, scene, trial, factors, settings))
     assert str(refused.value).count("\n") == 0
     assert "allowed: " in str(refused.value)
@@ -238,7 +238,7 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(
         ),
     ],
 )
-def test_what_is_refused_changes_no_outcome(
+def test_a_refused_option_changes_no_outcome(
     scene: str, trial: str, settings: dict[str, object], change: dict[str, object], tmp_path: Path
 ) -> None:
     plan = study_file.load(study(tmp_path, scene, trial, NOISE, "{}"))
