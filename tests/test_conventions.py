@@ -57,7 +57,7 @@ def icrs(ra_deg: float, dec_deg: float) -> np.ndarray:
         ([0.02, 0.03, 2.0], (330.0, 255.0)),  # only the direction counts
     ],
 )
-def test_a_direction_falls_on_the_pixel_worked_out_by_hand(vector_cam, pixel):
+def test_the_pixel_of_a_direction_matches_a_hand_calculation(vector_cam, pixel):
     """Both pieces of code for the one law: the hardware's and the tracker's."""
     vector = np.array([vector_cam])
     np.testing.assert_allclose(OPTICS.project(vector)[0], pixel, rtol=0, atol=1e-9)
@@ -243,7 +243,7 @@ def test_a_turned_gimbal_gives_the_body_the_opposite_of_the_rotor_s_momentum_cha
     np.testing.assert_allclose(momentum[[0, 2]], expected[[0, 2]], rtol=0.01, atol=0)
 
 
-def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
+def test_the_motion_of_an_apex_led_by_a_tilt_matches_a_hand_calculation():
     """Roll +10 deg about lab x lifts lab +y: body z leans to -y, so the apex LED falls on the image's +y side.
 
     Camera 0.381 m up a vehicle tilted by 10 deg stands at (0, -0.381 sin 10, 0.381 cos 10). The apex LED, 1.2192 m

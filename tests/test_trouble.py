@@ -186,7 +186,7 @@ def test_a_picture_without_room_names_file_and_reason(
 
 
 @pytest.mark.long
-def test_a_folder_that_cannot_be_written_is_reported_in_one_line(mounted: Path) -> None:
+def test_an_unwritable_folder_is_reported_in_one_line(mounted: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", mounted], check=True)
     for words in (("run", "shefex2", "--frames", "1"), ("study", "run", "led_count")):
         done = asked(*words, "--out", str(mounted / "run"))

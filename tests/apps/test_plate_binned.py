@@ -102,7 +102,7 @@ def test_a_binned_image_needs_more_evidence(
     assert set(tries[2:]) == {2000}
 
 
-def test_bins_are_means() -> None:
+def test_a_binned_pixel_is_the_mean_of_its_block() -> None:
     image = np.random.default_rng(3).integers(0, 256, (33, 47)).astype(np.uint8)
     means = image[:32, :44].reshape(8, 4, 11, 4).mean(axis=(1, 3))
     small = retries.bin_pixels(image, 4).astype(float)

@@ -181,7 +181,7 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
     assert drawing.behind([], None) is None
 
 
-def test_a_disc_takes_no_light_from_the_pixels_around_it() -> None:
+def test_a_disc_does_not_darken_the_surrounding_pixels() -> None:
     """Rounding of the transforms is far below zero beside a bright disc; sums of such pixels alone were negative."""
     light = np.zeros((40, 40))
     patches = np.zeros((2, 2, 9, 9))

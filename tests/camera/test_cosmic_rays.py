@@ -50,7 +50,7 @@ def test_entry_points_are_uniform_over_the_frame() -> None:
     assert stats.kstest((tracks["y_px"] + 0.5) / 200, "uniform").pvalue > 1e-4
 
 
-def test_directions_are_those_of_an_isotropic_flux_through_a_plate() -> None:
+def test_directions_follow_an_isotropic_flux_through_a_plate() -> None:
     """p(theta) = sin 2 theta: the cosine's square is uniform, azimuths are too."""
     tracks = many()
     cosine = 1e-9 / tracks["length_m"]
@@ -67,7 +67,7 @@ def test_the_mean_path_through_a_plate_is_twice_its_depth() -> None:
     assert length.mean() == pytest.approx(2 * (1 - 1 / MAX_TANGENT), abs=4 * sigma)
 
 
-def test_an_image_of_a_track_is_as_long_as_its_tangent_says() -> None:
+def test_a_track_s_image_has_the_length_of_depth_times_tangent() -> None:
     tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
     np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)

@@ -251,7 +251,7 @@ def test_charge_is_clipped_at_full_well() -> None:
     np.testing.assert_array_equal(made, 4064)
 
 
-def test_read_noise_comes_after_the_well_and_so_shows_above_it() -> None:
+def test_read_noise_is_added_after_clipping_at_full_well() -> None:
     made = frame(1e5, full_well_e=40000, gain_e_dn=10, offset_dn=64, read_noise_e=50)
     assert made.mean() == pytest.approx(4064, abs=4 * 5 / np.sqrt(N))
     assert made.std() == pytest.approx(np.sqrt(25 + 1 / 12), abs=4 * 5 / np.sqrt(2 * N))

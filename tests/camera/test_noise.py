@@ -57,7 +57,7 @@ def test_normal_numbers_are_normal() -> None:
     assert chi_square(bins, np.diff(stats.norm.cdf(edges))) > 1e-4
 
 
-def test_the_logarithm_is_that_of_double_precision() -> None:
+def test_the_fast_logarithm_matches_double_precision() -> None:
     """Of mantissa and exponent as `normal` takes a number apart; relative, also near 1, where it vanishes."""
     u = np.concatenate(
         [np.geomspace(2.0**-32, 0.999, 2000), 1 - np.geomspace(2.0**-24, 0.3, 2000)]

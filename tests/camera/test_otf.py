@@ -271,7 +271,7 @@ def test_blurs_add_in_quadrature() -> None:
             )
 
 
-def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
+def test_nearly_equal_sizes_share_a_kernel() -> None:
     lens = camera()
     psf = GaussianPsfConfig(sigma_px=0.7)
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)

@@ -301,7 +301,9 @@ def test_the_smear_of_shefex_matches_the_reference() -> None:
 
 
 @pytest.mark.parametrize("length_px", [0.1, 1.0, 4.41, 15.0])
-def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length_px: float) -> None:
+def test_a_smeared_star_has_its_path_s_length_and_is_centered_at_mid_exposure(
+    length_px: float,
+) -> None:
     """A uniform line of length L has the variance L^2 / 12 along itself and none across."""
     image, seen = shot(star_at(31.5, 23.5), turning([0, length_px / 2500, 0]))
     mean, variance = moments(image)
@@ -335,7 +337,7 @@ def test_a_roll_moves_stars_by_radius_times_angle_and_keeps_the_boresight() -> N
 @pytest.mark.parametrize(
     ("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)]
 )
-def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(
+def test_the_peak_of_a_smeared_star_matches_the_line_integral(
     length_px: float, ratio: float
 ) -> None:
     # Reference §3, sigma .7: peak relative to the still star's.

@@ -248,7 +248,7 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
 
 
 @pytest.mark.slow
-def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() -> None:
+def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     """The mean of the smoothstep is 1/2; the axis stands still, so this is exact."""
     up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
     ref = reference(HOLD, up, down)

@@ -548,7 +548,7 @@ def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     assert abs(one.accelerometer.matrix[2, 2] - 1) < 4 * 300e-6
 
 
-def test_a_turn_beyond_the_limit_reads_the_limit_and_the_attitude_stays_wrong() -> None:
+def test_a_rate_beyond_the_limit_reads_the_limit_and_leaves_an_attitude_error() -> None:
     """A second of 20 deg/s with a limit of 10, then a second of 5: ten of the 25 degrees are lost for good."""
     one = unit({"rate_limit_deg_s": 10})
     navigator = Navigator(wxyz(Rotation.identity()))

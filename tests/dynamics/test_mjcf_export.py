@@ -223,7 +223,7 @@ def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
         assert (sign * np.sum(normal * (corner.mean(axis=1) - middle), axis=1) > 0).all()
 
 
-def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None:
+def test_the_field_s_corners_are_the_chip_s_projected_onto_the_dome() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", [30.0, 8.0, -5.0], degrees=True)
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))

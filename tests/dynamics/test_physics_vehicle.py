@@ -220,7 +220,7 @@ def asymmetric_top(
     [((6.0, 6.5, 9.0), 0.3, 0.8), ((9.0, 6.5, 6.0), 0.2, 1.0), ((6.0, 6.5, 9.0), 0.9, 0.33)],
     ids=["about the greatest moment", "about the least", "nearly about the middle one"],
 )
-def test_asymmetric_top_turns_as_jacobi_solved_it(
+def test_an_asymmetric_top_follows_jacobi_s_solution(
     inertia: tuple[float, float, float], first: float, third: float
 ) -> None:
     """The issue's bar: 1e-6 rad within 60 s. It comes out below 1e-12, rounding's own size."""

@@ -70,7 +70,7 @@ def test_a_wrong_header_is_detected() -> None:
 
 
 @pytest.mark.slow
-def test_the_predicted_errors_are_those_of_least_squares() -> None:
+def test_the_predicted_errors_match_least_squares() -> None:
     """Attitudes and plates of stars of unequal errors, by Monte Carlo: 2,000 draws tell sigma to 1.6 %."""
     rng = np.random.default_rng(2)
     camera = oracles.load(SHEFEX, "tetra3rs", 1).camera

@@ -134,7 +134,7 @@ def test_the_cheapest_sufficient_survey_is_chosen() -> None:
     )
 
 
-def test_the_table_adds_up() -> None:
+def test_the_parts_table_sums_to_its_total() -> None:
     parts = listed()
     rows = [
         row for row in csv.reader(to_csv(parts, "mine").splitlines()) if not row[0].startswith("#")

@@ -215,7 +215,7 @@ def test_the_terminal_ends_with_the_answer_and_shows_only_its_blocks(
     ]
 
 
-def test_a_long_table_is_cut_on_the_terminal_and_says_so(
+def test_a_long_table_is_cut_on_the_terminal_with_a_note(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     report.print_table(Table([Column("n")], [[n] for n in range(100)]))

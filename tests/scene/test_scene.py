@@ -230,7 +230,7 @@ def test_the_afit_scene_has_the_thesis_s_values() -> None:
     assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
 
 
-def test_a_scene_is_frozen() -> None:
+def test_a_scene_is_immutable() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         loader.load("shefex2").seed = 3
 

@@ -348,7 +348,7 @@ def test_a_station_s_position_error_acts_as_a_lever_error() -> None:
     assert not station["LED survey"].any()
 
 
-def test_a_station_s_sights_err_by_angle_times_distance() -> None:
+def test_a_station_s_cross_errors_are_angle_times_distance() -> None:
     """Angles of 10″ at some 3.3 m, and distances of 0.16 mm, err by 0.16 mm along each axis."""
     sight = INSTRUMENT.replace("arcsec: 0", "arcsec: 10").replace('"0 mm"', '"0.16 mm"')
     station = variances_of({"instrument": f"{sight}}}"})

@@ -198,7 +198,7 @@ def test_only_selected_frames_are_rendered_and_match_those_of_the_whole_run(
 
 
 @pytest.mark.slow
-def test_an_endless_flight_goes_on_with_the_frames_of_the_scene() -> None:
+def test_an_endless_flight_continues_the_scene_s_frames() -> None:
     scene = scene_of("shefex2", 2)
     more = scene_of("shefex2", 5)
     with open_flight(scene, endless=True, keeps_history=False) as flight:
@@ -280,7 +280,7 @@ def test_steps_are_the_same_flight_as_a_loop_over_shots() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_a_torque_turns_the_vehicle_as_eulers_equation_says() -> None:
+def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
     """From rest about a principal axis: T t / J and T t^2 / 2 J. Then about all axes, by what momentum it gives."""
     scene = scene_of("afit_simsat", 2, **BALANCED)
     flight = open_flight(scene)

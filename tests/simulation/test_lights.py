@@ -233,7 +233,7 @@ def test_the_forecast_and_the_run_agree_on_stars_behind_the_earth() -> None:
     assert not any(len(shot.truth.sources.id) for shot in shots)
 
 
-def test_the_forecast_sees_the_stars_through_the_air_as_the_frames_do() -> None:
+def test_the_forecast_applies_the_air_as_the_frames_do() -> None:
     """Raised, dimmed, and none below the skyline: the electrons of the forecast are those of the frame's truth."""
     night = {
         "light.air": "{scintillation: false, horizon: {azimuth_deg: [0, 180], altitude_deg: [20, 20]}}",

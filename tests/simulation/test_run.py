@@ -188,7 +188,7 @@ def test_a_wrong_lever_causes_the_reference_s_error() -> None:
 # What the frames are made of
 
 
-def test_the_camera_points_where_the_scene_says() -> None:
+def test_the_camera_has_the_scene_s_pointing() -> None:
     flight = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
     _, truth = flight.render(0)
     right, down, sight = truth.cam_from_lab.as_matrix()

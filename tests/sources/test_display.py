@@ -122,7 +122,7 @@ def test_fibers_show_the_stars_of_a_projected_sky() -> None:
 
 
 @pytest.mark.parametrize("block", [1, 2, 3])
-def test_stars_stand_in_the_middle_of_blocks_of_pixels_on_the_panel(block: int) -> None:
+def test_stars_are_centered_in_blocks_of_pixels_on_the_panel(block: int) -> None:
     """Of an even number of columns the middle is between two: odd blocks are at halves of a pitch, even at wholes."""
     wanted = lit(EVERYWHERE)
     drawn = lit(PANEL | {"block": block})
@@ -237,7 +237,7 @@ def test_pixels_of_a_row_light_up_together_and_rows_one_after_another() -> None:
 
 @pytest.mark.parametrize("duty", [0.002, 0.1, 0.3])
 @pytest.mark.parametrize(("frames", "part"), [(0, 0.5), (1, 0.4), (2, 0.6), (7, 0.35), (20, 0.65)])
-def test_a_panel_flickers_as_the_reference_says(duty: float, frames: int, part: float) -> None:
+def test_a_panel_s_flicker_matches_the_reference(duty: float, frames: int, part: float) -> None:
     """Reference 1.3: sqrt(f (1 - f) - w / 3) / (n + f) for pulses of a share w <= f <= 1 - w, over all beginnings."""
     got = light_s(refreshed(duty), (frames + part) / 60)
     law = np.sqrt(part * (1 - part) - duty / 3) / (frames + part)

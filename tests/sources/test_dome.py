@@ -189,7 +189,7 @@ def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sou
     assert max(spread) < 1e-14
 
 
-def test_outer_leds_stand_off_the_surface_by_the_sagitta(afit: Sources) -> None:
+def test_outer_leds_of_a_board_are_off_the_surface_by_the_sagitta(afit: Sources) -> None:
     """A tangent plate of half-diagonal h under a dome of curvature radius R stands off by h^2 / 2R."""
     made = surface(MEASURED)
     gap = np.linalg.norm(made.meet(np.zeros(3), afit.place[:, :3]) - afit.place[:, :3], axis=1)
@@ -251,7 +251,7 @@ def logs(leds: Sources) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scatter", [0.07, 0.09])
-def test_intensities_scatter_by_as_much_as_declared(scatter: float) -> None:
+def test_intensities_scatter_as_declared(scatter: float) -> None:
     """Lognormal, as AFIT's Table 2 (reference A8: 7-9 %): moments of the logarithm to four of their sigmas."""
     drawn = logs(lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")) / scatter
     n = len(drawn)

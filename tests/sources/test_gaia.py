@@ -63,7 +63,7 @@ def test_a_rebuilt_catalog_equals_the_committed_file(tmp_path: Path) -> None:
     assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
 
 
-def test_counts_are_those_of_hipparcos_and_of_the_handbook(sky: Catalog, known: Catalog) -> None:
+def test_star_counts_match_hipparcos_and_the_handbook(sky: Catalog, known: Catalog) -> None:
     # A pair that Hipparcos saw as one star of V 4.9 is two fainter ones here.
     for limit in (3, 4, 5, 6):
         assert np.sum(sky.v_mag < limit) == pytest.approx(np.sum(known.v_mag < limit), rel=0.02)

@@ -85,7 +85,7 @@ span = st.floats(0, 5)
 
 @settings(max_examples=200, derandomize=True, deadline=None)
 @given(span, span, st.floats(0.2, 3), st.floats(-2, 2), st.floats(0, 1))
-def test_lit_time_is_that_of_brute_force_sampling(
+def test_lit_time_matches_brute_force_sampling(
     begin: float, length: float, period: float, start: float, duty: float
 ) -> None:
     exact = float(lit_s(begin, begin + length, period, start, duty * period))

@@ -127,7 +127,7 @@ def test_diffuse_light_of_a_floor_under_one_led_matches_a_hand_calculation() -> 
 
 
 @pytest.mark.slow
-def test_a_dome_that_stands_on_the_floor_keeps_its_light() -> None:
+def test_a_dome_on_the_floor_conserves_its_light() -> None:
     """Wall and floor absorb what the LED emits; patches beside the edge, where K is singular, make 3 %."""
     rim = Rim(half_rad=math.radians(120))
     wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 1.0), rim=rim)

@@ -274,7 +274,7 @@ def test_a_panel_and_a_vault_end_at_their_sides() -> None:
     np.testing.assert_array_equal(np.isnan(vault.meet(np.zeros(3), along)[:, 0]), [False, True] * 2)
 
 
-def test_a_drum_hangs_from_its_upper_edge() -> None:
+def test_a_drum_extends_down_from_its_upper_edge() -> None:
     height_in = np.array([29.9, 30.1, -19.9, -20.1])
     met = made(DRUM).meet(np.zeros(3), np.column_stack([np.full(4, 48.0), np.zeros(4), height_in]))
     np.testing.assert_array_equal(np.isnan(met[:, 0]), [False, True, False, True])
@@ -283,7 +283,7 @@ def test_a_drum_hangs_from_its_upper_edge() -> None:
 # The thesis's dome
 
 
-def test_the_design_contour_comes_from_its_wall() -> None:
+def test_the_design_contour_follows_from_its_wall_thickness() -> None:
     """Reference A3: 48.033 in at the apex, 48.010 in at the rim, 40 deg off; less than .05 % between."""
     angle = np.radians([0, 40])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])

@@ -77,7 +77,7 @@ def test_every_led_of_the_map_has_its_own_error_about_each_axis() -> None:
     np.testing.assert_array_equal(eyes.leds.id, lab.camera.sources.id)
 
 
-def test_over_the_seeds_the_camera_s_position_errs_by_lever_sigma() -> None:
+def test_the_camera_s_position_error_over_seeds_is_lever_sigma() -> None:
     true_m = np.array([0.0, 0.01, 0.381])
     error = [survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
     is_chi_square(np.array(error) / 1e-4)

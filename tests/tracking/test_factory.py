@@ -155,7 +155,7 @@ def test_under_imu_control_the_vehicle_follows_the_navigator_s_error() -> None:
 # --- what it feels ------------------------------------------------------------------------------------------
 
 
-def test_the_imu_measures_the_vibration() -> None:
+def test_the_imu_measures_vibration() -> None:
     """The navigator adds up the shaken vehicle's rates: it is where that is, seen from where it was zeroed."""
     shake = "[{kind: line, frequency_hz: 20, rms_arcsec: [200, 0, 0]}]"
     flight = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)

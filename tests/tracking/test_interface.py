@@ -456,7 +456,7 @@ def said(folder: Path, words: list[str]) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join)
-def test_the_page_s_commands_do_what_it_says(folder: Path, words: list[str]) -> None:
+def test_the_page_s_commands_run_without_wrong_attitudes(folder: Path, words: list[str]) -> None:
     page = said(folder, words)
     wrong = re.search(r"(\d+) wrong", page)
     assert wrong is None or wrong[1] == "0"

@@ -155,7 +155,7 @@ def test_without_opengl_the_run_continues_and_reports_the_missing_picture(
 
 
 @pytest.mark.long
-def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) -> None:
+def test_render_writes_only_frames_with_their_truth(rendered: Path) -> None:
     assert {p.name for p in rendered.iterdir()} == {
         "frame_0000.fits",
         "frame_0000.png",
@@ -298,7 +298,7 @@ def test_solve_takes_a_folder_and_states_why_an_image_is_refused(
 
 
 @pytest.mark.slow
-def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_accepts_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     path = rendered / "frame_0000.png"
     ran = skysim(
         "solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path

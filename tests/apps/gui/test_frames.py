@@ -118,7 +118,7 @@ def test_all_pixels_are_served_while_the_worker_keeps_them() -> None:
         assert asyncio.run(ServedFrame(pixels, {}, worker).response(display, whole=True)) is None
 
 
-def test_other_limits_come_with_all_pixels() -> None:
+def test_limits_of_a_reduced_frame_are_those_of_all_pixels() -> None:
     frame = served(sky(2))
     for screen_px in ((0, 0), (999, 999)):
         found = response(frame, Display(screen_px, "min to max"))[0]["limits"]
@@ -457,7 +457,7 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
-def test_successive_frames_come_over_one_request(square: Any) -> None:
+def test_successive_frames_are_sent_over_one_request(square: Any) -> None:
     square.mouse.move(5, 5)
     asked = list[str]()
     square.on("request", lambda request: asked.append(request.url))

@@ -387,7 +387,7 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
         assert np.linalg.norm(pointed - wanted, axis=1).max() < within_rad, scene
 
 
-def test_names_of_stars_are_those_of_bright_stars() -> None:
+def test_named_stars_are_bright_and_names_are_unique() -> None:
     stars = catalog.read("hipparcos_hp6.5")
     v_mag = dict(zip(stars.hip.tolist(), stars.v_mag.tolist(), strict=True))
     assert max(v_mag[hip] for hip in NAMES) < 3.4
@@ -468,7 +468,7 @@ def test_a_shared_page_requires_its_token(headers: dict[str, str], query: str, s
         ("/", "GET", "", {}, 200, 3),
     ],
 )
-def test_files_of_the_page_are_asked_for_once(
+def test_static_files_of_the_page_are_cached(
     path: str, method: str, query: str, headers: dict[str, str], status: int, asked: int
 ) -> None:
     """All other responses are made anew; each answer is whole, and a layer further out may change its headers."""

@@ -46,7 +46,7 @@ def exact(rate_rad_s: Floats) -> RateEstimate:
     Camera.row_delays_s,
 )
 @given(rng=SEEDS)
-def test_images_move_as_the_rate_says(rng: np.random.Generator) -> None:
+def test_images_move_at_the_rate_s_predicted_velocity(rng: np.random.Generator) -> None:
     for sight in STARS, DOME, DOME._replace(radius_m=rng.uniform(1.0, 1.4, 30)):
         seen = replace(moving(rng, any_rate(rng), sight=sight), camera=GLOBAL)
         rays = GLOBAL.rays(seen.still_px)

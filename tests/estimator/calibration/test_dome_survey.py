@@ -360,7 +360,7 @@ def test_wrong_names_ruin_plain_least_squares() -> None:
     assert np.degrees(np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2))) > 0.1
 
 
-def test_a_light_seen_once_stays_at_its_start_and_is_not_called_surveyed() -> None:
+def test_a_light_seen_once_keeps_its_start_position_unsurveyed() -> None:
     place, turned, lever = small_dome(33)
     rng = np.random.default_rng(34)
     frames = filmed(rng, turned, place, lever, SMALL, 0.1)

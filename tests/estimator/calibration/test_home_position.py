@@ -118,7 +118,7 @@ def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
     assert -5 < found < -4
 
 
-def test_with_the_sine_a_point_lies_on_its_ray_r_minus_m_away() -> None:
+def test_with_the_sine_a_point_is_on_its_ray_at_distance_r_minus_m() -> None:
     rng = np.random.default_rng(60)
     rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (50, 2)))
     point, _ = nearfield.thesis_points(rays, SPHERE, LEVER, sine=True)
@@ -314,7 +314,7 @@ def test_a_camera_mounted_askew_gives_the_same_positions() -> None:
     assert np.abs(off[:, :2]).max() < 0.12e-3 * 0.02 * 1.3
 
 
-def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(
+def test_the_tracker_map_has_the_catalog_s_directions_on_the_surface(
     home: HomeCatalog,
 ) -> None:
     oval = LedMap(

@@ -237,7 +237,7 @@ def test_brightness_identifies_leds_exchanged_in_the_list(rng: np.random.Generat
 
 @law(survey_faults.names)
 @given(rng=SEEDS)
-def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> None:
+def test_no_other_light_gets_the_name_of_a_dark_led(rng: np.random.Generator) -> None:
     """LED 1 is dark, and its name was given to the light of LED 2, which is called 2 again."""
     listed, place_m, covariance, table = close_group(rng, np.exp(np.linspace(0, -30, 60)))
     covariance[2] = np.nan
@@ -253,9 +253,7 @@ def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> No
 
 @law(survey_faults.exchanged)
 @given(rng=SEEDS, gain=some.floats(0.1, 10))
-def test_exchanged_lights_are_named_whatever_the_gain(
-    rng: np.random.Generator, gain: float
-) -> None:
+def test_exchanged_lights_are_found_at_any_gain(rng: np.random.Generator, gain: float) -> None:
     levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
     shown = np.ones((10, 12), dtype=bool)
     light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))

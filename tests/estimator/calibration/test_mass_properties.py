@@ -110,7 +110,7 @@ def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
 
 
 @pytest.mark.long
-def test_a_hundred_draws_err_as_their_covariance_says() -> None:
+def test_the_errors_of_a_hundred_draws_match_their_covariance() -> None:
     """The sum of 100 NEES of nine values is chi-square of 900 degrees of freedom."""
     values = [value for _, _, value, _ in draws(100, 1)]
     assert chi2.ppf(1e-4, 900) < sum(values) < chi2.ppf(1 - 1e-4, 900)

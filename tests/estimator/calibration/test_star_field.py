@@ -154,7 +154,7 @@ def test_twenty_frames_calibrate_the_field_to_a_fiftieth_of_a_pixel(
 
 
 @pytest.mark.long
-def test_the_covariance_of_the_lens_matches_its_errors(
+def test_the_covariance_of_the_lens_matches_the_errors(
     clean: list[tuple[Field, Calibration]],
 ) -> None:
     nees = []

@@ -42,11 +42,11 @@ def test_the_pairs_match_brute_force(sky: pair_index.PairIndex) -> None:
     )
 
 
-def test_the_pairs_come_by_growing_angle(sky: pair_index.PairIndex) -> None:
+def test_the_pairs_are_sorted_by_angle(sky: pair_index.PairIndex) -> None:
     assert np.all(np.diff(sky.angle_rad) >= 0)
 
 
-def test_every_star_s_neighbors_are_all_of_them_by_growing_angle(sky: pair_index.PairIndex) -> None:
+def test_every_star_has_all_its_neighbors_sorted_by_angle(sky: pair_index.PairIndex) -> None:
     every = angles(sky.vectors)
     np.fill_diagonal(every, np.inf)
     for star in range(len(sky.vectors)):

@@ -359,7 +359,7 @@ def test_settings_are_known_and_usable(word: str, value: Any) -> None:
         assert made is None or type(getattr(made, name)) is type(getattr(Settings(), name))
 
 
-def test_a_misspelt_setting_is_answered_with_the_nearest_name() -> None:
+def test_a_misspelled_setting_is_answered_with_the_nearest_name() -> None:
     with pytest.raises(
         ImageError, match="'centroid_sigma' is unknown; did you mean centroid_sigma_px"
     ):

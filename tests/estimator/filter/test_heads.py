@@ -83,7 +83,7 @@ def squared(
 @pytest.mark.slow
 @pytest.mark.parametrize("tracker", [MOUNTED, WALKING], ids=["constant", "walking"])
 @pytest.mark.parametrize("considered", [(), ("mounting",)], ids=["estimated", "considered"])
-def test_errors_of_two_mountings_are_what_the_covariance_says(
+def test_errors_of_two_mountings_match_the_covariance(
     tracker: TrackerModel, considered: tuple[str, ...]
 ) -> None:
     attitude, every, states = squared(tracker, considered, runs=150)

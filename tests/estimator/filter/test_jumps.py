@@ -124,7 +124,7 @@ def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> Non
 
 
 @pytest.mark.parametrize("wrong", [1, 3])
-def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong: int) -> None:
+def test_a_wrong_first_answer_is_abandoned_once_outnumbered_by_right_ones(wrong: int) -> None:
     vehicle = Vehicle(4, sigma_rad=2.0)  # knows nothing at the start
     assert statuses(vehicle.updates(WRONG, wrong)) == [(USED, wrong)]
     runs = statuses(vehicle.updates(HOME, 30))
@@ -234,7 +234,7 @@ def test_the_odds_match_the_docstring_s_formula() -> None:
     assert math.isfinite(log_odds(jump(since_s=0.0, support=10**6), model))
 
 
-def test_a_small_jump_is_put_to_the_filter_s_own_model_at_the_third_solution() -> None:
+def test_a_small_jump_is_attributed_to_the_filter_s_model_at_the_third_solution() -> None:
     assert log_odds(jump(distance=20.0, agreeing=CONFIRMATIONS), JumpModel()) > ENOUGH
     assert log_odds(jump(distance=40.0, agreeing=CONFIRMATIONS), JumpModel()) < ENOUGH
 

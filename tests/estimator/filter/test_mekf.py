@@ -621,7 +621,7 @@ def test_outliers_that_disagree_are_always_rejected() -> None:
     assert after_turning(mekf, 15).status == USED
 
 
-def test_solutions_that_stand_still_while_the_vehicle_turns_do_not_agree() -> None:
+def test_constant_solutions_of_a_rotating_vehicle_do_not_agree() -> None:
     mekf = turning()
     for k in range(3, 9):
         still = true(k + 1).inv() * wild(0.5, 0, 0)

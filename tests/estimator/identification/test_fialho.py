@@ -237,7 +237,9 @@ def test_the_fourth_version_measures_the_camera_s_magnitudes(sky: pair_index.Pai
     )
 
 
-def test_without_magnitudes_the_fourth_version_says_so(sky: pair_index.PairIndex) -> None:
+def test_without_magnitudes_the_fourth_version_has_no_magnitude_offset(
+    sky: pair_index.PairIndex,
+) -> None:
     seen, _, _, _ = field(np.random.default_rng(110), sky)
     match = fialho_4(seen, sky, 5 * SIGMA_RAD)
     assert match is not None

@@ -231,7 +231,7 @@ def test_too_few_lights_give_no_attitude():
 
 
 @pytest.mark.long
-def test_the_covariance_holds_the_map_s_own_errors():
+def test_the_covariance_includes_the_map_s_errors():
     """NEES over maps drawn anew: chi-square of three degrees, mean 3 +- sqrt(6 / 100)."""
     rng = np.random.default_rng(14)
     nees = []
@@ -279,7 +279,7 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
 
 
 @pytest.mark.long
-def test_the_covariance_holds_a_lever_s_error():
+def test_the_covariance_includes_the_lever_s_error():
     """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
     truth = spread(1400, OVAL, 18)
     rng = np.random.default_rng(19)
@@ -300,7 +300,7 @@ def test_the_covariance_holds_a_lever_s_error():
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
 
 
-def test_the_index_knows_the_errors_and_the_field_as_angles() -> None:
+def test_the_index_converts_errors_and_field_to_angles() -> None:
     """Errors of LEDs and pupil over the least distance from the camera; the sensor's area in tangents squared."""
     leds = spread(60, OVAL, seed=1)
     lever = Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)

@@ -199,7 +199,7 @@ def test_the_sides_of_a_triangle_must_agree_on_one_focal_length(
 @pytest.mark.parametrize(("share", "hypotheses"), [(0.9, 1), (1.1, 0)])
 @pytest.mark.parametrize("side", range(3))
 @pytest.mark.parametrize("unknown", [False, True])
-def test_a_side_may_be_off_by_both_directions_errors_and_its_stretch(
+def test_a_side_s_tolerance_includes_both_direction_errors_and_its_stretch(
     unknown: bool, side: int, share: float, hypotheses: int
 ) -> None:
     """sqrt(2) tolerances beyond the stretch; a third of the stretch after one factor for the whole perimeter."""
@@ -448,7 +448,7 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
         assert primary.area_sr[k] == pytest.approx(np.pi * primary.radius_rad[k] ** 2, rel=1e-12)
 
 
-def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
+def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
     """Catalog stars in the field and about the pair, of about the magnitude, over the area that they share."""
     rng = np.random.default_rng(7)
     seen = FIVE[:4]
@@ -566,7 +566,7 @@ def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -
 
 
 @pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
-def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(
+def test_saa_s_best_match_must_be_1e5_times_as_likely_as_contradicting_ones(
     ratio: float, accepted: bool
 ) -> None:
     """A cost is a squared number of standard deviations: the likelihood is exp(-cost / 2)."""

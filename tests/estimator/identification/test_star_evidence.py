@@ -156,7 +156,7 @@ def test_only_stars_within_three_and_a_half_sigma_match(sigmas: float, matched: 
     assert len(hypothesis.star) == matched
 
 
-def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
+def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     """A normal law of the smoothing about each star's magnitude; below and above all stars, that of the end."""
     rng = np.random.default_rng(2)
     vectors = rng.normal(size=(2000, 3))

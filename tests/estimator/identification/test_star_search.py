@@ -347,7 +347,7 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
 
 
-def test_pairs_come_by_length_and_rarity_and_none_twice() -> None:
+def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
     detections = unequal()
     length = PLAIN._pair_lengths(detections)
     rarity = PLAIN._rarity(detections, SKY)
@@ -453,7 +453,7 @@ def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
     assert len(found.star) == matches
 
 
-def test_the_limiting_magnitude_is_that_of_the_median_light_of_all() -> None:
+def test_the_limiting_magnitude_is_taken_at_the_median_light() -> None:
     lens = Sensor(1000.0, (0.0, 0.0), (0.0,) * 5, FIELD, 20.0, 0.25)
     sigma_px = np.full(5, 0.1)
     flux = np.array([900.0, 500.0, 300.0, 200.0, 100.0])

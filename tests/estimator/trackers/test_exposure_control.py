@@ -189,7 +189,7 @@ def test_without_the_mean_the_same_intruder_would_lengthen_it(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_one_planet_shortens_nothing_and_four_do(lab: Lab) -> None:
+def test_one_planet_does_not_shorten_the_exposure_and_four_do(lab: Lab) -> None:
     # Strengths multiplied until the brightest stars of the field saturate: one of them, then many.
     truth = render_at_rest(lab.camera, lab.start)[1]
     inside = np.flatnonzero(np.isin(lab.camera.sources.id, truth.sources.id))

@@ -372,7 +372,7 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
     scale=some.floats(0.1, 10),
     deviation=some.sampled_from([home_position.pooled, home_position.averaged]),
 )
-def test_a_spread_knows_scale_and_no_shift(
+def test_a_spread_scales_with_its_data_and_ignores_shifts(
     rng: np.random.Generator, shift: float, scale: float, deviation: Callable[..., Floats]
 ) -> None:
     value = rng.normal(size=40)

@@ -106,7 +106,7 @@ def test_bright_sources_are_detected_where_their_light_is() -> None:
     assert checked >= 6
 
 
-def test_a_still_star_has_a_square_about_it() -> None:
+def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
     """Also where rounding gives it a streak of 1e-14 pixels."""
     rows = np.zeros(3, dataset_labels.SOURCE)
     rows["flux_x_px"] = 10

@@ -391,7 +391,7 @@ def test_an_unknown_url_is_refused(url: str) -> None:
         dataset_shards.Storage(url)
 
 
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"pip install 'skysim\[dataset\]'"):
         dataset_shards.Storage("out/frames")

@@ -84,7 +84,7 @@ def test_units_are_equal_without_a_pattern():
     assert Designer(load("shefex2", plain), QUICK).units == 1
 
 
-def test_thermal_states_are_those_of_the_scene():
+def test_thermal_states_match_the_scene():
     """A period of the sine of 3 K about 21 C in four steps; none without a section."""
     scene = load("thermal_drift", {})
     assert states_c(scene, 4) == pytest.approx([21, 24, 21, 18])

@@ -188,7 +188,7 @@ def test_the_fmu_gives_the_same_errors_in_another_tool(tmp_path: Path, model: Er
     assert found == pytest.approx(np.array(expected), rel=1e-6)
 
 
-def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
+def test_the_scatter_of_fields_is_computed_from_two_estimates_of_each():
     """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate."""
     rng = np.random.default_rng(9)
     variance = np.exp(0.7 * rng.standard_normal(60_000))

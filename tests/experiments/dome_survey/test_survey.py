@@ -225,7 +225,7 @@ def test_stops_tilt_uniformly_over_the_cap_with_any_yaw(lab: Lab) -> None:
         assert np.mean(uniform**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / 2000))
 
 
-def test_the_imu_errs_by_its_sigma_about_each_axis(lab: Lab) -> None:
+def test_the_imu_error_about_each_axis_has_its_sigma(lab: Lab) -> None:
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 500, 25.0)
     off = (survey_frames.imu_attitudes(lab.scene, stops, 0.01) * stops).as_rotvec() / 0.01
     for axis in off.T:

@@ -104,7 +104,7 @@ def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
     assert shefex_nights.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
 
 
-def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
+def test_the_chip_s_fields_follow_from_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
     field_deg = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     np.testing.assert_allclose(field_deg, np.degrees(2 * np.arctan(half)), rtol=1e-9)

@@ -494,7 +494,7 @@ def test_an_address_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.long
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(
         sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False

@@ -193,7 +193,7 @@ def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
         assert one.feasible or one.why.startswith("identified")
 
 
-def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_a_refused_candidate_is_infeasible_and_the_search_continues(tmp_path: Path) -> None:
     """Its trials fail after one was tried, and do not count as failures of the budget."""
     asked = []
 
@@ -513,7 +513,9 @@ def test_a_distribution_cannot_be_searched() -> None:
         search.check(plan.Study.model_validate(STUDY | {"factors": {"x": drawn}}))
 
 
-def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_optuna_one_line_names_the_extra_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"^[^\n]*pip install 'skysim\[optuna\]'$"):
         search.create_sampler(plan.Study.model_validate(STUDY))

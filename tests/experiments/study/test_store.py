@@ -164,7 +164,7 @@ def test_another_study_or_other_code_is_refused(
 
 
 @pytest.mark.slow
-def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
+def test_a_study_with_more_replicates_keeps_existing_trials(
     study_plan: plan.Plan, tmp_path: Path
 ) -> None:
     more = other(study_plan, replicates="5")
