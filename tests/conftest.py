@@ -105,20 +105,20 @@ def run_modules(group: Sequence[Sequence[str]], folder: Path) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
-    """Say to a worker of xdist which file shows that the compilation is done."""
+    """Give a worker of xdist the file that marks the end of the compilation."""
     if COMPILED in node.config.stash:
         node.workerinput["compiled"] = str(node.config.stash[COMPILED][0] / "done")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """A worker waits for the compilation before its first test."""
+    """Let a worker wait for the compilation before its first test."""
     done = getattr(session.config, "workerinput", {}).get("compiled")
     while done and not Path(done).exists():
         time.sleep(0.1)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove what the compilation left, and raise what it raised."""
+    """Remove files of the compilation and raise its error, if any."""
     if COMPILED in config.stash:
         folder, groups = config.stash[COMPILED]
         wait(groups)

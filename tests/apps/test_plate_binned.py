@@ -1,4 +1,4 @@
-"""Pictures whose stars are large are solved binned: places are in pixels of the picture, and the bar is higher."""
+"""Images with large stars are solved binned: centroids are in full pixels, and more evidence is required."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)
 
 @pytest.fixture(scope="module")
 def drawn() -> tuple[NDArray, Rotation]:
-    """A picture with stars of 28 px that are hardly brighter than the noise of a pixel, and its attitude."""
+    """An image with stars of 28 px hardly brighter than the noise of a pixel, and its attitude."""
     stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
     return photographs.draw(SHOT, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(5))
 

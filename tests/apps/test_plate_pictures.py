@@ -96,7 +96,7 @@ def answer(
 
 
 def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -> None:
-    """Position and roll of the viewed picture to an arc-minute or two: 8 bits, and JPEG."""
+    """Check pointing and roll of the viewed image to one or two arcminutes, the limit of 8 bits and JPEG."""
     assert found["status"] == "solved"
     ours = stars.cam_from_icrs(found["ra_deg"], found["dec_deg"], found["roll_deg"])
     assert math.degrees((ours * truth.cam_from_lab.inv()).magnitude()) < 0.05

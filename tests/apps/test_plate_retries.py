@@ -1,4 +1,4 @@
-"""Pictures of which a part, or what is left without the clouds, is the sky."""
+"""Images of which only a part, or the image without clouds, shows the sky."""
 
 from __future__ import annotations
 

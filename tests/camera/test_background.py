@@ -1,4 +1,4 @@
-"""Sky, Moon and stray light against the law of illumination, published values and geometry done otherwise."""
+"""Sky, Moon and stray light against the law of illumination, published values and independent geometry."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def glow(**part: object) -> light.Glow:
 
 
 def lab_place(right_deg: float) -> tuple[float, float]:
-    """Right ascension and declination, in degrees, of what stands so far to the right of the boresight."""
+    """Right ascension and declination, deg, of a point at this angle to the right of the boresight."""
     angle = np.radians(right_deg)
     x, y, z = POINTING.inv().apply([np.sin(angle), 0.0, np.cos(angle)])
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
 def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
-    """Worked out at every third pixel itself, for comparison."""
+    """Background computed directly at every third pixel, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
     toward, pixel_sr = pixel_directions(np.column_stack([x.ravel(), y.ravel()]).astype(float), lens)
@@ -176,7 +176,7 @@ def test_the_sky_s_gradient_is_relative_per_degree() -> None:
 
 
 def vmag_arcsec2(nanolamberts: float) -> float:
-    """KS91 eq. 1 turned round."""
+    """Inverse of KS91 eq. 1."""
     return (20.7233 - np.log(nanolamberts / 34.08)) / 0.92104
 
 

@@ -134,7 +134,7 @@ def test_the_stray_light_of_a_near_earth_is_that_of_its_ground(
 
 
 def steps(count: int) -> Floats:
-    """Middles of even steps around a circle."""
+    """Centers of equal steps around a circle."""
     return (np.arange(count) + 0.5) * 2 * np.pi / count
 
 

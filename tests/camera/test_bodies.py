@@ -1,4 +1,4 @@
-"""Discs in a frame: against a hundred thousand points drawn one by one, and against the light that they must have."""
+"""Discs in a frame against a hundred thousand single points and against their total light."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def camera(focal_px: float, psf: dict[str, object]) -> CameraConfig:
 
 
 def toward(direction: Floats, off_px: tuple[float, float], optics: Optics) -> Rotation:
-    """lab_from_cam that puts a direction so many pixels from the chip's center."""
+    """lab_from_cam that images a direction at this offset, px, from the chip's center."""
     z = direction
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""Chromatic aberration: what a lens does to a light of many wavelengths, against rays of every one of them."""
+"""Chromatic aberration: images of polychromatic light against rays of each wavelength."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks of particles against the laws they are drawn from, and every electron accounted for."""
+"""Tracks of particles against their laws, with charge conserved."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def protons(**part: object) -> ParticlesConfig:
 
 
 def many(count: int = 100_000, **part: object) -> np.ndarray:
-    """Tracks, about so many, of a chip without margins worth mentioning: 0.06 cm2 and a depth of 1 nm."""
+    """About this number of tracks on a chip with negligible margins: 0.06 cm2 and a depth of 1 nm."""
     thin = protons(per_cm2_s=count / 0.06, depth="1 nm", **part)
     return draw_tracks(thin, SHAPE, 1.0, PIXEL_M, np.random.default_rng(1))
 

@@ -1,4 +1,4 @@
-"""Charge to numbers: every step's law, the exact distribution of the numbers, and the chip's two ends."""
+"""From charge to DN: the law of each step, the exact distribution of DN, and clipping at both ends."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any
 def law(
     mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float
 ) -> np.ndarray:
-    """Probability of every number: Poisson electrons, held by the well, plus a Gaussian, rounded, clipped."""
+    """Probability of every DN: Poisson electrons clipped at the well, plus Gaussian noise, rounded and clipped."""
     n = np.arange(int(mean_e + 12 * np.sqrt(mean_e)) + 12)
     edges_e = (np.arange(2**bits - 1) + 0.5 - offset) * gain
     held = np.minimum(n, well_e)

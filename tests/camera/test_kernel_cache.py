@@ -1,4 +1,4 @@
-"""Which image each source makes, and that no two share what they should not."""
+"""Kernel of each source, and which sources may share one."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def drawn_normals(seed: int = 0) -> np.ndarray:
 
 
 def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
-    """Share of honest draws that are farther from the law than these; bins of less than 10 are one."""
+    """Probability that draws of the law deviate more than these; bins below 10 are merged."""
     found = np.bincount(numbers, minlength=len(probability))
     wanted = probability * len(numbers)
     assert len(found) == len(wanted), "a number that the law does not have"

@@ -1,4 +1,4 @@
-"""Projection against OpenCV's, the light let through against rays traced, and the camera's own sizes by hand."""
+"""Projection against OpenCV, vignetting against traced rays, and camera dimensions against hand calculations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What falls on the chip: energy, place, shape and smear against integrals done here by other means."""
+"""Light on the chip: energy, position, shape and smear against independent integrals."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
 
 
 def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
-    """The same with another Gaussian, or a disk with a Gaussian edge."""
+    """The same camera with another Gaussian, or a disk with a Gaussian edge."""
     kind = {"kind": "disk", "radius_px": radius_px} if radius_px else {"kind": "gaussian"}
     return lens_of(psf=kind | {"sigma_px": sigma_px})
 
@@ -70,7 +70,7 @@ STILL = turning([0, 0, 0])
 
 
 def light(**fields: object) -> Sources:
-    """One star on the boresight of one photon per second and square meter, but for what is given."""
+    """One star on the boresight with one photon per second and square meter, unless given otherwise."""
     made = {
         "id": np.array([7]),
         "place": np.array([[0.0, 0.0, 1.0, 0.0]]),

@@ -1,4 +1,4 @@
-"""What is written comes back, astropy reads it as meant, and damage is one line."""
+"""Files round-trip, astropy reads them correctly, and damaged files are one error line."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def written(sky: Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def complaint(path: Path) -> str:
-    """The one line that a bad file gets."""
+    """One-line error text for a bad file."""
     with pytest.raises(InputError) as refusal:
         images.read_image(path)
     message = str(refusal.value)

@@ -66,7 +66,7 @@ def test_a_tenth_of_the_page_s_trials_prints_the_same_number_of_rows(words: list
 
 
 def printed_with(words: list[str], trials: int) -> list[str]:
-    """The lines of a table's command with so many trials a row."""
+    """Lines printed by a table's command with this number of trials per row."""
     at = TRIALS_AT.get(words[2], 3)
     few = [*words[1:at], str(trials), *words[at + 1 :]]
     done = subprocess.run([sys.executable, *few], cwd=ROOT, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What the site writes by itself: the pages of the commands and of the keys; and what pages tell to make."""
+"""Generated pages of commands and keys, and the make targets that pages name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skysim.scene.sections.tracker import SurveyErrorsConfig
 
 
 def of_the_site(name: str) -> ModuleType:
-    """A module beside the site's settings, which no package holds."""
+    """A module next to the site's settings, outside of any package."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -40,7 +40,7 @@ SECTIONS = dict(
 
 
 def helped(*words: str) -> str:
-    """What --help prints, on a terminal wide enough."""
+    """Text of --help on a wide terminal."""
     result = CliRunner().invoke(
         main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
     )

@@ -1,4 +1,4 @@
-"""The controller obeys its poles, knows Euler's equation, and does not wind up; flown, it does what theory says."""
+"""The controller: poles, feed-forward by Euler's equation, anti-windup, and closed-loop motion by theory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def planned(*elements: object) -> Reference:
 
 
 def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
-    """A controller that is to keep the attitude (0, 0, 0)."""
+    """A controller that holds the attitude (0, 0, 0)."""
     return build_controller(planned(), inertia, ControlConfig.model_validate(part))
 
 
@@ -46,7 +46,7 @@ def closed(
     disturbance_nm: Floats = NONE,
     stored_nms: Floats = STORED,
 ) -> tuple[Rotation, Floats]:
-    """Attitudes and rates at times of a rigid body with rotors under the law, asked without a pause.
+    """Attitudes and rates of a rigid body with rotors under the continuously evaluated law.
 
     J dw/dt + w x (J w + h) = T + disturbance and dR/dt = R [w], by SciPy; the error's integral is integrated too.
     """
@@ -107,7 +107,7 @@ def test_the_attitude_error_takes_the_shorter_way() -> None:
 
 
 def late(period_s: float) -> float:
-    """By how much the roll error after 1.6 s differs from the continuous law's where the torque is held a period.
+    """Difference of the roll error after 1.6 s between sampled and continuous control.
 
     A body on one axis is integrated exactly between the calls.
     """

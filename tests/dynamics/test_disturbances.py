@@ -1,4 +1,4 @@
-"""The air, the turning Earth, the bearing's jets and a knock, each against its law or an independent integration."""
+"""Air currents, Earth rotation, turbine torque and knocks against their laws or independent integrations."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ PERIOD_S = 0.01
 
 @pytest.fixture(scope="module")
 def gusts() -> Floats:
-    """(100,000, 3) a thousand seconds of it."""
+    """(100,000, 3) gust torques of a thousand seconds."""
     air = AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(5))
     return np.array([air.sample() for _ in range(100_000)])
 

@@ -1,4 +1,4 @@
-"""Every set of actuators gives the torque that was wanted, says when it cannot, and is relieved of its momentum."""
+"""Every set of actuators delivers the commanded torque, reports its limits, and is desaturated."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SETS = {
 
 @dataclass
 class Asks:
-    """A controller that wants one torque of the body, whatever the rotors' momentum makes of its turn."""
+    """A controller that commands one constant torque of the body for any rotor momentum."""
 
     torque: Floats
     given: list[tuple[Floats, Floats]] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Asks:
 
 
 def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Simulation]:
-    """A free SimSat or TAS-2 at rest, and who flies it."""
+    """A free SimSat or TAS-2 at rest with its flight computer."""
     actuators, parts = SETS[name]
     changes = FREE | parts | {"motion.control": f"{{actuators: {actuators}}}"} | more
     loaded = loader.load("afit_simsat", changes)
@@ -83,7 +83,7 @@ def present_controls(flight_computer: FlightComputer, flight: multibody.Simulati
 
 
 def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
-    """(3, 3) of what turns with the body about its own axes: a wheel does not about its axle, which is free."""
+    """(3, 3) inertia about the body axes without the wheels' inertia about their free axles."""
     wheels = vehicle.wheels
     return vehicle.inertia_kg_m2 - (wheels.axes * wheels.inertia_kg_m2) @ wheels.axes.T
 

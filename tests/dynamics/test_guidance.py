@@ -1,4 +1,4 @@
-"""The reference obeys the law of each element, joins without a jump where it should, and knocks with its impulse."""
+"""The reference follows the law of each element, is continuous where required, and applies knocks."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ EVERY = {
 
 @pytest.fixture
 def tour() -> Reference:
-    """Long slews that cruise, one too short to, and holds between them."""
+    """Long slews with a cruise phase, one too short for it, and holds between them."""
     return reference(HOLD, turn_to(12, -6, -160), turn_to(-8, 14, 80), HOLD, turn_to(-2, 14, 80))
 
 
@@ -97,7 +97,7 @@ def euler(roll: float, pitch: float, yaw: float) -> Rotation:
 
 
 def between(a: Rotation, b: Rotation) -> np.ndarray:
-    """Angles (rad) by the rotation vector: `magnitude` of nearly nothing is no better than 1e-8."""
+    """Angles (rad) by the rotation vector; `magnitude` of small rotations is accurate only to 1e-8."""
     return np.linalg.norm((a.inv() * b).as_rotvec(), axis=-1)
 
 

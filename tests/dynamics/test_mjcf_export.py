@@ -1,4 +1,4 @@
-"""The laboratory in 3-D: the exported MJCF flies like the stepped model, stands where it should, and can be drawn."""
+"""The exported MJCF laboratory moves like the stepped model, has the scene's geometry, and can be drawn."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def star_lab() -> tuple[Scene, multibody.VehicleModel, Sources, Rotation]:
 
 
 def loaded(text: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The text as MuJoCo reads it, in its keyframe `start`."""
+    """The exported model in its keyframe `start`."""
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
@@ -334,7 +334,7 @@ def states(*attitudes: Rotation) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def opengl() -> None:
-    """Skips where not even an empty room can be drawn, with the reason."""
+    """Skip with the reason if not even an empty room can be drawn."""
     try:
         scene_picture.picture(NOTHING, np.zeros(0), (64, 48))
     except scene_picture.NoPicture as reason:

@@ -1,4 +1,4 @@
-"""A stranger's vehicle reads no file outside of its folder, cannot crash skysim, and cannot fill memory or time."""
+"""An untrusted vehicle file reads only its folder, cannot crash skysim, and has limits of memory and time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vehicle as it is composed and flown: masses, actuators, camera, tilt stop, and what a file may not have.
+"""The assembled vehicle: masses, actuators, camera, tilt stop, and refused files.
 
 The laws of mechanics are in test_physics_vehicle and test_physics_actuators.
 """
@@ -382,7 +382,7 @@ ROTOR = f'<body><joint name="rotor_%s" axis="0 1 0"/>{DISK}</body>'
 
 
 def carrying(parts: str) -> str:
-    """The bus with more on it."""
+    """The bus with further bodies."""
     return BUS.replace(CAMERA, CAMERA + parts)
 
 

@@ -1,4 +1,4 @@
-"""What stands in the way hides exactly what is behind it: boxes against the slab test, walls against a quadratic."""
+"""Occlusion: boxes against the slab test, walls against a quadratic equation."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def test_stars_behind_the_body_are_hidden() -> None:
 
 
 def sources_at(place: Any) -> Sources:
-    """Sources at (N, 4) homogeneous places; all else is of no importance here."""
+    """Sources at (N, 4) homogeneous places; other properties are irrelevant here."""
     place = np.array(place, float)
     count = np.zeros(len(place), np.int64)
     number = np.zeros(len(place))

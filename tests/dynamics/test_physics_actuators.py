@@ -1,4 +1,4 @@
-"""Wheels, gimbals, fans and what drags at the vehicle, each against its closed form."""
+"""Wheels, gimbals, fans, drag and cables, each against its closed form."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_wheel_sticks_until_its_motor_beats_coulombs_friction(
 
 
 def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
-    """(3,) amplitude at a frequency, about the body's axes, of what is no slow drift in 0.2 s of flight."""
+    """(3,) amplitude at a frequency about the body axes over 0.2 s of flight, without slow drift."""
     flight = flown(vehicle, STILL, still(vehicle, 0.2))
     t = np.arange(len(flight.states)) * vehicle.model.opt.timestep
     turn = Rotation.from_quat(angles(flight)[:, :4], scalar_first=True).as_rotvec()

@@ -1,6 +1,6 @@
-"""The vehicle against the great laws: what is kept is kept, what theory solves comes out as solved.
+"""The vehicle's motion against conservation laws and analytic solutions.
 
-MuJoCo knows no spin-stabilized body, no gyroscope and no elliptic function; every number here is worked out beside it.
+Every expected value here is computed independently of MuJoCo.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
 
 
 def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
-    """Angular momentum (3,) about the lab's origin and kinetic energy, a sum over the bodies one by one.
+    """Angular momentum (3,) about the lab's origin and kinetic energy, summed over the bodies.
 
-    Of MuJoCo only each body's own velocity, place, mass and principal inertia: L = sum m r x v + J w.
+    L = sum m r x v + J w, from each body's velocity, position, mass and principal inertia in MuJoCo.
     """
     model = flight.model
     data = mujoco.MjData(flight.model)

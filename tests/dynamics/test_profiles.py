@@ -1,4 +1,4 @@
-"""Attitude profiles: every format and every name of a column gives the motion that was meant, or one clear line."""
+"""Attitude profiles: every format and column name gives the intended motion or one error line."""
 
 from __future__ import annotations
 

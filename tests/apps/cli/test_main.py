@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it leaves behind, and one line for whatever the user got wrong."""
+"""The command line: printed text, written files, and one error line for each wrong input."""
 
 from __future__ import annotations
 

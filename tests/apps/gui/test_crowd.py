@@ -31,7 +31,7 @@ WORKERS = 2
 
 
 class Hand:
-    """In place of a worker process."""
+    """Substitute for a worker process."""
 
     alive: ClassVar[set[Any]] = set()
 
@@ -121,7 +121,7 @@ def test_twenty_tabs_share_two_workers(browser: Any, tmp_path: Path) -> None:
 
 
 def place(page: Any) -> int:
-    """How many wait before a page; -1 if it does not wait."""
+    """Number of pages that wait before this one; -1 if it does not wait."""
     found = re.search(
         r"2 of 2 workers in use(?:; (\d+) before this page)?\.",
         page.locator(".lab-wait").inner_text(),

@@ -1,4 +1,4 @@
-"""Frames on their way to the browser: reduced to the screen's pixels while they follow one another."""
+"""Frames sent to the browser are reduced to the screen's pixels while frames follow one another."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def decoded(data: bytes) -> tuple[dict[str, Any], np.ndarray]:
 
 
 class Source:
-    """In place of a session: the worker shows an image of number 1, or has ended (None)."""
+    """Substitute for a session: the worker shows an image of number 1, or has ended (None)."""
 
     def __init__(self, image: np.ndarray | None) -> None:
         self.image = image
@@ -266,7 +266,7 @@ def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.Monkey
 
 
 def split(message: bytes) -> tuple[int, np.ndarray]:
-    """Number and pixels of a message."""
+    """Image number and pixels of a message."""
     length, number = np.frombuffer(message, "<u4", 2)
     assert len(message) == 8 + length
     return int(number), decoded(message[8:])[1]

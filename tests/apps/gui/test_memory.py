@@ -1,4 +1,4 @@
-"""What remains of a page that is closed: nothing."""
+"""A closed page is freed completely."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skysim.apps.gui.page.tab import Tab
 
 
 class Hand:
-    """In place of a worker process."""
+    """Substitute for a worker process."""
 
     def close(self) -> None:
         """End."""

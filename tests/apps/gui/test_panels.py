@@ -1,4 +1,4 @@
-"""The lab's parts without a browser: keys' turns, forms of the schema, marks, guard, worker, Monte Carlo."""
+"""The lab's parts without a browser: rotation keys, schema forms, marks, guard, worker, Monte Carlo."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_a_form_s_unchanged_values_give_the_same_scene(name: str) -> None:
 
 
 def rounded(tree: object) -> object:
-    """Numbers to six digits, as the fields have them."""
+    """Numbers rounded to six digits, as shown in the fields."""
     if isinstance(tree, dict):
         return {key: rounded(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):

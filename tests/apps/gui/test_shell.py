@@ -1,4 +1,4 @@
-"""What surrounds the lab's panels: the list of actions, theme, splitter, narrow windows, wording."""
+"""The frame around the lab's panels: list of actions, theme, splitter, narrow windows, wording."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def change_theme(page: Any) -> None:
 
 
 def ground(page: Any) -> str:
-    """Color behind the panels."""
+    """Background color of the panels."""
     return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
 
 
@@ -318,7 +318,7 @@ def test_a_closed_or_unchanged_laboratory_is_not_redrawn(
         return int(canvas.get_attribute("data-drawn") or 0)
 
     def moved(key: str) -> int:
-        """How many pictures are drawn for a key."""
+        """Number of pictures drawn after a key press."""
         page.wait_for_timeout(1000)
         before = pictures()
         frame = source(page)

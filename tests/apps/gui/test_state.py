@@ -110,7 +110,7 @@ def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch)
 
 
 def written(page: Any, *parts: str) -> bool:
-    """Whether the address comes to have these parts."""
+    """Whether the address has these parts after a short wait."""
     return come(lambda: all(part in address(page) for part in parts))
 
 
