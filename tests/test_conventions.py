@@ -1,4 +1,4 @@
-"""The conventions of the house, each nailed by a number worked out by hand. Read this file first."""
+"""The project's conventions, each checked by a hand calculation. Read this file first."""
 
 import re
 
@@ -136,7 +136,7 @@ def test_the_tracker_s_attitude_is_the_simulator_s_pointing():
 
 
 def hand_made(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
-    """Rows right, down, boresight by elementary turns alone: Rz(-roll) applied to (west, south, out)."""
+    """Rows right, down, boresight by elementary rotations: Rz(-roll) applied to (west, south, out)."""
     turn = Rotation.from_euler("z", ra_deg, degrees=True) * Rotation.from_euler(
         "y", -dec_deg, degrees=True
     )
@@ -198,7 +198,7 @@ def test_mujocos_camera_axes_convert_to_ours():
 def flown(
     parts: dict[str, object], motor: int, control: float
 ) -> tuple[multibody.VehicleModel, multibody.Simulation]:
-    """A second of SimSat, free and at rest, one of its motors at work."""
+    """A second of a free SimSat, initially at rest, with one motor driven."""
     given = {
         "model": "vehicles/simsat.xml",
         "mount": "free",

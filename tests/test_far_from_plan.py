@@ -1,4 +1,4 @@
-"""Flights far from what was planned: blows beyond all limits, stops, what cannot be stepped, flights of one tick."""
+"""Flights far from the plan: blows beyond all limits, stops, failed integrations, flights of one tick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The import graph: one way down, and no circle anywhere, lazy imports and those for type checkers counted."""
+"""The import graph has no cycle, counting lazy imports and those for type checkers."""
 
 import ast
 from collections.abc import Iterator
@@ -44,12 +44,12 @@ def imported(path: Path) -> set[str]:
 
 @cache
 def graph() -> dict[str, set[str]]:
-    """What each module imports."""
+    """Imports of each module."""
     return {name: imported(path) - {name} for name, path in FILES.items()}
 
 
 def circles(uses_of: dict[str, set[str]]) -> list[str]:
-    """What is left when modules whose imports are all gone are taken away, again and again."""
+    """Modules left after repeatedly removing those without remaining imports: the cycles."""
     left = {name: set(uses) for name, uses in uses_of.items()}
     while done := {name for name, uses in left.items() if not uses}:
         left = {name: uses - done for name, uses in left.items() if name not in done}

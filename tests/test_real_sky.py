@@ -1,6 +1,6 @@
-"""Real photographs of the night sky, whose attitude two independent solvers agree on.
+"""Real photographs of the night sky with attitudes from two agreeing independent solvers.
 
-The folder stands beside the checkout (or where SKYSIM_REAL_SKY says); its README tells how its truth was made.
+The folder is beside the checkout or at SKYSIM_REAL_SKY; its README describes how the truth was made.
 """
 
 import csv
@@ -28,7 +28,7 @@ needs_photographs = pytest.mark.skipif(
 
 
 def by_file(rows, quick: int = 1):
-    """A test for each photograph; of which every `quick`-th is not slow."""
+    """One test per photograph; every `quick`-th is not marked slow."""
     marks = [() if k % quick == 0 else pytest.mark.slow for k in range(len(rows))]
     params = [
         pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)

@@ -35,14 +35,14 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def answers(folder: Path) -> list[str]:
-    """The rows of the solutions, every digit, without the time that each took."""
+    """Rows of the solutions with every digit, without computing times."""
     table = Table.read(folder / "solutions.ecsv", format="ascii.ecsv")
     table.remove_column("time_ms")
     return [str(tuple(row)) for row in table]
 
 
 def made(scene: str, out: Path, **environment: str) -> Path:
-    """What a run leaves, in a process of its own."""
+    """Files of a run in a separate process."""
     folder = out / scene
     command = [sys.executable, "-m", "skysim", "run", scene, "--frames", "3", "--out", str(folder)]
     subprocess.run(command, check=True, capture_output=True, env=os.environ | environment)

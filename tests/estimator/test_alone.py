@@ -1,4 +1,4 @@
-"""The estimator without anything but numpy, scipy, numba and OpenCV: in this checkout, and as a package of its own."""
+"""The estimator with only numpy, scipy, numba and OpenCV, in this checkout and as a separate package."""
 
 from __future__ import annotations
 

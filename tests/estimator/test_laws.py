@@ -1,4 +1,4 @@
-"""No public function of the estimator without a property test; and all of them with many examples."""
+"""Every public function of the estimator has a property test, and all tests pass with many examples."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Places and magnitudes of Sun, Moon and planets are Skyfield's with JPL's DE421 (extra `oracle`).
+"""Positions and magnitudes of Sun, Moon and planets match Skyfield with JPL's DE421 (extra `oracle`).
 
-Skyfield has its own light time, deflection, aberration, Earth rotation and magnitudes; the shipped ephemeris is
+Skyfield computes light time, deflection, aberration, Earth rotation and magnitudes itself; the shipped ephemeris is
 fitted to DE423.
 """
 

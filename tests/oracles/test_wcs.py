@@ -1,4 +1,4 @@
-"""The pixel chain against astropy's own world coordinate system, built from the header that our frames carry."""
+"""Our projection against astropy's world coordinate system from our frames' headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures for the eye: marks where the truth is, stretches that compare."""
+"""Annotated pictures: marks at true positions and equal stretches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The list of parts: quantities against geometry, and what drive, code and layout change; tables of prices."""
+"""The list of parts: quantities against geometry, effects of drive, code and layout, and price tables."""
 
 from __future__ import annotations
 

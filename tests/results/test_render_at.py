@@ -1,4 +1,4 @@
-"""Frames for a plant outside of skysim: at the attitude, rate and time that it gives, with noise by number."""
+"""Frames for an external plant: at its attitude, rate and time, with noise by frame number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of reports: nothing is lost or obeyed on the way to a page, and every form says the same."""
+"""Laws of reports: text is kept and never interpreted, and every output format has the same content."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def of(*blocks: Block) -> Report:
 
 
 def everywhere(text: str) -> Report:
-    """A report with a text wherever it may come from outside."""
+    """A report with the text in every place that accepts outside text."""
     table = Table(
         [Column(text), Column("note", kind="aside")], [[text, text], [Cell(text, "bad", 3.0), ""]]
     )

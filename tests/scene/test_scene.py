@@ -1,4 +1,4 @@
-"""Units are what they say, and every kind of bad input is one line that helps."""
+"""Scene files: units, and one helpful error line for every kind of bad input."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def line_number(text: str, fragment: str) -> int:
 
 
 def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
-    """The one line that a bad scene gets."""
+    """One-line error text for a bad scene."""
     with pytest.raises(InputError) as refusal:
         loader.load(path, overrides)
     message = str(refusal.value)
@@ -155,7 +155,7 @@ def test_a_section_s_quantities_become_si(
 
 
 def parts_of(annotation: object) -> set[type[ConfigModel]]:
-    """Every section that an annotation names, and theirs."""
+    """Every section that an annotation names, recursively."""
     if isinstance(annotation, type) and issubclass(annotation, ConfigModel):
         fields = annotation.model_fields.values()
         return {annotation}.union(*(parts_of(field.annotation) for field in fields))
@@ -163,7 +163,7 @@ def parts_of(annotation: object) -> set[type[ConfigModel]]:
 
 
 def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
-    """Whether it, or each of it, is filled by a value such as "48 in"."""
+    """Whether an annotation, or each of its elements, takes a value such as "48 in"."""
     parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
     sizes = [one.quantity for one in metadata if isinstance(one, ErrorSchema)]
     own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(

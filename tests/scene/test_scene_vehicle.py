@@ -1,4 +1,4 @@
-"""A scene's vehicle, motion and base: units, what goes together, and one line for whatever does not."""
+"""A scene's vehicle, motion and base: units, and one error line for contradicting keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An option that has no effect is refused where it is written, and it really has none."""
+"""An option without effect is refused at its place, and it really has none."""
 
 from __future__ import annotations
 

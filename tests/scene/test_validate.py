@@ -1,4 +1,4 @@
-"""Files are checked before anything is flown; editors get a schema that knows what we know."""
+"""Files are checked before a run; the schema for editors has the same rules."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SHIPPED = {
 
 
 class Plain(yaml.SafeLoader):
-    """YAML as editors read it: a moment is a text."""
+    """YAML loader as in editors: times are text."""
 
 
 Plain.yaml_implicit_resolvers = {
@@ -40,7 +40,7 @@ Plain.yaml_implicit_resolvers = {
 
 
 def faults(kind: str, tree: Any) -> list[str]:
-    """What an independent validator has against it."""
+    """Errors reported by an independent validator."""
     validator = jsonschema.Draft202012Validator(validate.json_schema(kind))
     return [error.message for error in validator.iter_errors(tree)]
 

@@ -1,4 +1,4 @@
-"""Frames of a scene with air: where the stars are, how bright, and what the skyline hides."""
+"""Frames of a scene with air: star positions and brightness, and stars hidden by the skyline."""
 
 from __future__ import annotations
 

@@ -91,13 +91,13 @@ def off_deg(telemetry: Telemetry) -> Floats:
 
 
 def imu_error_deg(telemetry: Telemetry) -> Floats:
-    """(K, 3) of the IMU's attitude, in body axes."""
+    """(K, 3) error of the IMU's attitude in body axes, deg."""
     assert telemetry.lab_from_imu is not None
     return np.degrees((telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec())
 
 
 def in_sigma(telemetry: Telemetry) -> Floats:
-    """(K, 3) the filter's error about each body axis over what it believes of it."""
+    """(K, 3) the filter's error about each body axis over its standard deviation."""
     assert telemetry.lab_from_filter is not None
     error = (telemetry.lab_from_filter.inv() * telemetry.lab_from_body).as_rotvec()
     return np.abs(error) / telemetry.sigma_attitude_rad

@@ -32,7 +32,7 @@ RING_M = 0.08
 
 
 def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
-    """Lights at (n, 3) places in camera axes, one pixel accurate each."""
+    """Lights at (n, 3) places in camera axes, each with an error of one pixel."""
     count = len(arm_m)
     nothing = np.zeros(len(arm_m))
     xy_px = lab.camera.optics.project(offset_m)
@@ -225,7 +225,7 @@ def render_moving(
 
 
 def lit_by_known(exposure: Exposure, lab: Lab) -> Lit:
-    """The light by which the tracker finds itself."""
+    """Sources that the tracker's map contains."""
     (lit,) = (lit for lit in beam_of(lab.camera.lights, exposure).lits if lit.known)
     return lit
 

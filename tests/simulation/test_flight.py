@@ -46,7 +46,7 @@ def images(shots: list[Shot]) -> list[bytes]:
 
 @pytest.fixture
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Indices of the frames that a flight renders, as they come."""
+    """Indices of the frames in the order in which a flight renders them."""
     indices: list[int] = []
     render_frame = flight_module.render_frame
 
@@ -452,7 +452,7 @@ def test_a_frame_that_is_not_exposed_is_refused() -> None:
 
 
 def observed_at(flight: Flight, t_s: float) -> Shot:
-    """An observation by the flight when it has come to that time."""
+    """An observation by the flight at this time."""
     while flight.now_s < t_s - 1e-9:
         flight.step()
     return flight.observe(solves=False)

@@ -1,4 +1,4 @@
-"""Lights: a new one is one file with its schema; the forecast counts what is drawn and names what hides it."""
+"""Lights: a new kind is one file with its schema; the forecast counts drawn lights and names occluders."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ LAMP_ID = 3_000_000_000
 class LighthouseConfig(LightConfig):
     """One lamp that shines down and blinks.
 
-    lit : how long it shines in every period, from the scene's start on
+    lit : on-time in every period, from the scene's start
     """
 
     kind: Literal["lighthouse"]
@@ -85,7 +85,7 @@ class CurtainConfig(LightConfig):
 
 @dataclasses.dataclass(frozen=True)
 class Curtain(Obstacle):
-    """Hides what is beyond it."""
+    """Hide sources beyond it."""
 
     beyond_m: float
 

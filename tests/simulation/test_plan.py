@@ -1,4 +1,4 @@
-"""The check of a plan: its facts against counts and closed forms, and a warning for each mistake that names the key."""
+"""The check of a plan: facts against counts and closed forms, and a warning with its key for each mistake."""
 
 from __future__ import annotations
 

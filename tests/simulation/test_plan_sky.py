@@ -1,4 +1,4 @@
-"""What `skysim check` says of stray light, exclusion angles, the air, reflections and drift with the temperature."""
+"""`skysim check` on stray light, exclusion angles, air, reflections and thermal drift."""
 
 from __future__ import annotations
 

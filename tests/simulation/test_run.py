@@ -1,4 +1,4 @@
-"""The whole chain without noise returns the truth; frames stand alone; the streams are order-free."""
+"""The noise-free chain returns the truth; frames are independent; random streams do not depend on order."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def shots_of(scene: Scene) -> list[Shot]:
 def true_centroids(truth: Truth) -> Centroids:
     """The true pixels, brightest first, as if they had been measured to a hundredth of a pixel.
 
-    They are the images of the LEDs' centers. The centers of light are up to 1e-3 px from these in perspective.
+    These are the images of the LEDs' centers; by perspective the centers of light differ by up to 1e-3 px.
     """
     order = np.argsort(-truth.sources.electrons)
     count = len(order)

@@ -1,4 +1,4 @@
-"""Trackers and profiles given in Python, prescribed motions, and what the vehicle cannot follow."""
+"""Trackers and profiles given in Python, prescribed motions, and motions that the vehicle cannot follow."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def shown(**more: Any) -> Sources:
 
 
 def own_m(place_m: np.ndarray) -> np.ndarray:
-    """Places on FLAT in its own axes: its middle at the apex and the offset, turned about x, then about y."""
+    """Places on FLAT in its own axes: center at apex plus offset, rotated about x, then about y."""
     a, b = np.radians([4, -3])
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -256,7 +256,7 @@ def still_frame(lab: Lab) -> tuple[Frame, Truth]:
 
 
 def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
-    """A pixel's light in exposures begun evenly over a frame."""
+    """A pixel's light in exposures with start times uniform over a frame."""
     begins = (np.arange(4000) + 0.5) / 4000 / 60
     pulses = drawn.period_s[5], drawn.start_s[5], drawn.on_s[5]
     return np.array([lit_moments_s(begin, begin + exposure_s, *pulses)[0] for begin in begins])

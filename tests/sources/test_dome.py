@@ -1,4 +1,4 @@
-"""The dome's surface against its own equation and the FARO-arm figures; the boards against a ruler."""
+"""The dome's surface against its equation and the FARO-arm figures; the boards against distances."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ def test_boards_are_uniform_in_area() -> None:
 
 
 def logs(leds: Sources) -> np.ndarray:
-    """Each LED's brightness against the declared one, its logarithm."""
+    """Logarithm of each LED's brightness over the declared one."""
     return np.asarray(np.log(leds.strength / led_strength_e_s_sr(16e-3, "white", BAND)))
 
 
@@ -302,7 +302,7 @@ def test_nine_per_cent_ranks_as_normal_order_statistics() -> None:
 
 
 def likelihood(boards: np.ndarray) -> float:
-    """How probable Table 2 is among boards, by the standard deviation of its nine values: log density, Normal."""
+    """Log probability density of Table 2's standard deviation among simulated boards, by a normal law."""
     spread = np.log(boards.std(axis=1))
     seen = np.log(np.std(TABLE_2) / np.mean(TABLE_2))
     return float(-((seen - spread.mean()) ** 2) / (2 * spread.var()))

@@ -1,4 +1,4 @@
-"""The simulated sky: counts, doubles where other observers saw them, and every star that the tracker knows."""
+"""The simulated sky: counts, published positions of doubles, and every star of the tracker's catalog."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def known() -> Catalog:
 
 
 def axes(stars: Catalog) -> tuple[Floats, Floats, Floats]:
-    """(N, 3) unit vectors to the stars, east and north there."""
+    """(N, 3) unit vectors to the stars, and toward their local east and north."""
     ra = stars.ra_rad
     dec = stars.dec_rad
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])

@@ -1,4 +1,4 @@
-"""Where LEDs sit against rulers, counting and the sky; how they are driven against the thesis's own law."""
+"""Positions of LEDs against distances, counts and the sky; their drive against the thesis's law."""
 
 from __future__ import annotations
 
@@ -729,7 +729,7 @@ def light_s(leds: Sources, which: int, begin_s: float, length_s: float) -> float
 
 
 def sequential(count: int, **more: Any) -> dict[str, Any]:
-    """One board of so many LEDs on an Arduino."""
+    """One board of this number of LEDs on an Arduino."""
     board = {"azimuth_deg": 10, "tilt_deg": 5, "leds": list(range(count))} | more
     return {"kind": "patch_boards", "cap_deg": 40, "pitch": "8 mm", "boards": [board]}
 
@@ -789,7 +789,7 @@ def test_a_layout_without_boards_requires_leds_per_controller() -> None:
 
 
 def relative_sd(leds: Sources, which: int, exposure_s: float) -> float:
-    """Flicker from frame to frame: the LED's light in exposures begun evenly over its cycle."""
+    """Frame-to-frame flicker: relative deviation of the light over start times uniform in the cycle."""
     begins = (np.arange(4000) + 0.5) / 4000 * leds.period_s[which]
     got = np.array([light_s(leds, which, begin, exposure_s) for begin in begins])
     return float(got.std() / got.mean())

@@ -1,4 +1,4 @@
-"""What an LED sends: inverse square, Lambert's cosine, and its pulses against brute-force sampling."""
+"""Emission of LEDs: inverse-square law, Lambert's cosine, and pulses against brute-force sampling."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Optimized places against other layouts, at attitudes they were not made for; stars' LEDs in the chip's own band."""
+"""Optimized layouts against others at independent attitudes; stars' LEDs in the chip's band."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def lit(layout: dict) -> Sources:
 
 
 def spread(kind: str, count: int, cap_deg: float) -> Sources:
-    """As many LEDs of another layout; poisson_disk fills the cap, and those too many are left out."""
+    """The same number of LEDs of another layout; of poisson_disk, which fills the cap, the excess is left out."""
     if kind != "poisson_disk":
         return lit({"kind": kind, "count": count, "cap_deg": cap_deg})
     spacing_m = 1.22 * np.sqrt(0.66 * 2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count)
@@ -80,7 +80,7 @@ def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None
 
 
 def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) -> Floats:
-    """Of the estimator's own formula at random attitudes, in order: tr((sum J'J)^-1), by central differences."""
+    """Sorted variances at random attitudes: tr((sum J'J)^-1) with J by central differences."""
     rng = np.random.default_rng(77)
     tilt = np.arccos(1 - rng.random(count) * (1 - np.cos(np.radians(tilt_deg))))
     turns = rng.uniform(0, 7, (2, count))

@@ -1,4 +1,4 @@
-"""Magnitudes and candelas -> photo-electrons, against the reference's numbers, measured stars and closed forms."""
+"""Photo-electrons of magnitudes and candelas against the reference, measured stars and closed forms."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_a_thick_chip_is_redder_than_cmos_and_that_than_interline() -> None:
 
 
 def gaia_offset(v_i: float) -> float:
-    """G-V against that of a G2 star, by our black body."""
+    """G-V relative to that of a G2 star, by our black body."""
     band = Band(GAIA_G_NM * 1e-9, np.array(GAIA_G))
     return float(synthetic_mag(0.0, np.nan, v_i, band))
 
@@ -275,7 +275,7 @@ def test_the_eye_s_response_matches_the_cie_s() -> None:
 
 
 def pupil_sr() -> float:
-    """A 35 mm lens at f/8 seen from 33 in."""
+    """Solid angle of a 35 mm lens at f/8 from 33 in."""
     return float(np.pi / 4 * (0.035 / 8) ** 2 / (33 * 0.0254) ** 2)
 
 

@@ -201,7 +201,7 @@ def bounce(name: str, start: Floats, toward: Floats) -> tuple[Floats, Floats]:
 
 
 def miss(name: str, toward: Floats, led_m: Floats) -> Floats:
-    """(N,) distance at which reflected rays from the camera pass an LED in front of them."""
+    """(N,) miss distance of reflected rays from the camera to an LED ahead of them."""
     hit, along = bounce(name, CAMERA_M, toward)
     to_led = led_m - hit
     ahead = np.sum(to_led * along, axis=1)
@@ -209,7 +209,7 @@ def miss(name: str, toward: Floats, led_m: Floats) -> Floats:
 
 
 def brute_force(name: str, led_m: Floats) -> Floats:
-    """The directions in the field whose reflected rays pass through the LED, by ever finer searches."""
+    """Directions in the field whose reflected rays pass through the LED, by successively finer searches."""
     count = 241
     rays = grid(count=count)
     missed = miss(name, rays.reshape(-1, 3), led_m).reshape(count, count)

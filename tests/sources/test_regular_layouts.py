@@ -1,4 +1,4 @@
-"""Geodesic and tape layouts against counting, published chords and rulers laid on the surface."""
+"""Geodesic and tape layouts against counts, published chords and arc lengths on the surface."""
 
 from __future__ import annotations
 

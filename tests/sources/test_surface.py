@@ -1,4 +1,4 @@
-"""Surfaces against their own equations, rigid motion, differences and the measured dome; clouds against theory."""
+"""Surfaces against their equations, rigid motion, finite differences and the measured dome; clouds against theory."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def written(path: Path, points_m: np.ndarray, head: str = "# FARO arm\nx,y,z") -
 
 
 def off_equation(name: str, points_m: np.ndarray) -> np.ndarray:
-    """How far undisplaced points are from each kind's textbook equation; written out here once more."""
+    """Deviation of undisplaced points from each kind's textbook equation."""
     x, y, z = points_m.T / INCH_M
     off = {
         "sphere": np.hypot(np.hypot(x, y), z + 2) / 50 - 1,

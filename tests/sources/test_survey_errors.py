@@ -1,4 +1,4 @@
-"""What the tracker believes of its dome errs as its survey says: by chi-square, by geometry, bit for bit at zero."""
+"""Errors of the tracker's map follow its survey: by chi-square, by geometry, and exactly zero without errors."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def believing(**changes: str) -> tuple[DomeTracker, Lab]:
 
 
 def is_chi_square(normal: Floats) -> None:
-    """Whether independent numbers are standard normal, as far as their mean square can tell."""
+    """Whether the mean square of independent numbers is that of the standard normal law."""
     count = normal.size
     low, high = chi2.ppf([RARE / 2, 1 - RARE / 2], count)
     assert low < np.sum(normal**2) < high

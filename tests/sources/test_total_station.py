@@ -1,4 +1,4 @@
-"""A total station's errors: their covariance against Monte Carlo, and against what a ruler would say."""
+"""A total station's errors: their covariance against Monte Carlo and geometry."""
 
 from __future__ import annotations
 

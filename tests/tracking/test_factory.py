@@ -1,4 +1,4 @@
-"""What the vehicle believes of its attitude: the gyros added up, and every way in which that goes wrong."""
+"""Attitude knowledge of the vehicle: integration of the gyros, its errors, and the tracker's settings."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ NO_CONTROL = {
 
 
 def flown(until_s: float, **changes: str) -> Flight:
-    """SimSat, balanced and left alone unless the changes say otherwise."""
+    """A balanced SimSat without control, unless changed."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {until_s} s}}"}
     given = NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
     return simulate_motion(loader.load("afit_simsat", given))
 
 
 def telemetry_of(flight: Flight) -> Telemetry:
-    """Of a flight with an IMU."""
+    """Telemetry of a flight with an IMU."""
     telemetry = flight.telemetry()
     assert telemetry.lab_from_imu is not None
     return telemetry
 
 
 def error(telemetry: Telemetry) -> Floats:
-    """(K, 3) turn in lab axes from where the vehicle is to where the navigator has it, rad."""
+    """(K, 3) rotation in lab axes from the true attitude to the navigator's, rad."""
     assert telemetry.lab_from_imu is not None
     return (telemetry.lab_from_imu * telemetry.lab_from_body.inv()).as_rotvec()
 

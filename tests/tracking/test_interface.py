@@ -296,7 +296,7 @@ class Offset:
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with an entry point, as pip would leave it."""
+    """An installed package with an entry point, as pip makes it."""
     (tmp_path / "offset.py").write_text(OFFSET)
     about = tmp_path / "offset-1.0.dist-info"
     about.mkdir()
@@ -423,7 +423,7 @@ def commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page's files, its package as pip would leave it, and a `python` that is this one."""
+    """Folder with the page's files, its package as installed by pip, and this `python`."""
     folder = tmp_path_factory.mktemp("page")
     for block in blocks("python"):
         (folder / re.match(r"# (\w+\.py)\n", block)[1]).write_text(block)
@@ -504,7 +504,7 @@ def of_lost(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
 
 
 def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
-    """Its Attitude::Rotate and Camera::SpatialToCamera: where a star falls, from the upper left corner."""
+    """LOST's Attitude::Rotate and Camera::SpatialToCamera: pixel of a star from the upper left corner."""
     _, x, y, z = multiplied(
         multiplied(quaternion, np.array([0, *star])), quaternion * [1, -1, -1, -1]
     )

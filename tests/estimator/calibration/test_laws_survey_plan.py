@@ -1,4 +1,4 @@
-"""Laws of the survey's plan and of its faults."""
+"""Laws of the survey's plan and of the detection of faults."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ CLOSE_M = 0.004
 def close_group(
     rng: np.random.Generator, levels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, LightTable]:
-    """List, places, covariance and light of four LEDs in a row, and 56 far from one another, of these levels."""
+    """List, places, covariance and light of four LEDs in a row and of 56 distant ones with these levels."""
     place_m = 10 * rng.normal(0, 1, (60, 3))
     place_m[:4] = place_m[0] + CLOSE_M * np.arange(4)[:, None] * [1.0, 0.0, 0.0]
     listed = place_m + LIST_M * rng.normal(0, 1, place_m.shape)

@@ -34,7 +34,7 @@ FOCAL_ERROR = 0.01
 
 
 def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
-    """A dome as it is, and the attitudes of its plan."""
+    """A true dome and the attitudes of its plan."""
     true = model(count)
     candidates = attitudes(np.random.default_rng(1), 300)
     rows = survey_plan.choose(true, candidates, true.visible(candidates), frames)
@@ -49,11 +49,11 @@ def simulated(
     uses_assumed: bool = False,
     change: Callable[[DomeFrame], DomeFrame] | None = None,
 ) -> DomeSurvey:
-    """A survey of noisy pixels with a list, a lever, a lens and start attitudes that are off.
+    """A survey of noisy pixels with errors of list, lever, lens and initial attitudes.
 
-    sigma_factor : by which the noise is smaller than it is believed
+    sigma_factor : factor by which the noise is smaller than assumed
     uses_assumed : whether lever and focal length are measurements; the focal length then errs at random, else by 1 %
-    change       : of each frame, which the survey then tolerates by a robust loss
+    change       : applied to each frame; the survey then uses a robust loss
     """
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):

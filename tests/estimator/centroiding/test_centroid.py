@@ -1,4 +1,4 @@
-"""Centroids: against our own rendering by erf, and the Cramér-Rao bound from its numerical derivatives."""
+"""Centroids against images by erf and against the Cramér-Rao bound from their numerical derivatives."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ CELLS = 12
 def gaussian(
     shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA_PX
 ) -> np.ndarray:
-    """Light of a Gaussian integrated over each pixel, whose middle is the integer."""
+    """Light of a Gaussian integrated over each pixel; pixel centers are integers."""
 
     def share(count: int, at: float) -> np.ndarray:
         return np.diff(erf((np.arange(count + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
@@ -31,7 +31,7 @@ def gaussian(
 
 
 def disk(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
-    """A uniform disk: 200 chords a row of pixels, each cut exactly into pixels."""
+    """A uniform disk from 200 chords per row of pixels, each divided exactly among pixels."""
     chords = np.add.outer(np.arange(shape[0]), (np.arange(200) + 0.5) / 200 - 0.5).ravel()
     half = np.sqrt(np.maximum(radius**2 - (chords - y) ** 2, 0))[:, None]
     edges = np.arange(shape[1] + 1) - 0.5

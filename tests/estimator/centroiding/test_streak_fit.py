@@ -1,4 +1,4 @@
-"""Smeared stars: found by a line filter, placed by a line fit, against frames drawn here and the Cramér-Rao bound."""
+"""Smeared stars: line filter and line fit against independently drawn frames and the Cramér-Rao bound."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def smeared(
     flux: float,
     sigma: float = SIGMA_PX,
 ) -> np.ndarray:
-    """A Gaussian integrated over each pixel, on its way from end to end in 80 steps."""
+    """A moving Gaussian integrated over each pixel in 80 steps from end to end."""
 
     def share(count: int, at: np.ndarray) -> np.ndarray:
         return (
@@ -58,7 +58,7 @@ def nearest(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def near(found: np.ndarray, wanted: np.ndarray) -> int:
-    """How many places have a blob within 2 px."""
+    """Number of places with a blob within 2 px."""
     return int((np.linalg.norm(found[None] - wanted[:, None], axis=2).min(axis=1) < 2).sum())
 
 

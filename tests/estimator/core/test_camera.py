@@ -1,4 +1,4 @@
-"""The believed calibration: against numbers worked by hand and OpenCV's Brown-Conrady."""
+"""The camera model against hand calculations and OpenCV's Brown-Conrady distortion."""
 
 import cv2
 import numpy as np

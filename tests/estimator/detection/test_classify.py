@@ -1,4 +1,4 @@
-"""Star or not: what the flags of a blob say, on frames drawn here."""
+"""Classification of blobs by flags, on independently drawn frames."""
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ def star(
 
 
 def sky_frame(rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE):
-    """Light of some stars of 4,000 to 40,000 electrons on a lattice, and where they are."""
+    """Light of stars of 4,000 to 40,000 electrons on a lattice, and their positions."""
     step = 80
     lattice = [
         (x, y) for y in range(60, shape[0] - 40, step) for x in range(60, shape[1] - 40, step)
@@ -162,7 +162,7 @@ def test_smeared_stars_are_no_tracks_and_give_the_frame_s_streak() -> None:
 def smeared_frame(
     rng: np.random.Generator, streak: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of 15 streaks, drawn in steps of less than half a pixel, and where their middles are."""
+    """A frame of 15 streaks, drawn in steps below half a pixel, and their centers."""
     steps = 4 * int(np.hypot(*streak)) + 1
     light = np.zeros(SHAPE)
     xy = sky_frame(rng, 15, 0.7)[1]
@@ -200,7 +200,7 @@ def test_a_hot_pixel_in_a_smeared_frame_is_not_taken_for_a_star() -> None:
 
 
 def rolled_frame(seed: int, turn_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of 15 stars while the camera turns by this (3,) about its axes, and their places at mid-exposure."""
+    """A frame of 15 stars while the camera rotates by this (3,) vector, and their positions at mid-exposure."""
     rng = np.random.default_rng(seed)
     light = np.zeros(SHAPE)
     xy = sky_frame(rng, 15, 0.7)[1]

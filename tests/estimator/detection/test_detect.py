@@ -1,4 +1,4 @@
-"""Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, refusals word by word."""
+"""Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, texts of refusals."""
 
 from dataclasses import replace
 

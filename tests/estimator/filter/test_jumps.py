@@ -1,4 +1,4 @@
-"""Jumps: what the gyros could have missed against solutions that are wrong and agree."""
+"""Jumps: missed rotation against wrong solutions that agree with each other."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Vehicle:
     def update(
         self, attitude: Rotation, turn: np.ndarray | None = None, saturated: slice = slice(0)
     ) -> Update:
-        """One second on: the turn (100, 3) that the gyro measures, and a solution of the attitude."""
+        """Advance one second with gyro increments (100, 3) and a solution of the attitude."""
         t_s = self.second + np.arange(1, 101) / 100
         flags = np.zeros(100, bool)
         flags[saturated] = True
@@ -66,7 +66,7 @@ class Vehicle:
 
 
 def statuses(updates: list[Update]) -> list[tuple[str, int]]:
-    """Each status with the number of times that it follows itself."""
+    """Each status with its number of successive repetitions."""
     return [
         (status, len(list(group))) for status, group in groupby(update.status for update in updates)
     ]
@@ -138,7 +138,7 @@ def test_a_wrong_first_answer_is_abandoned_once_outnumbered_by_right_ones(wrong:
 
 
 def knock(rate_rad_s: float, samples: int) -> tuple[np.ndarray, Rotation]:
-    """(100, 3) a turn about x as a gyro with a limit measures it, and the attitude after it."""
+    """(100, 3) increments of a limited gyro in a rotation about x, and the attitude after it."""
     rate = np.zeros((100, 3))
     rate[40 : 40 + samples, 0] = rate_rad_s
     after = Rotation.from_rotvec([-rate_rad_s * samples / 100, 0, 0])

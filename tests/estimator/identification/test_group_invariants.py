@@ -1,4 +1,4 @@
-"""Invariants of groups of lights, of `benchmarks.dome_invariants`: which transforms leave them alone."""
+"""Invariants of groups of lights, of `benchmarks.dome_invariants`: which transforms do not change them."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ ERROR_M = 0.2e-3
 
 
 def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0) -> LedMap:
-    """So many LEDs on a surface, anywhere but never near one another."""
+    """This number of LEDs at random places on a surface with a minimum distance."""
     rng = np.random.default_rng(seed)
     z = 1 - rng.random(40 * count) * (1 - np.cos(np.radians(cap_deg)))
     azimuth = rng.uniform(0, 2 * np.pi, len(z))
@@ -54,7 +54,7 @@ def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float
 
 
 def surveyed(leds: LedMap, seed: int) -> LedMap:
-    """The map in the tracker's head: every LED out of place by ERROR_M along each axis."""
+    """The tracker's map: every LED is displaced by ERROR_M along each axis."""
     error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
     return LedMap(
         leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M
@@ -62,7 +62,7 @@ def surveyed(leds: LedMap, seed: int) -> LedMap:
 
 
 def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
-    """body_from_lab: any yaw, tilts to tilt_deg."""
+    """Random body_from_lab with any yaw and tilts up to tilt_deg."""
     tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(tilt_deg))))
     about, yaw = rng.uniform(0, 2 * np.pi, 2)
     tilt_rotation = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0]))
@@ -76,7 +76,7 @@ def lights(
     dead: float = 0.0,
     false: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Pixels in any order, and which LED each is; -1 for a reflection."""
+    """Pixels in random order and the LED of each; -1 for a reflection."""
     xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
     seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9), 12))
     seen = seen[rng.random(len(seen)) >= dead]
@@ -92,7 +92,7 @@ def identified(pixels: Floats, dome: DomeIndex) -> StarMatch | str:
 
 
 def names_right(match: StarMatch, names: Floats) -> bool:
-    """A reflection beside a dead LED may pass for it; no light may bear another LED's name."""
+    """Whether no light has another LED's name; a reflection beside a dead LED may have its name."""
     named = names[match.observed]
     return bool(np.all((named == match.star) | (named < 0)) and np.any(named >= 0))
 
@@ -181,7 +181,7 @@ def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
 
 
 def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
-    """Patch boards of 3x3 LEDs around the apex, one at each azimuth, all alike; and perhaps one LED more."""
+    """Equal patch boards of 3x3 LEDs around the apex, one per azimuth, with an optional single LED."""
     lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
     places = [
         Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
@@ -473,7 +473,7 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
 
 
 def uncalibrated(leds: LedMap, ratio: float) -> DomeTracker:
-    """A tracker that assumes a focal length `ratio` times too short, and knows no better."""
+    """A tracker whose assumed focal length is `ratio` times too short, with no uncertainty."""
     settings = Settings(
         identifier="non_dimensional", solver="rotation_only", centroid_sigma_px=NOISE_PX
     )

@@ -281,7 +281,7 @@ def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
 def crossing_area_sr(
     center: Floats, rings: list[tuple[Floats, float]], step: float = 2e-5
 ) -> float:
-    """Area where rings about stars cross: each of directions as far from its star as `center`, to a half-width."""
+    """Area of the intersection of rings about stars, each with the radius of `center` and a half-width."""
     steps = np.arange(-150, 151) * step
     across, down = np.linalg.svd(center[None])[2][1:]
     places = center + steps[:, None, None] * across + steps[:, None] * down

@@ -187,7 +187,7 @@ def test_the_covariance_matches_the_scatter(zoom: float) -> None:
 
 
 def zoom_sigma(truth: Rotation, row, zoom: float) -> float:
-    """Of log zoom where the attitude is unknown too: least squares with slopes by differences."""
+    """Standard deviation of log zoom with unknown attitude: least squares with numerical derivatives."""
 
     def model(p):
         x, y, z = (Rotation.from_rotvec(p[:3]) * truth).apply(VECTORS[row]).T

@@ -1,4 +1,4 @@
-"""Whatever array comes in: an answer or one line, and no attitude from what is no sky."""
+"""Any array gives an answer or one error line, and images without a sky give no attitude."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of the tracker of coded LEDs: names are right or refused, at rest and turning, with failed bits."""
+"""Laws of the tracker of coded LEDs: names are right or refused, at rest and rotating, with failed bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Double stars do not pull the attitude, and the covariance knows of them."""
+"""Double stars do not bias the attitude, and the covariance includes them."""
 
 from __future__ import annotations
 

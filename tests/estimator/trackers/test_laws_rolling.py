@@ -1,4 +1,4 @@
-"""Laws of the trackers under a rolling shutter: stars and LEDs, with a gyro, with streaks, with neither."""
+"""Laws of the trackers under a rolling shutter: stars and LEDs, with a gyro, with streaks, and without both."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tracker() -> StarTracker:
 def star_frame(
     tracker: StarTracker, seed: int, rate_deg_s: Floats = RATE_DEG_S
 ) -> tuple[Moving, Centroids]:
-    """A field of the catalog before a turning camera, and its exact centroids."""
+    """A catalog field before a rotating camera and its exact centroids."""
     truth = Rotation.random(rng=np.random.default_rng(seed))
     _, xy_px = tracker.field_matcher.in_field(WIDE, truth)
     xy_px = xy_px[WIDE.contains(xy_px, 120.0)]

@@ -46,7 +46,7 @@ RAYS = arrays("f8", some.tuples(some.integers(0, 12), some.just(3)), elements=AN
 
 
 class World:
-    """A sky with its index, and what a camera sees of it."""
+    """A sky with its index, and a camera's observations of it."""
 
     def __init__(self, rng: np.random.Generator, count: int = 800) -> None:
         self.vectors = units(rng, count)
@@ -213,7 +213,7 @@ def eye() -> StarTracker:
 def seen_by(
     eye: StarTracker, rng: np.random.Generator, truth: Rotation
 ) -> tuple[Centroids, NDArray]:
-    """The field's stars, brightest first, each a tenth of a pixel off, and their rows."""
+    """The field's stars, brightest first, with errors of a tenth of a pixel, and their rows."""
     rows, xy = eye.field_matcher.in_field(CAMERA, truth)
     inside = CAMERA.contains(xy, 2)
     rows = rows[inside]

@@ -1,4 +1,4 @@
-"""The sequence of stages: fed with true centroids, with rendered frames, and with what must be refused."""
+"""The sequence of stages with true centroids, rendered frames, and input to be refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def tracker() -> StarTracker:
 
 @pytest.fixture(scope="module")
 def uncertain() -> StarTracker:
-    """One that knows its focal length to 5 % only, and believes it 3 % too long."""
+    """A tracker with a focal length assumed 3 % too long and uncertain to 5 %."""
     stars = catalog.read(FILE)
     believed = CAMERA.zoomed(1.03)
     return StarTracker(believed, stars, catalog.apparent(stars, OBSERVER), focal_uncertainty=0.05)
@@ -42,7 +42,7 @@ def uncertain() -> StarTracker:
 def starfield(
     tracker: StarTracker, rng: np.random.Generator, lens: Camera, limit_mag: float = 6.0
 ) -> tuple[Rotation, Floats, Floats]:
-    """A random attitude, the pixels of the stars to a magnitude, brightest first, and their light."""
+    """A random attitude, and pixels and light of the stars to a magnitude, brightest first."""
     truth = Rotation.random(rng=rng)
     bright = catalog.brighter_than(tracker.stars, limit_mag)
     pixels = np.nan_to_num(lens.pixels(truth.apply(bright.vectors)), nan=-1e9)
@@ -319,7 +319,7 @@ SHAPES = {
 
 
 def dome(shape: str, count: int = 2500) -> LedMap:
-    """Random LEDs on the roof of a dome, 40 degrees about the vertical, none nearer than 5 mm to another."""
+    """Random LEDs within 40 deg of the dome's apex, at least 5 mm apart."""
     rng = np.random.default_rng(94)
     z = rng.uniform(np.cos(np.radians(40)), 1, count)
     around = rng.uniform(0, 2 * np.pi, count)

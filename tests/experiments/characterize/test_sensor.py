@@ -1,4 +1,4 @@
-"""A sensor from darks and flats: each estimator against a law written anew here, all against simulated chips."""
+"""A sensor from darks and flats: each estimator against an independent law, all against simulated chips."""
 
 from __future__ import annotations
 

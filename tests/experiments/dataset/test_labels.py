@@ -1,4 +1,4 @@
-"""Labels of a frame against the sky's own laws, and masks against frames without what they mask."""
+"""Labels of a frame against independent laws, and masks against frames without the masked effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of a dataset: what they hold, and that they are the same on any engine, also after a kill."""
+"""The files of a dataset: contents, and equality on any engine and after a kill."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def vary(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(vary: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of five frames that one process made undisturbed."""
+    """A dataset of five frames made by one uninterrupted process."""
     folder = tmp_path_factory.mktemp("whole") / "frames"
     progress = dataset_run.run(small(vary), str(folder), engines.Serial())
     assert (progress.done, progress.failed) == (5, 0)

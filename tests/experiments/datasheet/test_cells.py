@@ -1,4 +1,4 @@
-"""The cells of a datasheet: what each draws anew, and scenes that have none."""
+"""The cells of a datasheet: what each redraws, and scenes without cells."""
 
 from __future__ import annotations
 

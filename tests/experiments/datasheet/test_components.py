@@ -1,4 +1,4 @@
-"""Variance components: terms of known size come back, and their sum is the total."""
+"""Variance components: terms of known size are recovered, and their sum is the total."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error model: its processes follow their law, draws and steps agree, the module stands alone, the unit runs."""
+"""The error model: laws of its processes, agreement of draws and steps, independence of skysim, and the FMU."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
 
 
 def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:
-    """The state after a turn."""
+    """The state after a rotation."""
     new = []
     for name in ("field", "pixel", "scale"):
         left = np.exp(-step_deg / model.constants[f"{name}_deg"])

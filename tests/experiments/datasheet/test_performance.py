@@ -1,4 +1,4 @@
-"""Probabilities with exact bounds, runs that a claim needs, and limits."""
+"""Probabilities with exact bounds, the number of runs for a claim, and limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A survey from images on disk: of a dome that differs from its list, with faults; and what is refused."""
+"""A survey from images on disk of a dome that differs from its list, with faults; and refusals."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ tracker: {{min_area_px: 9{lever}}}
 
 
 def command(*words: object) -> tuple[int, str, str]:
-    """Exit code, what was printed, and what was complained of."""
+    """Exit code, standard output and error output."""
     out = std_io.StringIO()
     err = std_io.StringIO()
     argv = sys.argv
@@ -78,7 +78,7 @@ def write_leds(path: Path, ids: list[int], place_m: Floats, level: Floats) -> No
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`design.yaml` as the lab believes the dome, and `built.yaml` as it is."""
+    """`design.yaml` with the assumed dome, and `built.yaml` with the true one."""
     made = tmp_path_factory.mktemp("dome")
     text = (
         "schema: 1\nbase: afit_simsat_ideal\ntitle: places\nlight:\n"

@@ -1,4 +1,4 @@
-"""`skysim reproduce`: the verdict's law, the published data, the command, the pages; and every experiment, quickly."""
+"""`skysim reproduce`: verdicts, published data, the command, the pages, and shortened runs of every experiment."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_every_published_row_has_one_answer() -> None:
 def covered(
     interval: Callable[[np.ndarray], Summary], target: Callable[[np.random.Generator], float]
 ) -> float:
-    """How often the interval of four normal draws, of mean 3 and deviation 2, holds what it is of."""
+    """Coverage of the interval of four normal draws of mean 3 and standard deviation 2."""
     hits = 0
     for n in range(TRIED):
         rng = np.random.default_rng([7, n])
@@ -267,7 +267,7 @@ def parts() -> dict[str, list[list[str]]]:
 
 
 def read_summary(text: str) -> Summary:
-    """A number and its interval as the page has them."""
+    """A number and its interval, read from the page."""
     found = SUMMARY_PATTERN.search(text)
     assert found is not None, text
     value, low, high = (float(one) if one else float(found[1]) for one in found.groups())
@@ -275,7 +275,7 @@ def read_summary(text: str) -> Summary:
 
 
 def eased(ours: Summary, share: float) -> Summary:
-    """The interval wider by a share of the number, or narrower: the page rounds to four digits."""
+    """The interval widened (or narrowed) by a share of the number, as the page rounds to four digits."""
     by = share * abs(ours.value)
     return ours._replace(low=ours.low - by, high=ours.high + by)
 

@@ -1,4 +1,4 @@
-"""PTASE's experiments: the paper's error measures, its Earth and its roll, against theory and SOFA's arithmetic."""
+"""PTASE's experiments: error measures, Earth rotation and roll against theory and SOFA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SHEFEX-2's experiments: their tools against geometry, counting and theory."""
+"""Tools of SHEFEX-2's experiments against geometry, counting and theory."""
 
 from __future__ import annotations
 

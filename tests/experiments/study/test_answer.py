@@ -1,4 +1,4 @@
-"""The answers of a study in words, and what its report begins with."""
+"""The answers of a study in words, and the start of its report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clusters as the page describes them: the job of SLURM and the pods of Kubernetes, run here without either."""
+"""The page's SLURM job and Kubernetes pods, run here without either."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SMALL = ("replicates: 150", "replicates: 20")
 
 
 def block(begin: str) -> str:
-    """The code block of the page that begins so."""
+    """The page's code block that starts with this text."""
     (found,) = re.findall(rf"```\w+\n({re.escape(begin)}.*?)```", PAGE, re.S)
     return str(found)
 
@@ -50,7 +50,7 @@ def serial_contents(plan_: plan.Plan, tmp_path_factory: pytest.TempPathFactory) 
 
 @contextmanager
 def processes(*commands: list[str], **options: Any) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Commands that run meanwhile, in an environment without this one's numbers of threads."""
+    """Commands that run in the background, without this environment's thread limits."""
     environment = {
         key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD
     }
@@ -183,7 +183,7 @@ class Replies:
         self.replies = replies
 
     def wait_for_workers(self, *_: Any) -> None:
-        """They are there."""
+        """Return at once: the workers are present."""
 
     def run(self, *_: Any, **__: Any) -> dict[str, Any]:
         return self.replies

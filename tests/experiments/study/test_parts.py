@@ -1,4 +1,4 @@
-"""Rows beyond a million: in Parquet parts and SQLite together they are the same table, whenever a run is killed."""
+"""Rows beyond a million: Parquet parts and SQLite together are one table, also after a kill at any time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
-    """A row with a number, or none, in every column, and directions all over the sky."""
+    """A row with a number or no value in every column, and directions over the whole sky."""
     point, replicate = divmod(trial, each)
     rng = np.random.default_rng([point, replicate])
     if failed:
@@ -251,7 +251,7 @@ def test_tables_and_worst_trials_do_not_depend_on_parts(both: tuple[Path, Path])
 
 
 class Killer:
-    """Ends this process by SIGKILL in the step of a move that is named."""
+    """Kill this process by SIGKILL in the named step of a move."""
 
     def __init__(self, step: str) -> None:
         self.step = step
@@ -296,7 +296,7 @@ def die_in_step(path: Path, step: str) -> None:
 
 
 def forked(does: Callable[[], object]) -> int:
-    """The status of a process of its own that does something."""
+    """Exit status of a forked process that calls a function."""
     pid = os.fork()
     if pid == 0:
         try:

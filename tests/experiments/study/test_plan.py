@@ -1,4 +1,4 @@
-"""A study file: what it may say, what is refused before the first trial, and the studies that come with skysim."""
+"""Study files: allowed contents, refusals before the first trial, and the shipped studies."""
 
 import pytest
 

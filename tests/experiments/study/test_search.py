@@ -1,4 +1,4 @@
-"""The search of studies: what it finds where the answer is known, and that a kill changes nothing in its store."""
+"""The search of studies: known optima are found, and a kill does not change its store."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ class Law:
 
 
 def angle(arcsec: float, solved: bool = True) -> Outcome:
-    """A trial with that error about the boresight."""
+    """A trial with this error about the boresight."""
     return Outcome("solved", 1, 1, 0, 0.0, 0.0, arcsec) if solved else Outcome("none", 1)
 
 
 def bowl(settings: Settings) -> Outcome:
-    """Least, 1, at x = 0.7, y = 0.2."""
+    """An error whose minimum is 1 at x = 0.7, y = 0.2."""
     x = settings["trial.noise_px"]
     y = settings["trial.magnitude_sigma"]
     return angle(1 + (x - 0.7) ** 2 + (y - 0.2) ** 2)
@@ -95,7 +95,7 @@ def bowl(settings: Settings) -> Outcome:
 
 @pytest.fixture(autouse=True)
 def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A law has no scene, whose hash a run that goes on would compare."""
+    """Disable the check of the scene's hash on resume, as a law has no scene."""
     monkeypatch.setattr(runner, "check_scene", lambda *_: None)
 
 
@@ -256,11 +256,11 @@ def test_a_search_ends_at_its_limit_of_time(tmp_path: Path) -> None:
 
 
 class Killed(Exception):
-    """In the middle."""
+    """A kill during a search."""
 
 
 def killer(after: int) -> Callable[[Any], None]:
-    """A watch that raises at its nth call."""
+    """A callback that raises at its nth call."""
     calls = itertools.count(1)
 
     def watch(progress: runner.Progress) -> None:
@@ -271,7 +271,7 @@ def killer(after: int) -> Callable[[Any], None]:
 
 
 def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
-    """Kill a search at every nth batch until it ends by itself; how often it was."""
+    """Kill a search at every nth batch until it ends normally; return the number of kills."""
     for kills in itertools.count():
         try:
             searched(study_plan, out, engine, killer(every))

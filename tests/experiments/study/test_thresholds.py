@@ -1,4 +1,4 @@
-"""Where a proportion crosses a limit: against curves that are known, and how often the interval holds the truth."""
+"""Where a proportion crosses a limit: against known curves, and coverage of the interval."""
 
 from __future__ import annotations
 

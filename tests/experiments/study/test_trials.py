@@ -1,4 +1,4 @@
-"""One trial: of its own seed alone, with the physics that the frames have."""
+"""A trial depends on its seed alone and has the physics of rendered frames."""
 
 import math
 from dataclasses import replace
