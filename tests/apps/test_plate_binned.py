@@ -52,7 +52,7 @@ def test_a_defocused_image_is_solved_binned_and_reported_as_such(
 
 
 def test_centroids_of_a_binned_image_are_in_its_full_resolution_pixels() -> None:
-    """Centers of disks to a small part of a disk, for both parities of the squares' corner."""
+    """Centers of disks are accurate to a small part of a disk for both parities of the blocks' corner."""
     rng = np.random.default_rng(2)
     image = np.zeros((1700, 2100), np.uint8)
     places = np.array([(x, y) for x in (200, 700, 1200, 1703) for y in (201, 702, 1203)])
@@ -82,7 +82,7 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
 def test_a_binned_image_needs_more_evidence(
     monkeypatch: pytest.MonkeyPatch, blurred: NDArray
 ) -> None:
-    """No chance of a false match is added: a thousand times less than by the picture itself."""
+    """Required chance probability: a thousand times less than for the full image, so none is added."""
     tries = []
 
     def never(pixels: NDArray, solver: plate_solver.Solver, *_: object) -> tuple[Report, None]:

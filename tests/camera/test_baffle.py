@@ -163,7 +163,7 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
 
 @pytest.mark.slow
 def test_stray_light_follows_orbit_and_date() -> None:
-    """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
+    """The Sun gives none behind the Earth; the Earth's light is strongest over the day side; both depend on season."""
     lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
     around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
     assert 0.55 < np.mean(["the Sun" in one for one in around]) < 1

@@ -169,7 +169,7 @@ def test_the_moon_eclipses_the_sun() -> None:
 
 
 def test_a_star_behind_the_moon_is_hidden() -> None:
-    """Within its radius of 0.26 degrees, and by the vehicle's parts as before."""
+    """Stars within its radius of 0.26 deg are hidden, in addition to those behind vehicle parts."""
     moon = light("moon")
     stars = points_of(moon, np.array([[0.0, 0.0], [0.7, 0.7], [0.0, 1.01]]))
     hidden = drawing.behind([moon], None)
@@ -182,7 +182,7 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
 
 
 def test_a_disc_does_not_darken_the_surrounding_pixels() -> None:
-    """Rounding of the transforms is far below zero beside a bright disc; sums of such pixels alone were negative."""
+    """Rounding of Fourier transforms beside a bright disc must not make sums of pixels negative."""
     light = np.zeros((40, 40))
     patches = np.zeros((2, 2, 9, 9))
     light[10:30, 10:30] = 1e12

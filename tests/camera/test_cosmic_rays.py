@@ -32,7 +32,7 @@ def many(count: int = 100_000, **part: object) -> np.ndarray:
 
 
 def test_the_count_is_flux_times_area_times_time() -> None:
-    """What goes in within the frame is Poisson: mean and variance of 400 exposures."""
+    """Entries within the frame are Poisson: mean and variance of 400 exposures."""
     rng = np.random.default_rng(2)
     counts = []
     for _ in range(400):
@@ -109,7 +109,7 @@ def test_every_electron_of_a_track_within_the_frame_is_in_it(
 
 @pytest.mark.slow
 def test_charge_is_spread_evenly_along_the_track() -> None:
-    """Sum over rows of a level track: 10 electrons a pixel of way, half in the end pixels; rows are a Gaussian."""
+    """Sum over rows of a level track: 10 electrons per pixel of path, half in the end pixels; the cross profile is Gaussian."""
     image = np.zeros((41, 141))
     deposit(image, np.array([[20.0, 20.0, 120.0, 20.0]]), np.array([1000.0]), 0.5)
     columns = image.sum(axis=0)

@@ -411,7 +411,7 @@ def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None
 
 
 def test_row_by_row_simulation_equals_step_by_step_simulation() -> None:
-    """A threshold of blooming that nothing reaches sends the frame the longer way."""
+    """An unreachable blooming threshold selects the step-by-step code."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
     spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
     short, long = (

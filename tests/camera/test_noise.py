@@ -96,7 +96,7 @@ def test_the_least_uniform_numbers_have_the_law_s_tail() -> None:
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 8, 9, 31, 33])
 def test_rows_of_any_width_are_normally_distributed(width: int) -> None:
-    """Also the last pixel of an odd row, and where small and large means are side by side."""
+    """This includes the last pixel of an odd row, and adjacent small and large means."""
     memory = noise.scratch(width)
     seeds = noise.seeds(np.random.default_rng(width), 4000)
     normals = np.empty((4000, width), np.float32)
@@ -127,7 +127,7 @@ def test_noise_of_neighbors_and_rows_is_independent() -> None:
 
 
 def test_counts_and_the_numbers_that_follow_are_independent() -> None:
-    """A bright pixel must not tell the next one's fortune, though both come of one stream."""
+    """A bright pixel must be independent of the next one, though both use one random stream."""
     for mean in (0.3, 5.0, 50.0):
         made = drawn_counts(mean, seed=9)
         r = np.corrcoef(made[:, 1:].ravel(), made[:, :-1].ravel())[0, 1]

@@ -79,7 +79,7 @@ DEEP = {
 
 @pytest.mark.slow
 def test_reflections_are_in_the_frame_and_its_truth() -> None:
-    """A deep dome: what the wall mirrors is drawn where its truth says, and nothing else changes."""
+    """In a deep dome reflections are drawn at their true positions, and nothing else changes."""
     black, _ = frame(
         "apl_dome", {key: value for key, value in DEEP.items() if key != "light.reflection"}
     )

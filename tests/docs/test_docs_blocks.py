@@ -179,7 +179,7 @@ def shape(line: str) -> str:
 
 @pytest.mark.parametrize("path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_every_block_states_its_language(path: Path) -> None:
-    """So that what is not run is seen to be: a `text` block, never an unknown language."""
+    """Blocks that are not run are `text` blocks; unknown languages are refused."""
     assert [block for block in blocks(path) if block.language not in LANGUAGES] == []
     assert path.read_text(encoding="utf-8").count("```") == 2 * len(blocks(path)) + 0
 
@@ -239,7 +239,7 @@ def test_every_name_in_the_reference_is_a_module() -> None:
 
 
 def test_the_reference_holds_every_module_that_a_page_names() -> None:
-    """What a reader imports or is sent to; the browser's lab and the papers apart, which are no library."""
+    """Modules that a reader imports or is referred to, except the browser lab and the papers."""
     text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
     files = re.findall(r"(?<!tests/)\b((?:skysim|estimator)/[\w/]+)\.py", text)
     for package, name in re.findall(

@@ -63,7 +63,7 @@ def test_every_command_that_help_names_has_its_section() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_has_the_options_that_help_shows(name: str) -> None:
-    """And each of them, and every argument, with a word on what it is for."""
+    """Each option and argument has a description."""
     starts = re.findall(r"^│[ *]+((?:--[a-z0-9-]+ +)+)", helped(*name.split()), re.MULTILINE)
     shown = {option for start in starts for option in start.split()}
     rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", SECTIONS[name], re.MULTILINE))
@@ -180,7 +180,7 @@ def test_every_make_target_named_by_a_page_exists() -> None:
 
 @pytest.mark.parametrize("name", ["run", "weekly"])
 def test_every_make_target_of_ci_exists(name: str) -> None:
-    """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
+    """The scripts parse in bash and are executable; CONTRIBUTING names them and the parts of the weekly one."""
     script = ROOT / ".ci" / name
     subprocess.run(["bash", "-n", script], check=True)
     assert os.access(script, os.X_OK)

@@ -122,7 +122,7 @@ def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelSet:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 4])
 def test_wheels_turn_the_body_and_take_its_momentum(n):
-    """From rest nothing is stored but what they take: rate = BUS^-1 T t, and all of it comes back to zero."""
+    """From rest rate = BUS^-1 T t, and the total momentum stays zero."""
     set_ = wheels(n)
     torque = np.array([0.05, -0.08, 0.03])
     body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL)
@@ -413,7 +413,7 @@ def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
 
 @pytest.mark.slow
 def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturation():
-    """The whole 2 + 2 c = 3.155 instead of 1.155, at bounded rates, for a stray momentum of a few per cent."""
+    """It reaches 2 + 2 c = 3.155 instead of 1.155 at bounded rates with a few percent of cross momentum."""
     momentum, rates, angles = pushed_along_x(pyramid_set("singularity_robust"), 60)
     full = 2 + 2 * SLANT
     assert 0.999 * full < momentum[-1, 0] <= full

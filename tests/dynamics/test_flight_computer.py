@@ -124,7 +124,7 @@ def test_the_body_gets_the_commanded_torque(name: str, within: float) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
-    """With all that is wanted within the limits, the controller hears that it got it."""
+    """If the command is within the limits, the controller is told the full torque as delivered."""
     flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
     flight_computer.law = law  # type: ignore[assignment]
@@ -136,7 +136,7 @@ def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_anti_windup_uses_the_actuator_limits(name: str) -> None:
-    """Turning at 0.5 rad/s: far more is wanted about x than any set can give, and the integral stands still.
+    """At 0.5 rad/s the command about x exceeds the limit of every set, and the integral is frozen.
 
     Ideal torques have a limit for each axis, the other sets one for all, beyond which the direction is kept.
     """

@@ -405,7 +405,7 @@ def test_reference_holds_after_its_end_and_without_a_maneuver(tour: Reference) -
 
 
 def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
-    """Whatever those are called: with the ICRS for lab, the angles are still counted from the start."""
+    """This holds also if the reference is the ICRS: angles are counted from the start."""
     motion = motion_config(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
     lab_from_start = Rotation.from_rotvec([0.4, -1.0, 2.0])
     own = plan(motion)
@@ -425,7 +425,7 @@ def test_the_start_of_a_vehicle_in_the_lab_does_not_move_its_targets() -> None:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_the_reference_returns_new_unit_quaternions(name: str) -> None:
-    """A caller that writes into what it was given does not change what the next one is given."""
+    """Writing into a returned array does not change later results."""
     ref = reference(*EVERY[name])
     for t in np.linspace(0, ref.duration_s + 1, 9):
         state = ref.state_at(t)
@@ -439,7 +439,7 @@ def test_the_reference_returns_new_unit_quaternions(name: str) -> None:
 
 
 def test_the_reference_is_fast_enough_for_every_control_tick() -> None:
-    """12 us; the best of some, for the machine has other things to do."""
+    """12 us expected; the fastest of several runs is compared, as the machine may be busy."""
     for name in EVERY:
         ref = reference(*EVERY[name])
         t = ref.start_s[-2] + 0.3 * (ref.duration_s - ref.start_s[-2])

@@ -127,7 +127,7 @@ def test_a_beam_in_the_lab_does_not_rotate_with_the_vehicle(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_an_unobstructed_frame_is_unchanged_bit_for_bit(tmp_path: Path) -> None:
-    """With the switch on and off; and switched off a mast is as good as none."""
+    """With occlusion on and off; switched off, a mast has no effect."""
     on, off = (
         picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false")
     )

@@ -83,9 +83,9 @@ def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
 
 @pytest.mark.long
 def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
-    """The issue's bar, 1e-8 N m s. Whatever the motors do between the vehicle's parts, the whole keeps its own.
+    """To 1e-8 N m s: torques between the vehicle's parts do not change the total momentum.
 
-    For 40 s of the 60 random rates of up to 1 rad/s at the gimbals and 0.3 N m at the wheels, another each 0.1 s.
+    For 40 s of 60 s, random gimbal rates up to 1 rad/s and wheel torques up to 0.3 N m change every 0.1 s.
     """
     vehicle = multibody.build(vehicle_config(**SPINNING))
     rng = np.random.default_rng(4)
@@ -106,7 +106,7 @@ def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
 
 @pytest.mark.slow
 def test_energy_and_momentum_are_conserved_without_control() -> None:
-    """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
+    """To 1e-8 J (of 1112) and 1e-8 N m s (of 5.6), with every wheel, rotor and gimbal free."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
     vehicle.model.opt.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -223,7 +223,7 @@ def asymmetric_top(
 def test_an_asymmetric_top_follows_jacobi_s_solution(
     inertia: tuple[float, float, float], first: float, third: float
 ) -> None:
-    """The issue's bar: 1e-6 rad within 60 s. It comes out below 1e-12, rounding's own size."""
+    """Required: 1e-6 rad within 60 s; rounding allows 1e-12."""
     vehicle = multibody.build(
         vehicle_config(mount="free", inertia=[f"{moment} kg m2" for moment in inertia])
     )

@@ -104,7 +104,7 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
 
 
 def test_the_spline_beats_that_of_rotation_vectors_at_the_ends() -> None:
-    """Which the module says: SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
+    """SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
     t = np.linspace(0, 6, 4001)
     ours = angle(attitudes(fit_spline(sampled()), t), tumble(t)).max()
     theirs = angle(RotationSpline(TIMES, tumble(TIMES))(t), tumble(t)).max()
@@ -514,7 +514,7 @@ def test_epochs_may_use_the_day_of_the_year(tmp_path: Path) -> None:
 
 
 def test_segments_are_joined(tmp_path: Path) -> None:
-    """One sample of both at the seam; then a step between them; the second with its frames the other way round."""
+    """With a common sample at the seam, with a step between segments, and with reversed frames in the second."""
     first = segment(MOTION[:21], TIMES[:21])
     second = segment(MOTION[20:41], TIMES[20:41])
     third = segment(

@@ -240,7 +240,7 @@ def test_solve_needs_no_hint(skysim: Skysim, rendered: Path, tmp_path: Path) -> 
 def test_solve_ignores_an_impossible_header_date_with_a_warning(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
-    """As if there were none, when aberration is left out."""
+    """Aberration is then left out, as without a date."""
     frames = {}
     for name, date in (
         ("none", None),
@@ -373,7 +373,7 @@ def test_a_stage_of_a_run_is_named_by_its_option(
 
 @pytest.mark.long
 def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> None:
-    """Above the scene's own and above --set; TRIAD takes two stars where the scene's QUEST takes all."""
+    """The option overrides the scene and --set; TRIAD uses two stars where the scene's QUEST uses all."""
     words = [
         "run",
         "shefex2",
@@ -396,7 +396,7 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
-    """By a run and by a rendering, which are of the same frames."""
+    """By `run` and by `render`, which make the same frames."""
     growing = "tracker.exposure_control={mean_dn: 500, min_stars: 1000}"
     words = ["shefex2", "--frames", "2", "--out", tmp_path, "--set", growing]
     ran = json.loads(skysim("run", *words, "--json").out)
@@ -791,7 +791,7 @@ def test_an_option_without_effect_is_refused_in_one_line(skysim: Skysim) -> None
 
 
 def test_compare_takes_options_of_any_of_its_trackers() -> None:
-    """Each is refused for the other tracker alone; one that serves none is refused."""
+    """An option is refused only if no compared tracker uses it."""
     words = ["tracker.solver=quest", "tracker.options={a: 1}"]
     both = ["own", "mine"]
     assert load("shefex2", 1, None, words, both).tracker.name == "own"

@@ -45,7 +45,7 @@ class Hand:
 def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
+    """The event loop keeps running while twenty tabs wait: it counts between any two of their polls."""
     monkeypatch.setattr(session, "Session", Hand)
     monkeypatch.setattr(session, "QUEUE_S", 0.001)
     monkeypatch.setattr(Hand, "alive", set())

@@ -26,7 +26,7 @@ class Hand:
 
 
 def test_a_closed_page_is_freed(tmp_path: Path) -> None:
-    """Also its upload area, whose route FastAPI keeps."""
+    """This includes its upload area, whose route FastAPI keeps."""
 
     async def story() -> weakref.ref[Tab]:
         core.loop = asyncio.get_running_loop()

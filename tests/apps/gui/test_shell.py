@@ -139,7 +139,7 @@ def test_colors_are_distinguishable_with_color_blindness(eye: str) -> None:
 
 @pytest.mark.slow
 def test_the_time_of_the_first_frame_excludes_compilation() -> None:
-    """Also of a tracker that was chosen later: its first frame takes about as long as its second."""
+    """This holds for a tracker chosen later, too: its first frame takes about as long as its second."""
     bench = Workbench.open("shefex2", {})
     for overrides in ({}, {"tracker.identifier": "pyramid"}):
         bench = Workbench.open("shefex2", overrides, bench)
