@@ -58,7 +58,7 @@ def icrs(ra_deg: float, dec_deg: float) -> np.ndarray:
     ],
 )
 def test_the_pixel_of_a_direction_matches_a_hand_calculation(vector_cam, pixel):
-    """Both pieces of code for the one law: the hardware's and the tracker's."""
+    """Both implementations of the projection, of the hardware and of the tracker, agree."""
     vector = np.array([vector_cam])
     np.testing.assert_allclose(OPTICS.project(vector)[0], pixel, rtol=0, atol=1e-9)
     np.testing.assert_allclose(BELIEVED.pixels(vector)[0], pixel, rtol=0, atol=1e-9)
@@ -127,7 +127,7 @@ def test_the_image_of_three_stars_is_not_mirrored():
 
 
 def test_the_tracker_s_attitude_is_the_simulator_s_pointing():
-    """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
+    """Vega at the center (RA 279.2347, Dec +38.7837), up at position angle -25, in both directions of conversion."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
     np.testing.assert_allclose(
         np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
@@ -260,7 +260,7 @@ def test_the_motion_of_an_apex_led_by_a_tilt_matches_a_hand_calculation():
 
 
 def test_reading_data_executes_no_code():
-    """YAML by the safe loader, arrays and results without pickle, and nothing that runs a text."""
+    """YAML uses the safe loader, arrays and results do not use pickle, and no text is executed."""
     loads = r"yaml\.(unsafe_|full_)?load\((?!.*, Loader\))|pickle\b|marshal\b|shelve\b|allow_pickle=True"
     banned = rf"\b({loads}|(?<![.\w])(eval|exec)\()"
     found = [

@@ -111,7 +111,7 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 @needs_photographs
 @by_file(TO_SOLVE)
 def test_a_mirrored_photograph_is_refused(row, blind):
-    """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
+    """No rotation maps the sky to its mirror image, so every answer would be wrong; the hint names the mirror."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
     outcome = plate_solver.solve_picture(
         images.ViewedImage(np.ascontiguousarray(image[:, ::-1])), blind, None

@@ -169,7 +169,7 @@ def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
 
 
 def test_short_trails_match_the_detector_s_streak() -> None:
-    """The trails are thick for their length, so that shapes alone would not show them. sqrt(59^2 + 30^2) = 66, and some noise."""
+    """The trails are thick, so that shapes alone would not show them. sqrt(59^2 + 30^2) = 66, and some noise."""
     solvers = (plate_solver.make_solver(20.0, None),)
     short = diagnosis.Refusal(spread(trail(60))(photograph()), Centroids.empty(), solvers)
     assert re.match("trails of 6[567] px: ", diagnosis.trailed(short))

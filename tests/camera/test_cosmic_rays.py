@@ -109,7 +109,7 @@ def test_every_electron_of_a_track_within_the_frame_is_in_it(
 
 @pytest.mark.slow
 def test_charge_is_spread_evenly_along_the_track() -> None:
-    """Sum over rows of a level track: 10 electrons per pixel of path, half in the end pixels; the cross profile is Gaussian."""
+    """Sum over rows of a level track: 10 electrons per pixel, half in the end pixels; rows are Gaussian."""
     image = np.zeros((41, 141))
     deposit(image, np.array([[20.0, 20.0, 120.0, 20.0]]), np.array([1000.0]), 0.5)
     columns = image.sum(axis=0)

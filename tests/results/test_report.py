@@ -92,7 +92,7 @@ def test_a_text_from_outside_is_text_in_html() -> None:
 
 
 def test_a_text_from_outside_opens_no_element_in_markdown() -> None:
-    """But in code, where Markdown shows it literally."""
+    """Code is excepted, as Markdown shows it literally."""
     outside_of_code = re.sub(
         r"^(`{3,})\w*\n.*?^\1$", "", everywhere(HOSTILE).markdown(), flags=re.DOTALL | re.MULTILINE
     )

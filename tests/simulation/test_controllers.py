@@ -359,7 +359,7 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
 
 
 def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
-    """Or `skysim run`, which checks its plan, would start it twice."""
+    """Otherwise `skysim run`, which checks its plan first, would start it twice."""
     started = tmp_path / "started"
     programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
     lab = build_lab(

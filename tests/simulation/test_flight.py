@@ -78,7 +78,7 @@ HEADS = {"motion__maneuver": "[{kind: hold, duration: 1 s}]", "exposure__rate_hz
 def test_each_exposure_is_rendered_once(
     name: str, changes: Mapping[str, str], cameras: int, has_filter: bool, rendered: list[int]
 ) -> None:
-    """And, where only the motion is wanted, those alone that the filter needs."""
+    """If only the motion is requested, only frames for the filter are rendered."""
     scene = scene_of(name, 3, **changes)
     shots = list(open_flight(scene).shots())
     assert len(shots) == 3 * cameras
@@ -122,7 +122,7 @@ def test_a_shot_equals_the_frame_rendered_alone(changes: Mapping[str, str], solv
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["simsat_bump", "simsat_slew", "shefex2", "two_heads"])
 def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
-    """To the last bit: with the filter in the loop, and without."""
+    """The motion is equal bit for bit, with and without the filter in the loop."""
     scene = scene_of(name, 6)
     shots, forgetful = (
         list(open_flight(scene, keeps_history=keeps).shots()) for keeps in (True, False)
@@ -140,7 +140,7 @@ def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_flight_without_history_has_the_same_motion() -> None:
-    """Nothing of the motion depends on how much is kept; what is older is gone."""
+    """The motion does not depend on the kept history; older parts are dropped."""
     scene = scene_of("simsat_slew", 3)
     long = open_flight(scene)
     short = open_flight(scene, keeps_history=False)
@@ -310,7 +310,7 @@ def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
 
 @pytest.mark.parametrize("actuators", ["ideal", "wheels"])
 def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(actuators: str) -> None:
-    """For the steps that it is given for. The wheels, of 0.010125 kg m2, take up the momentum that the vehicle gets."""
+    """It acts in the steps for which it is given; the wheels (0.010125 kg m2) take up the opposite momentum."""
     changes = BALANCED | {
         "vehicle.wheels": "{torque_limit: '0.6 N m'}",
         "motion.control": f"{{law: pid, actuators: {actuators}}}",
@@ -398,7 +398,7 @@ def test_the_state_is_the_trajectory_s_present_one() -> None:
 
 
 def test_imu_samples_since_a_time_are_the_latest_ones() -> None:
-    """As the gyros give them while the vehicle moves: none is changed or lost later."""
+    """Samples are final when the gyros deliver them: none is changed or lost later."""
     flight = open_flight(scene_of("simsat_bump", 1, exposure__first="0.6 s"))
     assert len(flight.imu_samples().t_s) == 0
     while flight.now_s < 0.5:

@@ -157,7 +157,7 @@ def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_no
 
 
 def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
-    """Lamp and LEDs beyond it are gone from the frame and listed as hidden; those before it are as without it."""
+    """Lamp and LEDs beyond it are absent from the frame and listed as hidden; those before it are unchanged."""
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
     lab = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}")
     free = lab_with(lamp)
@@ -176,7 +176,7 @@ def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
 
 
 def test_a_lighthouse_is_a_section_of_the_scene() -> None:
-    """Read with units, written with its keys, and refused by them."""
+    """It is read with units, written with its keys, and errors name them."""
     scene = loader.load("afit_simsat", LEVEL | {"lights": f"[{LAMP}]"})
     (config,) = scene.lights
     assert isinstance(config, LighthouseConfig)

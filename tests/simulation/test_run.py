@@ -114,7 +114,7 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["shefex2", "nps_tas2_ideal", "apl_dome_ideal"])
 def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) -> None:
-    """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
+    """Without noise, the images' wings and readout smear must not merge the lights into one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
     lab = build_lab(
         loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()})
@@ -474,7 +474,7 @@ def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
 
 
 def test_a_frame_has_the_commanded_exposure_time() -> None:
-    """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
+    """It opens on time; its truth and glare (1e5 e-/s) are those of its own exposure."""
     glare = "[{kind: uniform, e_s: 1e5}]"
     scene = controlled(3, "4 ms", "{mean_dn: 1000, min_stars: 1000}", background=glare)
     shots = shots_of(scene)

@@ -174,7 +174,7 @@ def test_levels_are_the_nearest_grays(grays: int, gamma: float) -> None:
 
 
 def test_stars_on_one_pixel_add_up_to_white() -> None:
-    """The brightest's number stands for them."""
+    """The sum has the number of the brightest star."""
     points = {"kind": "listed", "cap_deg": 5, "levels": [0.25, 0.5, 0.8, 0.9]}
     points["directions_deg"] = [[0, 1], [0, 1.0001], [90, 2], [90, 2.0001]]
     drawn = lit(PANEL | {"points": points, "gray_levels": 65536, "gamma": 1})

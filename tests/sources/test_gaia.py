@@ -248,7 +248,7 @@ def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
 
 
 def test_variability_does_not_change_the_tracker_s_catalog() -> None:
-    """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
+    """The scene's stars have the drawn brightness; the tracker's catalog and all positions are unchanged."""
     labs = (
         build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"})
     )

@@ -205,7 +205,7 @@ def test_the_hardware_seed_determines_the_dome(layout: dict) -> None:
 
 
 def test_levels_are_drawn_from_the_list_and_magnitudes_by_pogson() -> None:
-    """Each as often as any other, to four sigmas of n draws; five magnitudes are a hundredfold."""
+    """Levels are equally frequent to four sigmas of n draws; five magnitudes are a factor of 100."""
     levels = lit({"kind": "fibonacci", "count": 3000, "levels": [1.0, 0.5, 0.25]}).on_s / 1e-3
     values, counts = np.unique(levels, return_counts=True)
     np.testing.assert_array_equal(values, [0.25, 0.5, 1.0])

@@ -62,7 +62,7 @@ def best() -> Sources:
 
 @pytest.mark.slow
 def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None:
-    """Brightness is drawn after the search, from the same stream: a kept search changes no byte, and no other dome."""
+    """Brightness is drawn after the search from the same stream; a cached search changes no dome."""
     few = WANTED | {"count": 12, "rounds": 1, "levels": [1, 0.5], "spacing": "20 mm"}
     spreads.optimized_places.cache_clear()
     first = lit(few)
@@ -289,7 +289,7 @@ def test_an_led_is_as_bright_as_the_chip_finds_its_star() -> None:
 
 
 def test_doubles_within_a_disk_are_merged_to_one_led_of_their_light() -> None:
-    """No light is lost, and no two are nearer than a disk, though merged ones stand between their stars' places."""
+    """Light is conserved, and no two LEDs are nearer than a disk, although merged ones are between their stars."""
     wide = lit(SKY)
     fine = dome.sources(
         DomeConfig.model_validate(

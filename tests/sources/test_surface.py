@@ -150,7 +150,7 @@ def test_normals_match_the_numerical_gradient(name: str, cloud: dict) -> None:
 
 @pytest.mark.parametrize("name", [*KINDS, "cloud"])
 def test_offset_and_tilt_are_a_rigid_motion_about_the_center(name: str, cloud: dict) -> None:
-    """Turn the rays instead: first about x by 3 deg, then about y by -2 deg, written out as matrices."""
+    """The rays are rotated instead: first about x by 3 deg, then about y by -2 deg, by explicit matrices."""
     part = cloud if name == "cloud" else KINDS[name]
     still = made(part)
     moved = made(part, **MOVED)
@@ -512,7 +512,7 @@ def test_the_drawn_mesh_is_on_the_surface(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["rimmed", "narrow", "panel"])
 def test_the_drawn_mesh_extends_to_the_rim(name: str) -> None:
-    """Half a degree beyond the last ring there is nothing."""
+    """Half a degree beyond the last ring the surface has ended."""
     shape = made(DRAWN[name])
     last = mjcf_export.shell_m(shape, 0.6)[-1]
     beyond = last / np.linalg.norm(last, axis=1, keepdims=True) - [0.0, 0.0, 0.017]

@@ -173,7 +173,7 @@ def test_a_further_survey_error_does_not_change_the_others() -> None:
 
 
 def test_the_survey_does_not_change_the_hardware() -> None:
-    """Frames are the same whatever is believed."""
+    """Frames do not depend on the tracker's map."""
     frames = []
     for survey in ("{}", ALL.format(lever="5 mm", seed=1)):
         lab = build_lab(loaded(tracker__survey=survey, exposure=BARE_CAMERA["exposure"]))

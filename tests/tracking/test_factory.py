@@ -325,7 +325,7 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
 def test_a_dome_that_no_tracker_supports_is_refused_in_one_line(
     changes: dict[str, str], why: str
 ) -> None:
-    """And it is rendered all the same: a lab may light one LED."""
+    """It is still rendered, as a lab may light one LED."""
     lab = build_lab(loader.load("afit_simsat_ideal", changes))
     with pytest.raises(
         InputError, match=f"light: the star tracker cannot use .*: {why}"
@@ -362,7 +362,7 @@ def test_a_surface_that_is_no_upright_ellipsoid_is_warned_of(surface: str, doubt
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
 def test_a_camera_outside_of_the_dome_is_warned_of(scene: str) -> None:
-    """Its frames would be black, without a word."""
+    """Its frames would be black without explanation."""
     far = {
         "vehicle.camera": "[0 m, 1.3 m, 0 m]",
         "vehicle.inertia": "[120 kg m2, 120 kg m2, 120 kg m2]",

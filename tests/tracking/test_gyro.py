@@ -39,7 +39,7 @@ def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
 
 @pytest.mark.slow
 def test_the_rate_of_a_frame_does_not_depend_on_the_buffer_of_samples() -> None:
-    """What the frame gets when it is due needs none that come later; nor those that a flight forgets."""
+    """The rate at the frame's due time needs neither later samples nor those that a flight drops."""
     scene = load("shefex2", FLIGHT | {"tracker.gyro": "true"})
     flight = open_flight(scene)
     shots = list(flight.shots())

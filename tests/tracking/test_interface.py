@@ -127,7 +127,7 @@ def test_a_program_gets_the_pixels_and_its_answer_is_returned() -> None:
 
 @pytest.mark.parametrize("kind", ["png", "fits"])
 def test_the_frame_s_folder_is_removed_with_the_program(kind: str) -> None:
-    """The frame alone: the truth that a run's own files carry is not in it."""
+    """The folder has the frame alone, without the truth of a run's files."""
     text = "for line in g:\n    h = json.loads(line); print(json.dumps({'frame': 7, 'status': h['file']}), flush=True)"
     runs = program(READY + text, kind=kind)
     path = Path(runs.solve(PICTURE).status)
@@ -209,7 +209,7 @@ def test_a_program_that_does_not_read_times_out() -> None:
 def test_a_program_is_restarted_and_abandoned_after_three_successive_failures(
     tmp_path: Path,
 ) -> None:
-    """The first dies once; of the other every one does."""
+    """The first program dies once; the other dies at every start."""
     mark = str(tmp_path / "mark")
     answer = 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
     once = f"if not os.path.exists({mark!r}): open({mark!r}, 'x'); sys.exit(1)\n    "

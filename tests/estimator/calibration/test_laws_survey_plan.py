@@ -213,7 +213,7 @@ def test_equal_leds_get_the_assignment_of_least_distance(rng: np.random.Generato
 @law(survey_faults.names)
 @given(rng=SEEDS)
 def test_brightness_identifies_leds_exchanged_in_the_list(rng: np.random.Generator) -> None:
-    """Of neighbors the light decides; of LEDs farther apart the place, and an exchange is reported."""
+    """Brightness identifies neighbors and position distant LEDs; an exchange is reported."""
     levels = np.exp(np.linspace(0, -30, 60))
     listed, place_m, covariance, table = close_group(rng, levels)
     wrong = np.arange(60)

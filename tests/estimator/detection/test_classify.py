@@ -178,7 +178,7 @@ def smeared_frame(
 def test_a_short_streak_is_found_and_centered_without_a_gyro_as_with_one(
     streak: tuple[float, float],
 ) -> None:
-    """A round star in place of a streak of some pixels would double the error, and claim too little."""
+    """A round-star fit of a short streak would double the error and understate it."""
     image, xy = smeared_frame(np.random.default_rng(47), streak)
     alone, guided = (
         detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak)
@@ -294,7 +294,7 @@ def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
 
 
 def test_tracks_among_round_stars_are_not_taken_for_a_roll() -> None:
-    """Of three tracks and the sky, any two lines give a turn, but the stars are round."""
+    """Any two of three tracks would give a roll, but the stars are round."""
     rng = np.random.default_rng(50)
     light, _ = sky_frame(rng, 15, 0.7)
     for at, angle in (((20, 20), 0.4), ((560, 20), 2.0), ((20, 430), 1.2)):
@@ -306,7 +306,7 @@ def test_tracks_among_round_stars_are_not_taken_for_a_roll() -> None:
 
 
 def test_three_tracks_are_not_taken_for_a_roll() -> None:
-    """Any two lines agree with some field: five must."""
+    """Any two lines agree with some roll, so five are required."""
     light = np.zeros(SHAPE)
     for at, angle in (((100, 100), 0.4), ((500, 120), 2.0), ((220, 400), 1.2)):
         add_line(light, at, angle)
@@ -356,7 +356,7 @@ def test_long_streaks_that_differ_by_a_few_percent_are_stars() -> None:
 
 
 def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
-    """Ten of 15 trails are just above the noise of a pixel; the bright ones tell how long all are."""
+    """Ten of 15 trails are just above the noise of a pixel; the bright ones give the length of all."""
     image = trailed_frame(61, 60.0, 0.02)
     background = detect.estimate_background(image)
     pieces = detect.detect_blobs(

@@ -332,7 +332,7 @@ def test_faint_streaks_are_found_at_full_length(length_px: float, angle_deg: flo
 
 
 def test_a_field_that_only_rolls_is_not_line_filtered() -> None:
-    """Its streaks are those of a turn, and that at the center has no length to grow from."""
+    """Its streaks are those of a roll, whose streak at the center has no length."""
     image, _ = field_of_stars(4)
     turning = replace(detect.default(image), streak_px=(0.0, 0.0), turn_rad=0.01)
     assert detect.in_full_length(image, turning, 5.0, 99, FramePriors()) is turning

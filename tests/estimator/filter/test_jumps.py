@@ -89,7 +89,7 @@ def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
 
 
 def test_the_filter_adopts_a_persistently_wrong_tracker_after_half_a_minute() -> None:
-    """Nothing that the filter knows distinguishes it then from a gyro that failed without a flag."""
+    """The filter cannot distinguish this from a gyro that failed without a flag."""
     vehicle = Vehicle(2)
     vehicle.updates(HOME, 60)
     runs = statuses(vehicle.updates(WRONG, 60))

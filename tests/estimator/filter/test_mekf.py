@@ -700,7 +700,7 @@ def test_an_earlier_residual_is_rotated_with_the_body_before_comparison(
 def test_solutions_confirm_each_other_within_what_the_bias_turns(
     sigmas: float, status: str
 ) -> None:
-    """A bias of b turns the prediction by 3 b in 3 s; the solutions themselves err by less than 1% of that."""
+    """A bias b rotates the prediction by 3 b in 3 s; the solutions err by less than 1 % of that."""
     sigma_bias = 1e-3
     gap_s = 3.0
     drift = [wild(0.0, 0.0, sigmas * sigma_bias * gap_s * k) for k in range(3)]

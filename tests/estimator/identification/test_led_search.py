@@ -125,7 +125,7 @@ def test_equal_leds_are_identified_and_never_wrongly(surface, dead, false, least
 
 
 def test_an_accurate_survey_identifies_leds_of_which_half_are_dead():
-    """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
+    """The number of fitting false attitudes sets the limit: it scales with the square of an LED's error per light."""
     truth = spread(1400, OVAL, 4)
     dome = build_dome_index(truth, LEVER, CAMERA)
     rng = np.random.default_rng(5)
@@ -139,7 +139,7 @@ def test_an_accurate_survey_identifies_leds_of_which_half_are_dead():
 
 @pytest.mark.long
 def test_random_lights_give_no_attitude():
-    """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
+    """Evidence of x powers of ten occurs in at most one of 10^x such frames (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
     dome = build_dome_index(leds, LEVER, CAMERA)
     rng = np.random.default_rng(8)
@@ -156,7 +156,7 @@ def test_random_lights_give_no_attitude():
 
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
 def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
-    """By which a pair is looked up: both rays carried to the one sphere, against the index's angle."""
+    """The lookup angle of a pair, with both rays extended to one sphere, against the index's angle."""
     leds = spread(600, surface, 9)
     dome = build_dome_index(leds, LEVER, CAMERA)
     rng = np.random.default_rng(10)
@@ -251,7 +251,7 @@ def test_the_covariance_includes_the_map_s_errors():
 
 
 def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
-    """One blob between them, nearer to the brighter: in neither's place by 10 px, where the others are to .05 px."""
+    """One blob between them is 10 px from both, while the others are accurate to 0.05 px."""
     lone = spread(1400, OVAL, 16)
     beside = lone.position_m + np.array([0.0025, 0, 0])  # 26 px
     leds = LedMap(np.arange(2800), np.concatenate([lone.position_m, beside]), *OVAL)
@@ -280,7 +280,7 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
 
 @pytest.mark.long
 def test_the_covariance_includes_the_lever_s_error():
-    """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
+    """A pupil position error of 1 mm is 0.047 deg at 48 in, far beyond the lights' noise, and is claimed."""
     truth = spread(1400, OVAL, 18)
     rng = np.random.default_rng(19)
     nees = []
@@ -530,7 +530,7 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
 
 @pytest.mark.slow
 def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() -> None:
-    """What the search with a free focal length is for: the angles of all pairs are wrong."""
+    """All pair angles are wrong, which only the search with a free focal length handles."""
     truth = spread(1400, OVAL, 21)
     rng = np.random.default_rng(22)
     leds = surveyed(truth, 23)
@@ -552,7 +552,7 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
 
 @pytest.mark.long
 def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
-    """As for a calibrated camera: evidence of x powers of ten is met in one frame of 10^x at most."""
+    """As for a calibrated camera, evidence of x powers of ten occurs in at most one of 10^x frames."""
     dome = build_dome_index(surveyed(spread(1400, OVAL, 6), 7), LEVER, CAMERA.zoomed(0.88))
     rng = np.random.default_rng(8)
     dex = []

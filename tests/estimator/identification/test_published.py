@@ -126,7 +126,7 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
 
 
 def test_the_tail_of_chance_matches_is_binomial_down_to_the_least_number() -> None:
-    """Beyond 1e-300, which doubles hardly hold, it stays there: a finite evidence."""
+    """Probabilities below 1e-300 are clipped, so that the evidence is finite."""
     chance = interpreted("estimator.identification.chance")
     for trials, hits, p in ((10, 4, 0.01), (30, 12, 1e-4), (5, 5, 0.3), (40, 1, 1e-3)):
         wanted = stats.binom.logsf(hits - 1, trials, p) / np.log(10)
@@ -346,7 +346,7 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
 
 
 def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
-    """Among many stars and with wide gates, by all of them: angles, side of the base, least sum of differences."""
+    """Against a search of all stars with wide gates: angles, side of the base, least sum of differences."""
     rng = np.random.default_rng(9)
     found = 0
     for _ in range(20):
@@ -621,7 +621,7 @@ def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(
 def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(
     share: float, matched: bool
 ) -> None:
-    """Of twice as many lights as there are stars, all stars match."""
+    """All stars match among twice as many lights."""
     rays, _, rows, index, _ = field(1)
     strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
     options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)

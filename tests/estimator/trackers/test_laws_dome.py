@@ -130,7 +130,7 @@ def test_exact_solves_find_the_truth(
 def test_a_focal_length_is_fitted_with_the_attitude(
     rng: np.random.Generator, count: int, ratio: float, sigma: float
 ) -> None:
-    """Exactly from exact rays, from 2 deg off, whatever the error that all rays have."""
+    """Exact rays give the exact attitude from a start 2 deg off for any assumed error."""
     arm = lever(rng)
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, OVAL, arm, truth, count)

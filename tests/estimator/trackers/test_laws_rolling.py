@@ -107,7 +107,7 @@ def test_an_uncorrected_shear_rotates_the_field_as_predicted(tracker: StarTracke
 def test_of_two_signs_the_one_with_more_evidence_is_kept(
     tracker: StarTracker, monkeypatch: pytest.MonkeyPatch, sign: int
 ) -> None:
-    """A part of the stars matches with the wrong sign, too, in whichever order the two are tried."""
+    """Some stars also match with the wrong sign; the result does not depend on the order of trials."""
     seen, found = star_frame(tracker, 1, sign * RATE_DEG_S)
     tried = []
 

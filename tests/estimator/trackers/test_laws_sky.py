@@ -80,7 +80,7 @@ class World:
 def test_identified_stars_are_the_true_stars(
     rng: np.random.Generator, name: str, false: int, with_magnitudes: bool
 ) -> None:
-    """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
+    """Each star is matched once, false ones never, with the true attitude; or there is no match."""
     world = World(rng)
     tolerance_rad = 2e-4
     seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
@@ -127,7 +127,7 @@ def test_random_directions_match_each_star_once_or_none(
 @law(candidates)
 @given(rng=SEEDS, steps=some.integers(-2, 2))
 def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, steps: int) -> None:
-    """The focal length is off by whole steps of the search, or known."""
+    """The focal length is known or off by whole steps of the search."""
     world = World(rng)
     light = 10 ** (-0.4 * world.mag[world.star])
     centroids = Centroids(CAMERA.pixels(world.seen), np.full(len(light), 0.05), light)

@@ -221,7 +221,7 @@ def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> N
 
 
 def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(uncertain: StarTracker) -> None:
-    """Where the lens may be off by as much as the lamp is from the star, its brightness alone tells them apart."""
+    """If the lens may be off by the distance of the lamp from the star, only brightness distinguishes them."""
     rng = np.random.default_rng(96)
     for _ in range(5):
         truth, pixels, light = starfield(uncertain, rng, CAMERA)
@@ -272,7 +272,7 @@ def test_the_residual_is_the_rms_of_the_coordinates(
 
 
 def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
-    """A rolling shutter shears the image of a turning camera: the stars of a part of the field fit an attitude."""
+    """A rolling shutter shears the image of a rotating camera, so stars of only a part of the field fit."""
     rng = np.random.default_rng(97)
     solved = 0
     for _ in range(20):

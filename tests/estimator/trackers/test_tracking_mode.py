@@ -173,9 +173,9 @@ def test_an_outdated_attitude_is_not_used_for_prediction(tracker: StarTracker) -
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
-    """Dark frames, frames that never come, knocks unseen by the gyros and stale predictions, one after the other.
+    """Successive dark frames, missing frames, knocks unseen by the gyros and outdated predictions.
 
-    Every frame with stars is solved, right; after a gap shorter than the memory the gyros' turn leads on.
+    Every frame with stars is solved correctly; after a short gap the gyros' rotation predicts the attitude.
     """
     rng = np.random.default_rng(seed)
     follower = TrackingMode(tracker)

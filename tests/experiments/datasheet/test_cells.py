@@ -36,7 +36,7 @@ def test_every_cell_is_different(scene):
 
 
 def test_the_total_cells_use_the_units_of_the_terms_in_turn():
-    """As often each, so that terms and total can agree with few units; the probabilities' frames are of others."""
+    """Each unit is used equally often, so that terms and total agree with few units; probabilities use other frames."""
     designer = Designer(load("afit_simsat", {}), FULL)
     cells = list(designer.cells())
     assert designer.seeds == [

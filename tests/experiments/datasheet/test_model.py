@@ -38,7 +38,7 @@ def model() -> ErrorModel:
 
 
 def test_a_process_follows_its_recursion():
-    """Beside the loop over the times, with steps that change: the same numbers from the same draws."""
+    """Against a loop over times with changing steps: the same numbers from the same draws."""
     steps = np.random.default_rng(1).uniform(0, 0.5, 300)
     found = correlated(steps, np.array([0.7, -1.2]), np.random.default_rng(2))
     normal = np.random.default_rng(2).standard_normal((300, 2))
@@ -143,7 +143,7 @@ def test_more_than_a_hundred_thousand_errors_a_second(model):
 
 
 def test_the_error_model_runs_without_skysim(tmp_path: Path) -> None:
-    """Copied away it needs NumPy and its constants, and nothing of skysim."""
+    """A copy of the module needs only NumPy and its constants."""
     model_fit.write_model(tmp_path, CONSTANTS)
     code = (
         "import sys, numpy; from tracker_error import ErrorModel; m = ErrorModel.read('tracker_error.json');"

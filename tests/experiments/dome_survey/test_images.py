@@ -150,7 +150,7 @@ def result(folder: Path, frames: Path) -> dict[str, Any]:
 def test_a_folder_of_images_alone_gives_the_dome_as_built(
     result: dict[str, Any], folder: Path, built: Lab
 ) -> None:
-    """Only here is the truth known: places, focal length and lever within their errors, and better than the list."""
+    """Against the truth: places, focal length and lever are within their errors and better than the list."""
     found = Table.read(folder / "by_imu" / "leds.ecsv", format="ascii.ecsv")
     assert len(found) > 0.7 * len(built.camera.sources)
     row = np.searchsorted(built.camera.sources.id, found["id"])
@@ -250,7 +250,7 @@ def test_a_watch_ends_with_the_survey_of_the_images_at_hand(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A thread drops the images in; Ctrl-C comes when all are read. The survey is that of the folder at rest."""
+    """A thread adds images; Ctrl-C follows when all are read. The survey equals that of the complete folder."""
     arriving = tmp_path / "arriving"
     arriving.mkdir()
 

@@ -161,7 +161,7 @@ def test_the_commands_of_the_pods_run_a_study(
 def test_a_hanging_worker_is_abandoned(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
-    """Stopped by a signal it answers no more; its trials are repeated by the other one, and none is stored twice."""
+    """A worker stopped by a signal does not answer; another repeats its trials, and none is stored twice."""
     patience = {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "3s"}
     for cluster in cluster_of(tmp_path, "--no-nanny", count=2, environment=patience):
         engine = on_dask(cluster, 2)
@@ -190,7 +190,7 @@ class Replies:
 
 
 def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
-    """But one of another version does, and none that replies."""
+    """A worker of another version ends the run, as does a run without replying workers."""
     pytest.importorskip("distributed")
     from distributed.comm import CommClosedError
 

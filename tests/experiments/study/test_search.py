@@ -174,7 +174,7 @@ def test_the_front_holds_the_nondominated_candidates(tmp_path: Path) -> None:
 
 
 def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
-    """The bowl's bottom answers too seldom: the best is on the border x = 0.5, at a height of 1.04."""
+    """The bowl's minimum is identified too rarely; the best candidate is on the border x = 0.5 at 1.04."""
 
     def law(settings: Settings) -> Outcome:
         return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
@@ -194,7 +194,7 @@ def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
 
 
 def test_a_refused_candidate_is_infeasible_and_the_search_continues(tmp_path: Path) -> None:
-    """Its trials fail after one was tried, and do not count as failures of the budget."""
+    """Its trials fail after the first and do not count as failures of the budget."""
     asked = []
 
     def law(settings: Settings) -> Outcome:
@@ -219,7 +219,7 @@ def test_a_refused_candidate_is_infeasible_and_the_search_continues(tmp_path: Pa
 
 
 def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
-    """Not even where all that is asked is its price, which it has."""
+    """This holds even if cost, which it has, is the only objective."""
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.noise_px"] < 0.5:
@@ -284,7 +284,7 @@ def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine,
 @pytest.mark.long
 @pytest.mark.parametrize("every", [2, 9])
 def test_a_search_killed_and_resumed_leaves_the_same_store(tmp_path: Path, every: int) -> None:
-    """Two objectives, a constraint, levels and a refusal: all that the sampler hears of comes back from the store."""
+    """Two objectives, a constraint, levels and a refusal: the sampler's whole input is restored from the store."""
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.magnitude_sigma"] > 0.9:
@@ -431,7 +431,7 @@ def test_bad_prices_are_reported_as_errors_of_the_study(tmp_path: Path) -> None:
 def test_the_terminal_s_front_has_levels_error_and_cost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The two of three candidates that no other beats, as a table."""
+    """A table of the two nondominated candidates of three."""
     study = loaded(
         tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])
     ).study

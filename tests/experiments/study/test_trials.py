@@ -258,7 +258,7 @@ def test_a_coded_trial_is_a_sequence_of_frames():
 
 @pytest.mark.slow
 def test_unreadable_codes_give_no_wrong_attitude():
-    """Half of all bits fail: no word can be read."""
+    """Half of all bits fail, so that no word can be read."""
     outcomes = coded({"light.led.code": {"kind": "gray", "dropout": 0.49, "depth": 0.1}}, 60)
     assert sum(one.solved for one in outcomes) < 30
     assert not any(one.wrong for one in outcomes)
@@ -403,7 +403,7 @@ def test_a_rotation_about_the_boresight_keeps_its_star_in_place():
 
 @pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
 def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
-    """As evenly as the other trials' attitudes: drawn from the same stream."""
+    """Start attitudes are uniform, drawn from the same stream as those of other trials."""
     trial = {"kind": "flight", "start": "random"}
     ready = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {})
     kind = {"kind": "frames"}
