@@ -71,7 +71,9 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
 
 
 COMPILED = pytest.StashKey[tuple[Path, Future[None]]]()
-LAST_COMPILED = "estimator/identification/stars/__pycache__/quads.identify-*.nbi"  # which `make demo` leaves out
+LAST_COMPILED = (
+    "estimator/identification/__pycache__/star_quads.identify-*.nbi"  # which `make demo` leaves out
+)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -90,20 +92,20 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
-    """Say to a worker of xdist which file shows that the compilation is done."""
+    """Give a worker of xdist the file that marks the end of the compilation."""
     if COMPILED in node.config.stash:
         node.workerinput["compiled"] = str(node.config.stash[COMPILED][0] / "done")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """A worker waits for the compilation before its first test."""
+    """Let a worker wait for the compilation before its first test."""
     done = getattr(session.config, "workerinput", {}).get("compiled")
     while done and not Path(done).exists():
         time.sleep(0.1)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove what the compilation left, and raise what it raised."""
+    """Remove files of the compilation and raise its error, if any."""
     if COMPILED in config.stash:
         folder, compiled = config.stash[COMPILED]
         wait([compiled])

@@ -1,4 +1,4 @@
-"""The conventions of the house, each nailed by a number worked out by hand. Read this file first."""
+"""The project's conventions, each checked by a hand calculation. Read this file first."""
 
 import re
 
@@ -57,8 +57,8 @@ def icrs(ra_deg: float, dec_deg: float) -> np.ndarray:
         ([0.02, 0.03, 2.0], (330.0, 255.0)),  # only the direction counts
     ],
 )
-def test_a_direction_falls_on_the_pixel_worked_out_by_hand(vector_cam, pixel):
-    """Both pieces of code for the one law: the hardware's and the tracker's."""
+def test_the_pixel_of_a_direction_matches_a_hand_calculation(vector_cam, pixel):
+    """Both implementations of the projection, of the hardware and of the tracker, agree."""
     vector = np.array([vector_cam])
     np.testing.assert_allclose(OPTICS.project(vector)[0], pixel, rtol=0, atol=1e-9)
     np.testing.assert_allclose(BELIEVED.pixels(vector)[0], pixel, rtol=0, atol=1e-9)
@@ -127,7 +127,7 @@ def test_the_image_of_three_stars_is_not_mirrored():
 
 
 def test_the_tracker_s_attitude_is_the_simulator_s_pointing():
-    """Vega in the middle (RA 279.2347, Dec +38.7837), up at position angle -25: said once each way."""
+    """Vega at the center (RA 279.2347, Dec +38.7837), up at position angle -25, in both directions of conversion."""
     look = Rotation.from_matrix(hand_made(279.2347, 38.7837, -25.0))
     np.testing.assert_allclose(
         np.degrees(ra_dec_roll_rad(look)), (279.2347, 38.7837, -25.0), rtol=0, atol=1e-10
@@ -136,7 +136,7 @@ def test_the_tracker_s_attitude_is_the_simulator_s_pointing():
 
 
 def hand_made(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
-    """Rows right, down, boresight by elementary turns alone: Rz(-roll) applied to (west, south, out)."""
+    """Rows right, down, boresight by elementary rotations: Rz(-roll) applied to (west, south, out)."""
     turn = Rotation.from_euler("z", ra_deg, degrees=True) * Rotation.from_euler(
         "y", -dec_deg, degrees=True
     )
@@ -198,7 +198,7 @@ def test_mujocos_camera_axes_convert_to_ours():
 def flown(
     parts: dict[str, object], motor: int, control: float
 ) -> tuple[multibody.VehicleModel, multibody.Simulation]:
-    """A second of SimSat, free and at rest, one of its motors at work."""
+    """A second of a free SimSat, initially at rest, with one motor driven."""
     given = {
         "model": "vehicles/simsat.xml",
         "mount": "free",
@@ -243,7 +243,7 @@ def test_a_turned_gimbal_gives_the_body_the_opposite_of_the_rotor_s_momentum_cha
     np.testing.assert_allclose(momentum[[0, 2]], expected[[0, 2]], rtol=0.01, atol=0)
 
 
-def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
+def test_the_motion_of_an_apex_led_by_a_tilt_matches_a_hand_calculation():
     """Roll +10 deg about lab x lifts lab +y: body z leans to -y, so the apex LED falls on the image's +y side.
 
     Camera 0.381 m up a vehicle tilted by 10 deg stands at (0, -0.381 sin 10, 0.381 cos 10). The apex LED, 1.2192 m
@@ -260,7 +260,7 @@ def test_a_tilt_moves_an_apex_led_the_way_worked_out_by_hand():
 
 
 def test_reading_data_executes_no_code():
-    """YAML by the safe loader, arrays and results without pickle, and nothing that runs a text."""
+    """YAML uses the safe loader, arrays and results do not use pickle, and no text is executed."""
     loads = r"yaml\.(unsafe_|full_)?load\((?!.*, Loader\))|pickle\b|marshal\b|shelve\b|allow_pickle=True"
     banned = rf"\b({loads}|(?<![.\w])(eval|exec)\()"
     found = [

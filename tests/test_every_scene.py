@@ -1,4 +1,4 @@
-"""Whatever stands in scenes/ loads, flies, lights enough sources, and repeats itself bit for bit."""
+"""Every scene in scenes/ loads, runs, shows enough sources, and is reproducible bit for bit."""
 
 from __future__ import annotations
 
@@ -267,7 +267,7 @@ STEERED = [name for name in NAMES if loader.load(name).motion.control]
 
 @pytest.fixture(scope="module", params=STEERED)
 def whole(request: pytest.FixtureRequest) -> Flight:
-    """A scene flown to its last frame, none of which is rendered."""
+    """A scene's motion up to its last frame, without rendering."""
     return simulate_motion(loader.load(request.param, NO_EYES.get(request.param)))
 
 

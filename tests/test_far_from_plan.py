@@ -1,4 +1,4 @@
-"""Flights far from what was planned: blows beyond all limits, stops, what cannot be stepped, flights of one tick."""
+"""Flights far from the plan: blows beyond all limits, stops, failed integrations, flights of one tick."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_after_a_blow_beyond_the_torque_limit_the_vehicle_brakes_and_returns(
 
 @pytest.mark.long
 def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
-    """Blown to six times what the gyros show, with no star tracker to help: it comes to rest somewhere."""
+    """After a blow to six times the gyros' limit and without a star tracker, it comes to rest at some attitude."""
     overrides = {
         "vehicle.imu": "{gyro: {rate_limit_deg_s: 10}}",
         "motion.control": "{feedback: imu}",

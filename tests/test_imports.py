@@ -1,4 +1,4 @@
-"""The import graph: one way down, and no circle anywhere, lazy imports and those for type checkers counted."""
+"""The import graph has no cycle, counting lazy imports and those for type checkers."""
 
 import ast
 from collections.abc import Iterator
@@ -44,12 +44,12 @@ def imported(path: Path) -> set[str]:
 
 @cache
 def graph() -> dict[str, set[str]]:
-    """What each module imports."""
+    """Imports of each module."""
     return {name: imported(path) - {name} for name, path in FILES.items()}
 
 
 def circles(uses_of: dict[str, set[str]]) -> list[str]:
-    """What is left when modules whose imports are all gone are taken away, again and again."""
+    """Modules left after repeatedly removing those without remaining imports: the cycles."""
     left = {name: set(uses) for name, uses in uses_of.items()}
     while done := {name for name, uses in left.items() if not uses}:
         left = {name: uses - done for name, uses in left.items() if name not in done}
@@ -67,7 +67,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_no_folder_holds_too_many_modules(package: str) -> None:
-    """A dozen or a little more; a folder needs a sentence of its own, so that many small ones read no better."""
+    """About a dozen modules per folder; each folder needs a description, so many small ones are no better."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
         entries = {path.name for path in folder.iterdir()} - {
             "__init__.py",

@@ -1,6 +1,6 @@
-"""Real photographs of the night sky, whose attitude two independent solvers agree on.
+"""Real photographs of the night sky with attitudes from two agreeing independent solvers.
 
-The folder stands beside the checkout (or where SKYSIM_REAL_SKY says); its README tells how its truth was made.
+The folder is beside the checkout or at SKYSIM_REAL_SKY; its README describes how the truth was made.
 """
 
 import csv
@@ -28,7 +28,7 @@ needs_photographs = pytest.mark.skipif(
 
 
 def by_file(rows, quick: int = 1):
-    """A test for each photograph; of which every `quick`-th is not slow."""
+    """One test per photograph; every `quick`-th is not marked slow."""
     marks = [() if k % quick == 0 else pytest.mark.slow for k in range(len(rows))]
     params = [
         pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)
@@ -111,7 +111,7 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 @needs_photographs
 @by_file(TO_SOLVE)
 def test_a_mirrored_photograph_is_refused(row, blind):
-    """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
+    """No rotation maps the sky to its mirror image, so every answer would be wrong; the hint names the mirror."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
     outcome = plate_solver.solve_picture(
         images.ViewedImage(np.ascontiguousarray(image[:, ::-1])), blind, None
@@ -133,7 +133,7 @@ def test_a_photograph_is_solved_with_any_field_error_below_five_per_cent(row, fo
 @needs_photographs
 @pytest.mark.parametrize("fov_error", [-0.05, 0.0, 0.05])
 @by_file(ANY)
-def test_a_hopeless_photograph_may_be_refused_but_not_answered_wrongly(row, fov_error):
+def test_a_hopeless_photograph_is_refused_or_answered_correctly(row, fov_error):
     found = answer(row, fov_error)
     right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
     assert right or found["status"] != "solved"

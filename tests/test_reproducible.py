@@ -35,14 +35,14 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def answers(folder: Path) -> list[str]:
-    """The rows of the solutions, every digit, without the time that each took."""
+    """Rows of the solutions with every digit, without computing times."""
     table = Table.read(folder / "solutions.ecsv", format="ascii.ecsv")
     table.remove_column("time_ms")
     return [str(tuple(row)) for row in table]
 
 
 def made(scene: str, out: Path, **environment: str) -> Path:
-    """What a run leaves, in a process of its own."""
+    """Files of a run in a separate process."""
     folder = out / scene
     command = [sys.executable, "-m", "skysim", "run", scene, "--frames", "3", "--out", str(folder)]
     subprocess.run(command, check=True, capture_output=True, env=os.environ | environment)
@@ -51,7 +51,7 @@ def made(scene: str, out: Path, **environment: str) -> Path:
 
 @pytest.mark.parametrize("package", [estimator, skysim])
 def test_a_loop_is_compiled_equally_for_any_first_caller(package: Any) -> None:
-    """A caller that raises for a division by zero and adds in any order has no say in what it calls."""
+    """Compiler options of a caller (division errors, order of additions) do not change its callees."""
 
     @package.core.jit.jit(cache=False)
     def lost(small: float) -> tuple[float, float]:
@@ -82,7 +82,7 @@ assert two(1) == 3 and two(1.0) == 3.0
 
 @pytest.mark.long
 def test_a_command_announces_compilation_once_and_not_after_it(tmp_path: Path) -> None:
-    """Before a terminal: cold, warm, and as a package; into a file never."""
+    """On a terminal: with cold and warm cache and as a package; never into a file."""
     said = []
     for name, attended, seen in (
         ("a", True, True),
@@ -109,7 +109,7 @@ def test_a_command_announces_compilation_once_and_not_after_it(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_first_rendered_picture_announces_compilation(tmp_path: Path) -> None:
-    """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
+    """Otherwise half a minute would pass without output. The test stops after the announcement."""
     cv2.imwrite(
         str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8)
     )

@@ -1,4 +1,4 @@
-"""Trouble around us: a full disk, a folder that can't be written, signals. One line, and nothing half-written."""
+"""Full disks, unwritable folders and signals: one error line and no partial file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SMALL = ["--set", "light.limit_mag=5"]
 
 
 def ready() -> None:
-    """A shell's background job hands down that Ctrl-C is to be ignored."""
+    """Restore Ctrl-C, which a shell's background jobs ignore."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -43,7 +43,7 @@ def asked(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def whole_frames(folder: Path) -> int:
-    """How many frames there are, each of them readable, and no leftover of another."""
+    """Number of frames; checks that each is readable and no temporary file is left."""
     assert [path.name for path in folder.iterdir() if path.name.startswith(".")] == []
     frames = sorted(folder.glob("frame_*.fits"))
     for path in frames:
@@ -89,7 +89,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
 
 @contextlib.contextmanager
 def no_room(file_bytes: int) -> Iterator[None]:
-    """No file may grow larger: what a write gets then is an error of the system, as on a full disk."""
+    """Limit the size of files, so that writes fail as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, before[1]))
     try:
@@ -186,7 +186,7 @@ def test_a_picture_without_room_names_file_and_reason(
 
 
 @pytest.mark.long
-def test_a_folder_that_cannot_be_written_is_reported_in_one_line(mounted: Path) -> None:
+def test_an_unwritable_folder_is_reported_in_one_line(mounted: Path) -> None:
     subprocess.run(["mount", "-o", "remount,ro", mounted], check=True)
     for words in (("run", "shefex2", "--frames", "1"), ("study", "run", "led_count")):
         done = asked(*words, "--out", str(mounted / "run"))

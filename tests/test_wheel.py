@@ -1,4 +1,4 @@
-"""An installed package does without the checkout: scenes and data travel within it."""
+"""An installed package needs no checkout: it contains scenes and data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wrong attitude is worse than none: random fields with false and missing lights, and none answered wrongly."""
+"""Random fields with false and missing lights never give a wrong attitude."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def afit() -> DomeTracker:
 
 
 def body_from_lab(rng: np.random.Generator) -> Rotation:
-    """Evenly over the tilts to 20 deg, any yaw."""
+    """Random body_from_lab with tilts uniform to 20 deg and any yaw."""
     tilt, azimuth, yaw = np.radians(20) * np.sqrt(rng.uniform()), *rng.uniform(0, 2 * np.pi, 2)
     lean = Rotation.from_rotvec(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0]))
     return (lean * Rotation.from_euler("z", yaw)).inv()
@@ -32,7 +32,7 @@ def body_from_lab(rng: np.random.Generator) -> Rotation:
 def field(
     tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator
 ) -> Centroids:
-    """The LEDs wholly in view but for a share of them, with 0.2 px of noise, and false lights anywhere."""
+    """The LEDs wholly in view without a missing share, with 0.2 px of noise, and random false lights."""
     pixels = project(turned, tracker.leds.position_m, tracker.lever, tracker.camera)
     pixels = pixels[tracker.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12)]
     pixels = pixels[rng.uniform(size=len(pixels)) >= missing]

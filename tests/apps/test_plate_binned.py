@@ -1,4 +1,4 @@
-"""Pictures whose stars are large are solved binned: places are in pixels of the picture, and the bar is higher."""
+"""Images with large stars are solved binned: centroids are in full pixels, and more evidence is required."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)
 
 @pytest.fixture(scope="module")
 def drawn() -> tuple[NDArray, Rotation]:
-    """A picture with stars of 28 px that are hardly brighter than the noise of a pixel, and its attitude."""
+    """An image with stars of 28 px hardly brighter than the noise of a pixel, and its attitude."""
     stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
     return photographs.draw(SHOT, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(5))
 
@@ -52,7 +52,7 @@ def test_a_defocused_image_is_solved_binned_and_reported_as_such(
 
 
 def test_centroids_of_a_binned_image_are_in_its_full_resolution_pixels() -> None:
-    """Centers of disks to a small part of a disk, for both parities of the squares' corner."""
+    """Centers of disks are accurate to a small part of a disk for both parities of the blocks' corner."""
     rng = np.random.default_rng(2)
     image = np.zeros((1700, 2100), np.uint8)
     places = np.array([(x, y) for x in (200, 700, 1200, 1703) for y in (201, 702, 1203)])
@@ -82,7 +82,7 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
 def test_a_binned_image_needs_more_evidence(
     monkeypatch: pytest.MonkeyPatch, blurred: NDArray
 ) -> None:
-    """No chance of a false match is added: a thousand times less than by the picture itself."""
+    """Required chance probability: a thousand times less than for the full image, so none is added."""
     tries = []
 
     def never(pixels: NDArray, solver: plate_solver.Solver, *_: object) -> tuple[Report, None]:
@@ -102,7 +102,7 @@ def test_a_binned_image_needs_more_evidence(
     assert set(tries[2:]) == {2000}
 
 
-def test_bins_are_means() -> None:
+def test_a_binned_pixel_is_the_mean_of_its_block() -> None:
     image = np.random.default_rng(3).integers(0, 256, (33, 47)).astype(np.uint8)
     means = image[:32, :44].reshape(8, 4, 11, 4).mean(axis=(1, 3))
     small = retries.bin_pixels(image, 4).astype(float)

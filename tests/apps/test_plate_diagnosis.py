@@ -1,4 +1,4 @@
-"""What a refusal says: each cause on a picture that has it, and no cause on one that has not."""
+"""Hints of a refusal: each cause is named for an image that has it, and for no other."""
 
 from __future__ import annotations
 
@@ -76,19 +76,19 @@ def mirror(image: NDArray) -> NDArray:
 
 
 def bleach(image: NDArray) -> NDArray:
-    """Day: all but a strip is white."""
+    """Daylight: all but a strip is white."""
     white = np.full(image.shape, 255, np.uint8)
     white[:100] = np.random.default_rng(0).integers(0, 255, (100, image.shape[1]))
     return white
 
 
 def noise(image: NDArray) -> NDArray:
-    """The cap is on."""
+    """The lens cap is on."""
     return np.random.default_rng(0).normal(100, 5, image.shape).astype(np.uint16)
 
 
 def dots(image: NDArray) -> NDArray:
-    """Stars that fell anywhere: no sky."""
+    """Random stars that match no sky."""
     rng = np.random.default_rng(3)
     picture = rng.normal(100, 5, (480, 640))
     for x, y, light in zip(
@@ -102,7 +102,7 @@ make_solver = cache(plate_solver.make_solver)  # it keeps its trackers
 
 
 def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None) -> str:
-    """What the refusal of a picture says; "" for a solution."""
+    """Hint of an image's refusal; "" for a solution."""
     picture = images.ViewedImage(image)
     outcome = plate_solver.solve_picture(
         picture, make_solver(fov_deg, None, catalog=catalog_name), None
@@ -169,7 +169,7 @@ def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
 
 
 def test_short_trails_match_the_detector_s_streak() -> None:
-    """Thick for their length: their shapes alone would not show them. sqrt(59^2 + 30^2) = 66, and some noise."""
+    """The trails are thick, so that shapes alone would not show them. sqrt(59^2 + 30^2) = 66, and some noise."""
     solvers = (plate_solver.make_solver(20.0, None),)
     short = diagnosis.Refusal(spread(trail(60))(photograph()), Centroids.empty(), solvers)
     assert re.match("trails of 6[567] px: ", diagnosis.trailed(short))

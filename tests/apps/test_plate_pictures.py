@@ -96,7 +96,7 @@ def answer(
 
 
 def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -> None:
-    """Position and roll of the viewed picture to an arc-minute or two: 8 bits, and JPEG."""
+    """Check pointing and roll of the viewed image to one or two arcminutes, the limit of 8 bits and JPEG."""
     assert found["status"] == "solved"
     ours = stars.cam_from_icrs(found["ra_deg"], found["dec_deg"], found["roll_deg"])
     assert math.degrees((ours * truth.cam_from_lab.inv()).magnitude()) < 0.05
@@ -111,7 +111,7 @@ def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -
 def test_the_answer_refers_to_the_image_as_viewed(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, suffix: str, orientation: int
 ) -> None:
-    """Also for pictures that are stored mirrored (2, 4, 5, 7); the annotated one is the viewed one."""
+    """This holds for mirrored storage (2, 4, 5, 7), too; the annotated image is the viewed one."""
     path = with_exif(tmp_path / f"x{suffix}", STORED[orientation](gray), orientation)
     check_right(answer(path, annotated=tmp_path / "x.annotated.png"), sky[2])
     height, width, _ = cv2.imread(str(tmp_path / "x.annotated.png")).shape
@@ -126,7 +126,7 @@ def test_without_its_orientation_tag_an_image_has_another_attitude(
     orientation: int,
     turned_deg: float,
 ) -> None:
-    """The tests above would hold for a solver that ignores the tag and the turn."""
+    """Without this the tests above would pass for a solver that ignores the tag."""
     tall = math.degrees(
         2 * math.atan(math.tan(math.radians(FOV_DEG / 2)) * (HEIGHT_PX - 1) / (WIDTH_PX - 1))
     )
@@ -163,7 +163,7 @@ def test_exif_gives_the_field_by_the_diagonal(
 def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     gray: NDArray, focal_35mm: int, orientation: int
 ) -> None:
-    """By the longer side (36 mm over 6.52 mm) it is 138 mm. Turned, the field is that of the shorter side."""
+    """By the longer side (36 mm over 6.52 mm) it is 138 mm. In portrait format the field is the shorter side's."""
     seen = images.ViewedImage(
         np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm
     )
@@ -201,7 +201,7 @@ def test_a_phone_s_wide_field_is_solved_by_its_focal_length(tmp_path: Path) -> N
 def test_a_wrong_exif_focal_length_is_abandoned(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
 ) -> None:
-    """A crop, or a lens without contacts; 0 and absurd ones are not even tried."""
+    """For a crop or a manual lens; zero and absurd values are not tried."""
     check_right(answer(with_exif(tmp_path / "x.jpg", gray, 1, 50), None), sky[2])
     for absurd in (1, 65_000):
         unknown = plate_solver.make_solver(None, None)
@@ -252,7 +252,7 @@ def test_every_hypothesis_reduces_the_allowed_chance_probability(
 def test_a_fits_image_has_the_same_attitude_in_either_row_order(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path, order: str | None, highest_first: bool
 ) -> None:
-    """Without ROWORDER both are tried, since the header leaves it open. With a wrong one the sky is a mirrored one."""
+    """Without ROWORDER both orders are tried. With a wrong ROWORDER the sky is mirrored."""
     image = sky[1].image_dn if highest_first else sky[1].image_dn[::-1]
     path = tmp_path / "x.fits"
     fits.PrimaryHDU(image, fits.Header([("ROWORDER", order)] if order else [])).writeto(path)

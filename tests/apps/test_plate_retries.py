@@ -1,4 +1,4 @@
-"""Pictures of which a part, or what is left without the clouds, is the sky."""
+"""Images of which only a part, or the image without clouds, shows the sky."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_an_image_with_a_town_below_is_solved_by_its_upper_half() -> None:
 
 @pytest.mark.slow
 def test_removing_clouds_keeps_the_stars() -> None:
-    """The clouds change the sky by more than the noise within a tile of the background."""
+    """The clouds change the sky within a background tile by more than the noise."""
 
     def clouds(light: NDArray, _: np.random.Generator) -> None:
         y, x = np.mgrid[:960, :1280]
@@ -67,7 +67,7 @@ def test_removing_clouds_keeps_the_stars() -> None:
 
 
 def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
-    """Bars stand before the clouds: what is left of their edges is parallel, and would make every star a track."""
+    """Bars in front of the clouds leave parallel edges, which would flag every star as a track."""
 
     def bars(light: NDArray, _: np.random.Generator) -> None:
         y, x = np.mgrid[:960, :1280]
@@ -91,7 +91,7 @@ def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [29, 32, 36])
 def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number: int) -> None:
-    """Of trails that the detector sees in pieces, more than twice as many stars are then where they are."""
+    """For trails that are detected in pieces, this more than doubles the number of correct centroids."""
     rng = np.random.default_rng([25, number])
     shot = photographs.trailed(rng)
     stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
@@ -120,7 +120,7 @@ def test_round_stars_are_not_taken_for_trails() -> None:
 
 
 def test_an_upper_half_is_solved_in_its_own_field() -> None:
-    """The trackers' field is the upper half; attitude and camera are those of the whole picture."""
+    """The trackers' field is the upper half; attitude and camera refer to the whole image."""
     image, truth = drawn(replace(SHOT, fov_deg=36.0, limit_mag=5.6), 7)
     centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None), None)[
         0

@@ -105,7 +105,7 @@ def test_a_decisive_answer_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> 
 def test_answers_are_taken_in_the_order_of_the_trackers(
     threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However many threads there are: the first decisive one is taken, not the quickest."""
+    """With any number of threads the first decisive answer in order is taken, not the quickest."""
     monkeypatch.setattr(searching, "THREADS", threads)
     for decisive in itertools.permutations(
         [answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0)]

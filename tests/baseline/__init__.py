@@ -1,4 +1,5 @@
-"""What a refactoring must not change, as digests kept in git: `python -m tests.baseline` compares, `--record` records.
+"""Digests in git of results that a refactoring must not change: `python -m tests.baseline` compares them.
 
-Only public faces are used: the command line, `skysim.load_scene`, `simulate`, `render`, `run_study`, and written files.
+`--record` records them. Only public interfaces are used: the command line, `skysim.load_scene`, `simulate`,
+`render`, `run_study`, and written files.
 """

@@ -64,7 +64,7 @@ def run_variant(name: str, keys: dict[str, Any], folder: Path) -> Entries:
 
 
 def run_scene(scene: str, frames: int | None, folder: Path) -> Entries:
-    """Messages, JSON and files of `skysim run`, and what `skysim check` foresees. frames : the scene's if None"""
+    """Messages, JSON and files of `skysim run`, and facts of `skysim check`. frames : the scene's if None"""
     ran = succeed(
         folder,
         "run",
@@ -197,7 +197,7 @@ def run_survey(words: str, folder: Path) -> Entries:
 
 
 def message_cases() -> dict[str, Case]:
-    """What a person reads after a mistake: of the command line, and of Python."""
+    """Error messages for wrong input of the command line and of Python."""
     given = CASES["messages"]
     cases: dict[str, Case] = {
         f"skysim {line}": partial(refused, line) for line in given["commands"].splitlines()
@@ -206,7 +206,7 @@ def message_cases() -> dict[str, Case]:
 
 
 def refused(line: str, folder: Path) -> Entries:
-    """Exit code and text of a command that is wrong."""
+    """Exit code and text of a wrong command."""
     write_files(folder, CASES["messages"]["files"])
     ran = run(folder, *shlex.split(line))
     yield "", f"{ran.code}: {ran.err.strip()}"

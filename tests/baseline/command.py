@@ -1,4 +1,4 @@
-"""Run `skysim` in a forked process, which has imported everything already and keeps nothing of an earlier command."""
+"""Run `skysim` in a forked process that has all imports and no state of an earlier command."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def ecsv(path: Path) -> Entries:
 
 
 def steady(value: Any) -> Any:
-    """JSON without what changes from run to run."""
+    """JSON without values that change from run to run."""
     if isinstance(value, dict):
         return {key: steady(inner) for key, inner in value.items() if not CHANGING.fullmatch(key)}
     if isinstance(value, list):  # without sentences about times

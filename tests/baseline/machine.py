@@ -1,4 +1,4 @@
-"""What floating-point results depend on beside the code: the processor's instructions, and versions of libraries."""
+"""What floating-point results depend on besides the code: processor instructions and library versions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def machine() -> dict[str, str]:
 
 
 def differences(recorded: dict[str, str]) -> list[str]:
-    """One line for each value that was another one where and when the digests were recorded."""
+    """One line for each value that differs from that of the recording machine."""
     return [
         f"recorded with {name} {recorded.get(name)}, here {value}"
         for name, value in machine().items()

@@ -1,4 +1,4 @@
-"""Sky, Moon and stray light against the law of illumination, published values and geometry done otherwise."""
+"""Sky, Moon and stray light against the law of illumination, published values and independent geometry."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def glow(**part: object) -> light.Glow:
 
 
 def lab_place(right_deg: float) -> tuple[float, float]:
-    """Right ascension and declination, in degrees, of what stands so far to the right of the boresight."""
+    """Right ascension and declination, deg, of a point at this angle to the right of the boresight."""
     angle = np.radians(right_deg)
     x, y, z = POINTING.inv().apply([np.sin(angle), 0.0, np.cos(angle)])
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
 def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
-    """Worked out at every third pixel itself, for comparison."""
+    """Background computed directly at every third pixel, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
     toward, pixel_sr = pixel_directions(np.column_stack([x.ravel(), y.ravel()]).astype(float), lens)
@@ -82,7 +82,7 @@ def drawn(config: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarr
     return image
 
 
-def test_every_kind_of_the_schema_is_known() -> None:
+def test_every_background_kind_of_the_schema_is_implemented() -> None:
     union = typing.get_args(typing.get_args(light.Glow)[0])
     assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(
         BACKGROUNDS
@@ -176,7 +176,7 @@ def test_the_sky_s_gradient_is_relative_per_degree() -> None:
 
 
 def vmag_arcsec2(nanolamberts: float) -> float:
-    """KS91 eq. 1 turned round."""
+    """Inverse of KS91 eq. 1."""
     return (20.7233 - np.log(nanolamberts / 34.08)) / 0.92104
 
 
@@ -230,7 +230,7 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
 
 
 def test_the_sun_s_stray_light_matches_its_transmittance() -> None:
-    """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, half of it made electrons."""
+    """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, with an efficiency of one half."""
     ra_deg, dec_deg = lab_place(110.0)
     sun = glow(kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12))
     wavelength = np.linspace(400e-9, 1000e-9, 6001)

@@ -134,7 +134,7 @@ def test_the_stray_light_of_a_near_earth_is_that_of_its_ground(
 
 
 def steps(count: int) -> Floats:
-    """Middles of even steps around a circle."""
+    """Centers of equal steps around a circle."""
     return (np.arange(count) + 0.5) * 2 * np.pi / count
 
 
@@ -163,7 +163,7 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
 
 @pytest.mark.slow
 def test_stray_light_follows_orbit_and_date() -> None:
-    """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
+    """The Sun gives none behind the Earth; the Earth's light is strongest over the day side; both depend on season."""
     lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
     around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
     assert 0.55 < np.mean(["the Sun" in one for one in around]) < 1

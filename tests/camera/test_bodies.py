@@ -1,4 +1,4 @@
-"""Discs in a frame: against a hundred thousand points drawn one by one, and against the light that they must have."""
+"""Discs in a frame against a hundred thousand single points and against their total light."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def camera(focal_px: float, psf: dict[str, object]) -> CameraConfig:
 
 
 def toward(direction: Floats, off_px: tuple[float, float], optics: Optics) -> Rotation:
-    """lab_from_cam that puts a direction so many pixels from the chip's center."""
+    """lab_from_cam that images a direction at this offset, px, from the chip's center."""
     z = direction
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
@@ -169,7 +169,7 @@ def test_the_moon_eclipses_the_sun() -> None:
 
 
 def test_a_star_behind_the_moon_is_hidden() -> None:
-    """Within its radius of 0.26 degrees, and by the vehicle's parts as before."""
+    """Stars within its radius of 0.26 deg are hidden, in addition to those behind vehicle parts."""
     moon = light("moon")
     stars = points_of(moon, np.array([[0.0, 0.0], [0.7, 0.7], [0.0, 1.01]]))
     hidden = drawing.behind([moon], None)
@@ -181,8 +181,8 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
     assert drawing.behind([], None) is None
 
 
-def test_a_disc_takes_no_light_from_the_pixels_around_it() -> None:
-    """Rounding of the transforms is far below zero beside a bright disc; sums of such pixels alone were negative."""
+def test_a_disc_does_not_darken_the_surrounding_pixels() -> None:
+    """Rounding of Fourier transforms beside a bright disc must not make sums of pixels negative."""
     light = np.zeros((40, 40))
     patches = np.zeros((2, 2, 9, 9))
     light[10:30, 10:30] = 1e12

@@ -1,4 +1,4 @@
-"""Blooming, transfer loss and smear against the same processes acted out step by step."""
+"""Blooming, transfer loss and smear against step-by-step simulations of the same processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def frame(column: np.ndarray, width: int = 3) -> np.ndarray:
 
 
 def halve_till_it_fits(column: np.ndarray) -> np.ndarray:
-    """Every over-full pixel gives its excess in halves to its neighbors, all at once, over and over."""
+    """Repeatedly move the excess of every overfull pixel in halves to its neighbors, all at once."""
     charge = np.concatenate([[0.0], column, [0.0]])  # the two outer places swallow
     while (excess := np.maximum(charge[1:-1] - WELL, 0)).max() > 1e-7 * WELL:
         charge[1:-1] -= excess

@@ -1,4 +1,4 @@
-"""Chromatic aberration: what a lens does to a light of many wavelengths, against rays of every one of them."""
+"""Chromatic aberration: images of polychromatic light against rays of each wavelength."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_mean_and_spread_of_a_light(case: str) -> None:
 def test_chromatic_images_match_the_integral_over_wavelength(case: str) -> None:
     """Mean position and mean square radius of rays of every wavelength from every part of the pupil.
 
-    The LEDs are out of focus by their distance as well, which some colors make up for.
+    The LEDs are also defocused by their distance, which some wavelengths compensate.
     """
     moments, spectrum, distance_m = CASES[case]
     config = camera(focus="0.7 m") if distance_m else camera()
@@ -215,7 +215,7 @@ CELESTIAL = "{kind: celestial, cap_deg: 10, count: 20, camera: [0 m, 0 m, 0 m], 
     ],
 )
 def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) -> None:
-    """And is imaged where its mean wavelength is."""
+    """The image is at the place for its mean wavelength."""
     lab = build_lab(loader.load(scene, keys | {"camera.chromatic": LENS}))
     sources = lab.camera.sources
     config = lab.scene.camera

@@ -1,4 +1,4 @@
-"""Tracks of particles against the laws they are drawn from, and every electron accounted for."""
+"""Tracks of particles against their laws, with charge conserved."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def protons(**part: object) -> ParticlesConfig:
 
 
 def many(count: int = 100_000, **part: object) -> np.ndarray:
-    """Tracks, about so many, of a chip without margins worth mentioning: 0.06 cm2 and a depth of 1 nm."""
+    """About this number of tracks on a chip with negligible margins: 0.06 cm2 and a depth of 1 nm."""
     thin = protons(per_cm2_s=count / 0.06, depth="1 nm", **part)
     return draw_tracks(thin, SHAPE, 1.0, PIXEL_M, np.random.default_rng(1))
 
 
 def test_the_count_is_flux_times_area_times_time() -> None:
-    """What goes in within the frame is Poisson: mean and variance of 400 exposures."""
+    """Entries within the frame are Poisson: mean and variance of 400 exposures."""
     rng = np.random.default_rng(2)
     counts = []
     for _ in range(400):
@@ -50,7 +50,7 @@ def test_entry_points_are_uniform_over_the_frame() -> None:
     assert stats.kstest((tracks["y_px"] + 0.5) / 200, "uniform").pvalue > 1e-4
 
 
-def test_directions_are_those_of_an_isotropic_flux_through_a_plate() -> None:
+def test_directions_follow_an_isotropic_flux_through_a_plate() -> None:
     """p(theta) = sin 2 theta: the cosine's square is uniform, azimuths are too."""
     tracks = many()
     cosine = 1e-9 / tracks["length_m"]
@@ -67,7 +67,7 @@ def test_the_mean_path_through_a_plate_is_twice_its_depth() -> None:
     assert length.mean() == pytest.approx(2 * (1 - 1 / MAX_TANGENT), abs=4 * sigma)
 
 
-def test_an_image_of_a_track_is_as_long_as_its_tangent_says() -> None:
+def test_a_track_s_image_has_the_length_of_depth_times_tangent() -> None:
     tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
     np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)
@@ -109,7 +109,7 @@ def test_every_electron_of_a_track_within_the_frame_is_in_it(
 
 @pytest.mark.slow
 def test_charge_is_spread_evenly_along_the_track() -> None:
-    """Sum over rows of a level track: 10 electrons a pixel of way, half in the end pixels; rows are a Gaussian."""
+    """Sum over rows of a level track: 10 electrons per pixel, half in the end pixels; rows are Gaussian."""
     image = np.zeros((41, 141))
     deposit(image, np.array([[20.0, 20.0, 120.0, 20.0]]), np.array([1000.0]), 0.5)
     columns = image.sum(axis=0)

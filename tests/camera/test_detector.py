@@ -1,4 +1,4 @@
-"""Charge to numbers: every step's law, the exact distribution of the numbers, and the chip's two ends."""
+"""From charge to DN: the law of each step, the exact distribution of DN, and clipping at both ends."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any
 def law(
     mean_e: float, read_e: float, gain: float, offset: float, bits: int, well_e: float
 ) -> np.ndarray:
-    """Probability of every number: Poisson electrons, held by the well, plus a Gaussian, rounded, clipped."""
+    """Probability of every DN: Poisson electrons clipped at the well, plus Gaussian noise, rounded and clipped."""
     n = np.arange(int(mean_e + 12 * np.sqrt(mean_e)) + 12)
     edges_e = (np.arange(2**bits - 1) + 0.5 - offset) * gain
     held = np.minimum(n, well_e)
@@ -251,7 +251,7 @@ def test_charge_is_clipped_at_full_well() -> None:
     np.testing.assert_array_equal(made, 4064)
 
 
-def test_read_noise_comes_after_the_well_and_so_shows_above_it() -> None:
+def test_read_noise_is_added_after_clipping_at_full_well() -> None:
     made = frame(1e5, full_well_e=40000, gain_e_dn=10, offset_dn=64, read_noise_e=50)
     assert made.mean() == pytest.approx(4064, abs=4 * 5 / np.sqrt(N))
     assert made.std() == pytest.approx(np.sqrt(25 + 1 / 12), abs=4 * 5 / np.sqrt(2 * N))
@@ -411,7 +411,7 @@ def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None
 
 
 def test_row_by_row_simulation_equals_step_by_step_simulation() -> None:
-    """A threshold of blooming that nothing reaches sends the frame the longer way."""
+    """An unreachable blooming threshold selects the step-by-step code."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
     spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
     short, long = (

@@ -102,7 +102,7 @@ def test_galactic_latitudes_match_astropy() -> None:
     )
 
 
-def test_the_glow_of_a_field_is_that_of_a_sky_of_the_same_magnitude() -> None:
+def test_the_glow_of_a_field_equals_a_sky_of_the_same_magnitude() -> None:
     """A field on the galactic equator and the uniform sky of the brightness that the law gives there."""
     optics = Optics.from_camera(loader.load("shefex2").camera)
     band = Band.from_efficiency(0.5)

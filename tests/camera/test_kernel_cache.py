@@ -1,4 +1,4 @@
-"""Which image each source makes, and that no two share what they should not."""
+"""Kernel of each source, and which sources may share one."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
     assert made.reach_px[1] >= 6.5 * 2.5
 
 
-def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
+def test_sharpness_is_the_sigma_of_a_gaussian_and_of_an_edge() -> None:
     assert sharpness_px(build_kernel(camera().psf, camera())) == pytest.approx(
         np.sqrt(0.49 + 1 / 12), rel=1e-12
     )

@@ -45,7 +45,7 @@ def lens_of(**changes: Any) -> Optics:
 def led(
     lens: Optics, xy_px: tuple[float, float], incidence_deg: float, around_deg: float = 20.0
 ) -> Sources:
-    """An LED of unit strength imaged there, its normal inclined to the line of sight."""
+    """An LED of unit strength imaged at this place, with its normal inclined to the line of sight."""
     place = DEPTH_M * np.append(
         (np.array(xy_px) - lens.camera.center_px) / lens.camera.focal_px, 1.0
     )

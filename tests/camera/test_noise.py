@@ -29,7 +29,7 @@ def drawn_normals(seed: int = 0) -> np.ndarray:
 
 
 def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
-    """Share of honest draws that are farther from the law than these; bins of less than 10 are one."""
+    """Probability that draws of the law deviate more than these; bins below 10 are merged."""
     found = np.bincount(numbers, minlength=len(probability))
     wanted = probability * len(numbers)
     assert len(found) == len(wanted), "a number that the law does not have"
@@ -57,7 +57,7 @@ def test_normal_numbers_are_normal() -> None:
     assert chi_square(bins, np.diff(stats.norm.cdf(edges))) > 1e-4
 
 
-def test_the_logarithm_is_that_of_double_precision() -> None:
+def test_the_fast_logarithm_matches_double_precision() -> None:
     """Of mantissa and exponent as `normal` takes a number apart; relative, also near 1, where it vanishes."""
     u = np.concatenate(
         [np.geomspace(2.0**-32, 0.999, 2000), 1 - np.geomspace(2.0**-24, 0.3, 2000)]
@@ -96,7 +96,7 @@ def test_the_least_uniform_numbers_have_the_law_s_tail() -> None:
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 8, 9, 31, 33])
 def test_rows_of_any_width_are_normally_distributed(width: int) -> None:
-    """Also the last pixel of an odd row, and where small and large means are side by side."""
+    """This includes the last pixel of an odd row, and adjacent small and large means."""
     memory = noise.scratch(width)
     seeds = noise.seeds(np.random.default_rng(width), 4000)
     normals = np.empty((4000, width), np.float32)
@@ -127,7 +127,7 @@ def test_noise_of_neighbors_and_rows_is_independent() -> None:
 
 
 def test_counts_and_the_numbers_that_follow_are_independent() -> None:
-    """A bright pixel must not tell the next one's fortune, though both come of one stream."""
+    """A bright pixel must be independent of the next one, though both use one random stream."""
     for mean in (0.3, 5.0, 50.0):
         made = drawn_counts(mean, seed=9)
         r = np.corrcoef(made[:, 1:].ravel(), made[:, :-1].ravel())[0, 1]

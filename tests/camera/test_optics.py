@@ -1,4 +1,4 @@
-"""Projection against OpenCV's, the light let through against rays traced, and the camera's own sizes by hand."""
+"""Projection against OpenCV, vignetting against traced rays, and camera dimensions against hand calculations."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_beyond_the_fold_of_barrel_distortion_there_is_no_image() -> None:
     ],
 )
 def test_the_fold_is_where_the_image_stops_growing(distortion: tuple[float, ...]) -> None:
-    """By walking outwards."""
+    """The fold is found by stepping outward."""
     k1, k2, _, _, k3 = distortion
     r = np.linspace(0, 10, 1_000_001)
     shrinks = np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) < 0
@@ -154,7 +154,7 @@ def test_the_field_reaches_the_farthest_corner_of_a_shifted_chip() -> None:
 
 @pytest.mark.parametrize("k1", [-0.3, -0.1, 0.2, 0.5])
 def test_the_field_undoes_distortion(k1: float) -> None:
-    """What stands at that angle, towards the farthest corner of a wide lens's chip, OpenCV puts on that corner."""
+    """OpenCV projects the direction at this angle toward the farthest corner onto that corner."""
     lens = optics(
         focal_length="7 mm", distortion=[k1, 0, 0, 0, 0], principal_point_px=[300.0, 250.0]
     )
@@ -180,7 +180,7 @@ def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:
 
 @pytest.mark.parametrize("distortion", [[0, 0, 0, 0, 0], [-0.3, 0.1, 0, 0, 0], [0.3, 0, 0, 0, 0]])
 def test_the_field_is_never_too_small(distortion: list[float]) -> None:
-    """Whatever a camera images is within it."""
+    """Every imaged direction is within the field."""
     lens = optics(focal_length="8 mm", principal_point_px=[500.0, 100.0], distortion=distortion)
     vectors = rays(5000, 50, 3)
     xy = lens.project(vectors)
@@ -224,7 +224,7 @@ def test_the_pupil_collects_its_area_times_the_transmission() -> None:
 
 
 def test_a_point_s_light_falls_with_the_pupil_s_foreshortening() -> None:
-    """And not with cos^4, which is an extended source's."""
+    """It does not fall with cos^4, the law of an extended source."""
     angle = np.radians([0, 30, 60, 89, 90, 91, 180])
     wanted = [1, np.sqrt(0.75), 0.5, np.cos(np.radians(89)), 0, 0, 0]
     np.testing.assert_allclose(optics().throughput(np.cos(angle)), wanted, rtol=0, atol=1e-15)
@@ -279,7 +279,7 @@ def test_a_table_of_transmission_is_linear_between_its_angles_and_level_beyond()
 
 @pytest.mark.slow
 def test_a_star_s_electrons_are_scaled_by_vignetting() -> None:
-    """Through the renderer: at the cosine and vignetting of 10 deg off axis, (axis / edge) is their product."""
+    """Rendered at 10 deg off axis, the ratio to the axis is the product of cosine and vignetting."""
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 40}, focal_length="15 mm")
     angle = np.radians([0.0, 8.0])
     place = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle), 0 * angle])

@@ -64,7 +64,7 @@ def draw(image: Kernel, x: float, y: float, size: int) -> Floats:
 
 
 def profile(image: Kernel, radii: Floats) -> Floats:
-    """The image along the x axis."""
+    """Profile of the image along the x axis."""
     return np.array(
         [draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii]
     )
@@ -225,7 +225,7 @@ def brute(parts: list[Floats], fine: int, x: float, y: float, size: int) -> Floa
 
 
 def fine_grid(size: int, fine: int) -> tuple[Floats, Floats]:
-    """Places of the cells of the fine grid, from its middle cell."""
+    """Positions of the fine grid's cells relative to its center cell."""
     at = (np.arange(size * fine) - (size * fine) // 2) / fine
     return np.meshgrid(at, at)
 
@@ -271,7 +271,7 @@ def test_blurs_add_in_quadrature() -> None:
             )
 
 
-def test_a_kernel_is_made_once_for_sizes_that_are_all_but_equal() -> None:
+def test_nearly_equal_sizes_share_a_kernel() -> None:
     lens = camera()
     psf = GaussianPsfConfig(sigma_px=0.7)
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)

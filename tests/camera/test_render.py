@@ -1,4 +1,4 @@
-"""What falls on the chip: energy, place, shape and smear against integrals done here by other means."""
+"""Light on the chip: energy, position, shape and smear against independent integrals."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
 
 
 def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
-    """The same with another Gaussian, or a disk with a Gaussian edge."""
+    """The same camera with another Gaussian, or a disk with a Gaussian edge."""
     kind = {"kind": "disk", "radius_px": radius_px} if radius_px else {"kind": "gaussian"}
     return lens_of(psf=kind | {"sigma_px": sigma_px})
 
@@ -70,7 +70,7 @@ STILL = turning([0, 0, 0])
 
 
 def light(**fields: object) -> Sources:
-    """One star on the boresight of one photon per second and square meter, but for what is given."""
+    """One star on the boresight with one photon per second and square meter, unless given otherwise."""
     made = {
         "id": np.array([7]),
         "place": np.array([[0.0, 0.0, 1.0, 0.0]]),
@@ -157,7 +157,7 @@ def test_a_disk_of_any_size_keeps_every_electron(radius_px: float, sigma_px: flo
 
 
 def test_a_smeared_star_keeps_every_electron() -> None:
-    """The star walks 20 px across; the cosine of its angle is 1 to 1e-5."""
+    """The star moves 20 px across; the cosine of its angle is 1 to 1e-5."""
     image, seen = shot(star_at(31.5, 23.5, 1e4), turning([0, 20 / 2500, 0]))
     assert seen.streak_px[0] == pytest.approx(20, abs=0.01)
     assert image.sum() == pytest.approx(1e4, rel=1.5e-5)
@@ -301,7 +301,9 @@ def test_the_smear_of_shefex_matches_the_reference() -> None:
 
 
 @pytest.mark.parametrize("length_px", [0.1, 1.0, 4.41, 15.0])
-def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length_px: float) -> None:
+def test_a_smeared_star_has_its_path_s_length_and_is_centered_at_mid_exposure(
+    length_px: float,
+) -> None:
     """A uniform line of length L has the variance L^2 / 12 along itself and none across."""
     image, seen = shot(star_at(31.5, 23.5), turning([0, length_px / 2500, 0]))
     mean, variance = moments(image)
@@ -318,7 +320,7 @@ def test_a_smeared_star_is_as_long_as_its_path_and_stands_at_mid_exposure(length
 
 
 def test_stars_move_opposite_to_the_camera() -> None:
-    """Turning about body y (down) by the right-hand rule swings the boresight to +x: stars go left."""
+    """A right-handed rotation about body y (down) moves the boresight to +x and stars to the left."""
     _, early = draw(light(), Window(0.0, 0.1), turning([0, 0.004, 0]))
     _, late = draw(light(), Window(0.9, 0.1), turning([0, 0.004, 0]))
     assert early.xy_px[0, 0] - late.xy_px[0, 0] == pytest.approx(0.9 * 0.004 * 2500, rel=1e-4)
@@ -335,7 +337,7 @@ def test_a_roll_moves_stars_by_radius_times_angle_and_keeps_the_boresight() -> N
 @pytest.mark.parametrize(
     ("length_px", "ratio"), [(2, 0.78), (3, 0.61), (4.41, 0.43), (8.8, 0.22), (15, 0.13)]
 )
-def test_the_peak_of_a_smeared_star_is_that_of_the_line_integral(
+def test_the_peak_of_a_smeared_star_matches_the_line_integral(
     length_px: float, ratio: float
 ) -> None:
     # Reference §3, sigma .7: peak relative to the still star's.
@@ -375,7 +377,7 @@ def test_a_streak_is_the_integral_of_its_moments(angle_deg: float) -> None:
 def test_a_smeared_disk_s_integration_has_converged(
     monkeypatch: pytest.MonkeyPatch, radius_px: float, length_px: float
 ) -> None:
-    """In pieces of a twentieth the image is no other one."""
+    """With steps of a twentieth the image is the same."""
     path = turning([0.6 * length_px / 2500, 0.8 * length_px / 2500, 0])
     usual, _ = shot(star_at(31.3, 23.1), path, blurred(0.8, radius_px))
     monkeypatch.setattr(rendering, "STEP", rendering.STEP / 20)
@@ -410,7 +412,7 @@ def test_a_star_that_sweeps_through_from_outside_the_field_is_not_missed() -> No
 
 @pytest.mark.slow
 def test_stars_that_cross_the_field_between_two_samples_are_not_missed() -> None:
-    """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
+    """One revolution per second, sampled nine times: every star on the equator gives the same light."""
     around = np.radians(np.arange(0, 360, 7.5))
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
     ring = with_sources(stars)
@@ -587,7 +589,7 @@ def test_jitter_widens_a_star_by_its_own_variance() -> None:
 
 
 def test_a_step_of_the_attitude_draws_two_stars() -> None:
-    """Half of the exposure here, half there: 20 px apart, a jump of 1 ms between them."""
+    """Half of the exposure at each of two places 20 px apart, with a step of 1 ms between them."""
     t = np.concatenate([np.arange(0, 0.5, 1e-3), np.arange(0.5, 3, 1e-3)])
     turned = np.where(t < 0.5, 0.0, 20 / 2500)
     leap = Trajectory(t, Rotation.from_rotvec(np.outer(turned, [0, 1, 0])), np.zeros((len(t), 3)))
@@ -853,7 +855,7 @@ def test_electrons_are_proportional_to_time_and_pupil_area() -> None:
 
 
 def test_rendering_in_batches_equals_rendering_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Patches of many sources do not fit in a frame at once; the outcome does not tell."""
+    """Patches of many sources are processed in batches, which does not change the result."""
     rng = np.random.default_rng(2)
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]
     stars = with_sources(many)

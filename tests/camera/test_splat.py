@@ -1,4 +1,4 @@
-"""Drawing: light kept, where it belongs, row by row, at sub-pixel places; against error functions and moments."""
+"""Drawing of kernels: light, position and rows at sub-pixel offsets, against error functions and moments."""
 
 from __future__ import annotations
 

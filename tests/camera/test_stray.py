@@ -79,7 +79,7 @@ DEEP = {
 
 @pytest.mark.slow
 def test_reflections_are_in_the_frame_and_its_truth() -> None:
-    """A deep dome: what the wall mirrors is drawn where its truth says, and nothing else changes."""
+    """In a deep dome reflections are drawn at their true positions, and nothing else changes."""
     black, _ = frame(
         "apl_dome", {key: value for key, value in DEEP.items() if key != "light.reflection"}
     )
@@ -140,7 +140,7 @@ def test_ghosts_are_mirrored_through_the_axis(magnification: float) -> None:
 GLARE = GlareConfig(share=0.1, exponent=3.0, core_px=16.0)
 
 
-def test_glare_keeps_all_light() -> None:
+def test_glare_conserves_light() -> None:
     light = np.random.default_rng(3).exponential(50.0, (240, 400))
     total = light.sum()
     add_glare(light, GLARE)

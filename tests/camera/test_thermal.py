@@ -45,7 +45,7 @@ def config(temperature: dict[str, Any], **rest: Any) -> ThermalConfig:
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
 def test_temperature_after_an_hour_and_a_half(history: dict[str, Any], expected_c: float) -> None:
-    """And with a history three times as fast, after half an hour."""
+    """The same holds after half an hour for a history three times as fast."""
     assert temperature_c(config(history), 5400.0) == pytest.approx(expected_c, abs=1e-12)
     assert temperature_c(config(history, speed=3.0, **MOUNT), 1800.0) == pytest.approx(
         expected_c, abs=1e-12
@@ -95,7 +95,7 @@ def test_image_grows_with_the_focal_length() -> None:
 
 @pytest.mark.slow
 def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
-    """Every frame's camera is turned by the coefficient times dT about its own axes, and its stars are there."""
+    """Every frame's camera is rotated by the coefficient times dT about its axes, and so are its stars."""
     settings = {
         "thermal.temperature": "{kind: linear, start_c: 19, rate_c_h: 2}",
         "thermal.speed": "1800",

@@ -1,4 +1,4 @@
-"""Errors: parts that survive every copy, one line that a terminal can show, and laws of all code that raises them."""
+"""Errors: parts survive every copy, the text is one printable line, and rules for all code that raises them."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def catchers(tree: ast.AST) -> Iterator[ast.ExceptHandler]:
 
 
 def reads_text(node: ast.AST, error: str) -> bool:
-    """Whether an expression takes the text of an error apart, searches it, or makes a key of it."""
+    """Whether an expression splits or searches the text of an error, or uses it as a key."""
     if isinstance(node, ast.Compare):
         return any(mentions(one, "str") and mentions(one, error) for one in node.comparators)
     if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute | ast.Name):

@@ -1,4 +1,4 @@
-"""What is written comes back, astropy reads it as meant, and damage is one line."""
+"""Files round-trip, astropy reads them correctly, and damaged files are one error line."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def written(sky: Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def complaint(path: Path) -> str:
-    """The one line that a bad file gets."""
+    """One-line error text for a bad file."""
     with pytest.raises(InputError) as refusal:
         images.read_image(path)
     message = str(refusal.value)
@@ -305,7 +305,7 @@ with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "fra
 
 
 def test_only_temporary_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
-    """Not what a live process writes, ours or another, nor another machine's, nor hidden files of the user's."""
+    """Files of live processes, of other machines and hidden files of the user are kept."""
     subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
     left = {path.name for path in tmp_path.iterdir()}
     assert len(left) == 2
@@ -410,7 +410,7 @@ def test_the_image_of_an_extension_is_found(tmp_path: Path) -> None:
 def test_a_few_flipped_bytes_give_an_image_or_one_error_line(
     written: Path, tmp_path: Path, seed: int
 ) -> None:
-    """Whatever the damage to a header: no other exception, no warning. A lie that is valid FITS stays one."""
+    """No damage to a header causes another exception or a warning. Valid FITS with wrong values is read."""
     rng = np.random.default_rng(seed)
     data = bytearray((written / "frame_0000.fits").read_bytes())
     data[int(rng.integers(0, 2880))] = int(rng.integers(0, 256))

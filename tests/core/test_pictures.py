@@ -1,4 +1,4 @@
-"""Pictures as a person sees them: EXIF's orientation, FITS row orders, packed and color FITS, planar TIFF."""
+"""Images oriented as viewed: EXIF orientation, FITS row orders, packed and color FITS, planar TIFF."""
 
 from __future__ import annotations
 

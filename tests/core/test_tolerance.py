@@ -1,4 +1,4 @@
-"""Errors as a data sheet states them: their moments, their bounds, and what a wrong one is answered."""
+"""Tolerances as on a data sheet: moments, bounds, and error messages for wrong ones."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ TABLES = [words for words in commands(DOME) + commands(ESTIMATOR) if words[0] ==
 @pytest.mark.long
 @pytest.mark.parametrize("words", TABLES, ids=" ".join)
 def test_the_page_s_tables_can_be_printed(words: list[str]) -> None:
-    """With two trials a row in place of the page's."""
+    """Run with two trials per row instead of the page's number."""
     assert len(printed_with(words, 2)) >= 5
 
 
@@ -68,7 +68,7 @@ def printed_with(words: list[str], trials: int) -> list[str]:
 
 @pytest.mark.long
 def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
-    """As it is typed there: solved stops and errors after it, to a tenth of what the table says."""
+    """The command runs as typed there; solved stops and errors agree to a tenth with the table."""
     (words,) = [words for words in commands() if words[0] == "skysim"]
     command = [sys.executable, "-m", *words]
     done = subprocess.run(
@@ -91,7 +91,7 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
     "words", [words for words in commands() if words[0] == "skysim"], ids=" ".join
 )
 def test_the_page_s_skysim_commands_parse(words: list[str]) -> None:
-    """Their options are: the run itself is `test_measure.py`'s."""
+    """Only options are parsed; `test_measure.py` runs a survey."""
     done = subprocess.run(
         [sys.executable, "-m", "skysim", words[1], "--help"],
         cwd=ROOT,

@@ -68,7 +68,7 @@ NUMBER = re.compile(r"[-+−]?\d[\d.,e+]*")
 
 
 class Block(NamedTuple):
-    """A code block: its language, and what is in it."""
+    """A code block: its language and text."""
 
     language: str
     text: str
@@ -88,7 +88,7 @@ def all_pages() -> list[Path]:
 
 
 def walked() -> list[Any]:
-    """The pages that have something to run and no test of their own."""
+    """Pages with blocks to run and without a test of their own."""
     pages = [path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE]
     running = [
         path
@@ -101,7 +101,7 @@ def walked() -> list[Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """A folder like the checkout, in which we stand."""
+    """A folder like the checkout, as the working directory."""
     for name in ("scenes", "data"):
         (tmp_path / name).symlink_to(ROOT / name)
     with contextlib.chdir(tmp_path):
@@ -153,7 +153,7 @@ def test_a_page_s_blocks_run_in_order(
 
 
 def ran(line: str) -> str:
-    """What a command prints. `make` is what runs this test: of it, whether it knows what to do."""
+    """Text printed by a command. `make` runs this test itself, so only its targets are checked."""
     program, *words = shlex.split(line, comments=True)
     if program == "make":
         done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
@@ -179,7 +179,7 @@ def shape(line: str) -> str:
 
 @pytest.mark.parametrize("path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_every_block_states_its_language(path: Path) -> None:
-    """So that what is not run is seen to be: a `text` block, never an unknown language."""
+    """Blocks that are not run are `text` blocks; unknown languages are refused."""
     assert [block for block in blocks(path) if block.language not in LANGUAGES] == []
     assert path.read_text(encoding="utf-8").count("```") == 2 * len(blocks(path)) + 0
 
@@ -205,7 +205,7 @@ def nav(part: Any) -> Iterator[str]:
 
 
 class Loader(yaml.SafeLoader):
-    """Reads mkdocs.yml, whose functions are none of ours."""
+    """Reader of mkdocs.yml that ignores its Python functions."""
 
 
 Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda *_: None)
@@ -239,7 +239,7 @@ def test_every_name_in_the_reference_is_a_module() -> None:
 
 
 def test_the_reference_holds_every_module_that_a_page_names() -> None:
-    """What a reader imports or is sent to; the browser's lab and the papers apart, which are no library."""
+    """Modules that a reader imports or is referred to, except the browser lab and the papers."""
     text = "".join(path.read_text(encoding="utf-8") for path in all_pages())
     files = re.findall(r"(?<!tests/)\b((?:skysim|estimator)/[\w/]+)\.py", text)
     for package, name in re.findall(

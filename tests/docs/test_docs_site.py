@@ -21,7 +21,7 @@ from skysim.scene.sections.tracker import SurveyErrorsConfig
 
 
 def of_the_site(name: str) -> ModuleType:
-    """A module beside the site's settings, which no package holds."""
+    """A module next to the site's settings, outside of any package."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -44,7 +44,7 @@ SECTIONS = dict(
 
 
 def helped(*words: str) -> str:
-    """What --help prints, on a terminal wide enough."""
+    """Text of --help on a wide terminal."""
     result = CliRunner().invoke(
         main.app, [*words, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
     )
@@ -67,7 +67,7 @@ def test_every_command_that_help_names_has_its_section() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_has_the_options_that_help_shows(name: str) -> None:
-    """And each of them, and every argument, with a word on what it is for."""
+    """Each option and argument has a description."""
     starts = re.findall(r"^│[ *]+((?:--[a-z0-9-]+ +)+)", helped(*name.split()), re.MULTILINE)
     shown = {option for start in starts for option in start.split()}
     rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", SECTIONS[name], re.MULTILINE))
@@ -192,7 +192,7 @@ def test_every_make_target_named_by_a_page_exists() -> None:
 
 @pytest.mark.parametrize("name", ["run", "weekly"])
 def test_every_make_target_of_ci_exists(name: str) -> None:
-    """Scripts that bash can read and anybody can start; CONTRIBUTING names them, and the parts of the weekly one."""
+    """The scripts parse in bash and are executable; CONTRIBUTING names them and the parts of the weekly one."""
     script = ROOT / ".ci" / name
     subprocess.run(["bash", "-n", script], check=True)
     assert os.access(script, os.X_OK)

@@ -1,4 +1,4 @@
-"""The package's README: its code runs on a picture, its tables name what there is."""
+"""The package's README: its code solves an image, and its tables list every algorithm."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def picture(cam_from_icrs: Rotation) -> np.ndarray:
-    """A gray 8-bit photograph of a field of 0.26 rad, a focal length of 2 % more, stars of one pixel's blur."""
+    """A gray 8-bit image of a field of 0.26 rad, focal length 2 % longer, star blur of one pixel."""
     camera = Camera.from_fov(1000, 800, 0.26).zoomed(1.02)
     stars = catalog.read(ROOT / "data/catalogs/hipparcos_hp6.5.ecsv")
     xy = camera.pixels(cam_from_icrs.apply(stars.vectors))

@@ -66,7 +66,7 @@ def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> No
 
 
 def test_a_new_run_removes_the_exports_of_the_old_one(tmp_path: Path) -> None:
-    """They would speak of other frames."""
+    """Old exports would describe other frames."""
     mine = tmp_path / "notes.aem"
     for name in (*recording.EXPORT_FILES, "frame_0003.tif", mine.name):
         (tmp_path / name).write_bytes(b"")

@@ -1,4 +1,4 @@
-"""The blocks of docs/howto/scene.md are scenes that fly and solve; its error message is what a user sees."""
+"""The blocks of docs/howto/scene.md run and are solved; its error message is the real one."""
 
 import re
 import subprocess

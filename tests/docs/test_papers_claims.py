@@ -14,13 +14,13 @@ PAGE = (ROOT / "docs/findings/datasheets/papers.md").read_text(encoding="utf-8")
 
 
 def row(begin: str) -> str:
-    """The only row of the table that begins so."""
+    """The only row of the table that starts with this text."""
     (found,) = [line for line in PAGE.splitlines() if line.startswith(f"| {begin}")]
     return found
 
 
 def lowest(failures: int, runs: int) -> float:
-    """The probability of success at which so few failures have a probability of 5 %: of the binomial distribution."""
+    """Success probability at which this few failures have a binomial probability of 5 %."""
     return float(
         scipy.optimize.brentq(
             lambda p: scipy.stats.binom.cdf(failures, runs, 1 - p) - 0.05, 0.01, 1 - 1e-9

@@ -1,4 +1,4 @@
-"""The README runs, its links lead somewhere, and the table of changes names what is there."""
+"""The README's blocks run, its links have targets, and its table of changes names existing files."""
 
 import re
 import subprocess

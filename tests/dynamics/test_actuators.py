@@ -1,4 +1,4 @@
-"""Wheels, fans and gyros against a body that keeps its angular momentum, and the known facts of the CMG pyramid."""
+"""Wheels, fans and CMGs against conservation of angular momentum and known facts of the CMG pyramid."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pyramid_set(steering: str = "singularity_robust", rate_limit_rad_s: float = 1.0) -> CmgSet:
-    """Four of one N m s each at 100 rad/s."""
+    """Four CMGs of one N m s each at 100 rad/s."""
     return CmgSet(*pyramid(SKEW), np.full(4, 0.01), rate_limit_rad_s, None, steering)
 
 
@@ -86,7 +86,7 @@ class Body:
         return self.spin / self.inertia - self.rate @ self.axles(self.angle)
 
     def move(self, dt: float, gimbal_rate=0.0, motor=0.0, outside=STILL) -> Body:
-        """The body dt later (or earlier), with what is commanded held."""
+        """The body dt later (or earlier) under constant commands."""
         n = len(self.inertia)
         gimbal_rate = np.broadcast_to(gimbal_rate, n)
         motor = np.broadcast_to(motor, n)
@@ -105,7 +105,7 @@ class Body:
 
 
 def torque_felt(body: Body, gimbal_rate=0.0, motor=0.0, dt: float = 1e-4) -> np.ndarray:
-    """BUS d(rate)/dt by a central difference, whose own error is of the order of dt squared."""
+    """BUS d(rate)/dt by a central difference with an error of the order of dt squared."""
     later = body.move(dt, gimbal_rate, motor)
     earlier = body.move(-dt, gimbal_rate, motor)
     return BUS @ (later.rate - earlier.rate) / (2 * dt)
@@ -122,7 +122,7 @@ def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelSet:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 4])
 def test_wheels_turn_the_body_and_take_its_momentum(n):
-    """From rest nothing is stored but what they take: rate = BUS^-1 T t, and all of it comes back to zero."""
+    """From rest rate = BUS^-1 T t, and the total momentum stays zero."""
     set_ = wheels(n)
     torque = np.array([0.05, -0.08, 0.03])
     body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL)
@@ -196,7 +196,7 @@ def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
 
 
 def fans(limit_n: float = 0.5) -> FanSet:
-    """A pair about each axis, a meter apart, whose pushes cancel."""
+    """A pair of fans about each axis, one meter apart, whose forces cancel."""
     places = 0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
     pushes = np.array(
         [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
@@ -413,7 +413,7 @@ def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
 
 @pytest.mark.slow
 def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturation():
-    """The whole 2 + 2 c = 3.155 instead of 1.155, at bounded rates, for a stray momentum of a few per cent."""
+    """It reaches 2 + 2 c = 3.155 instead of 1.155 at bounded rates with a few percent of cross momentum."""
     momentum, rates, angles = pushed_along_x(pyramid_set("singularity_robust"), 60)
     full = 2 + 2 * SLANT
     assert 0.999 * full < momentum[-1, 0] <= full
@@ -431,7 +431,7 @@ def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturati
 
 
 def variable(rotor_torque_limit_nm: float = 0.5) -> CmgSet:
-    """Three about the axes of the body, one N m s each at 100 rad/s; at angle zero d(h)/d(angle) is diagonal."""
+    """Three variable-speed CMGs about the body axes, 1 N m s each at 100 rad/s; d(h)/d(angle) is diagonal at zero."""
     return CmgSet(
         np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0, rotor_torque_limit_nm
     )
@@ -441,7 +441,7 @@ THREE = np.full(3, 100.0)
 
 
 def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
-    """Each rotor turned to its best along a direction, against which no gimbal then can move it."""
+    """Gimbal angles with every rotor at its largest component along a direction: a singularity."""
     across = np.cross(set_.gimbal_axes, set_.spin_axes, axis=0)
     return np.arctan2(along @ across, along @ set_.spin_axes)
 

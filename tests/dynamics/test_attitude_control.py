@@ -1,4 +1,4 @@
-"""The controller obeys its poles, knows Euler's equation, and does not wind up; flown, it does what theory says."""
+"""The controller: poles, feed-forward by Euler's equation, anti-windup, and closed-loop motion by theory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def planned(*elements: object) -> Reference:
 
 
 def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
-    """A controller that is to keep the attitude (0, 0, 0)."""
+    """A controller that holds the attitude (0, 0, 0)."""
     return build_controller(planned(), inertia, ControlConfig.model_validate(part))
 
 
@@ -46,7 +46,7 @@ def closed(
     disturbance_nm: Floats = NONE,
     stored_nms: Floats = STORED,
 ) -> tuple[Rotation, Floats]:
-    """Attitudes and rates at times of a rigid body with rotors under the law, asked without a pause.
+    """Attitudes and rates of a rigid body with rotors under the continuously evaluated law.
 
     J dw/dt + w x (J w + h) = T + disturbance and dR/dt = R [w], by SciPy; the error's integral is integrated too.
     """
@@ -107,7 +107,7 @@ def test_the_attitude_error_takes_the_shorter_way() -> None:
 
 
 def late(period_s: float) -> float:
-    """By how much the roll error after 1.6 s differs from the continuous law's where the torque is held a period.
+    """Difference of the roll error after 1.6 s between sampled and continuous control.
 
     A body on one axis is integrated exactly between the calls.
     """
@@ -125,7 +125,7 @@ def late(period_s: float) -> float:
 
 
 def test_a_held_torque_is_late_by_half_a_period() -> None:
-    """An error of first order in the period: it halves with it."""
+    """The error is of first order in the period."""
     errors = [late(period_s) for period_s in (8e-3, 4e-3, 2e-3)]
     assert abs(errors[2]) < 5e-3
     assert errors[0] / errors[1] == pytest.approx(2, abs=0.05)
@@ -156,7 +156,7 @@ def test_the_feed_forward_torque_satisfies_eulers_equation() -> None:
 
 @pytest.mark.slow
 def test_a_rigid_body_follows_the_reference_throughout_a_slew() -> None:
-    """By the feed-forward alone: the error that feedback might amend never comes to be."""
+    """By feed-forward alone: no error arises that feedback would have to correct."""
     tour = planned(SLEW)
     t_s = np.linspace(0.5, tour.duration_s + 1, 15)
     there, _ = closed(build_controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
@@ -168,7 +168,7 @@ def test_a_rigid_body_follows_the_reference_throughout_a_slew() -> None:
 
 
 def test_the_integral_does_not_wind_up_at_the_torque_limit() -> None:
-    """Held off its target for a minute at full torque, it lets go at once when the target is crossed."""
+    """After a minute at full torque away from its target, the torque reverses at once when the target is crossed."""
     law = holding()
     away = quaternion.from_rotation(Rotation.from_rotvec([0.2, 0, 0]))
     for k in range(6000):
@@ -189,7 +189,7 @@ def test_the_integral_grows_on_every_axis_below_its_limit() -> None:
 
 
 def test_the_integral_leaves_the_limit_again() -> None:
-    """Stuck at the positive limit for what it has summed up, with a positive error, which asks for less: it counts."""
+    """At the positive torque limit due to the integral, an error that reduces the torque is integrated."""
     law = holding()
     law.error_sum_rad_s = np.array([-5.0, 0, 0])
     wanted = law.torque_nm(

@@ -1,4 +1,4 @@
-"""The air, the turning Earth, the bearing's jets and a knock, each against its law or an independent integration."""
+"""Air currents, Earth rotation, turbine torque and knocks against their laws or independent integrations."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ PERIOD_S = 0.01
 
 @pytest.fixture(scope="module")
 def gusts() -> Floats:
-    """(100,000, 3) a thousand seconds of it."""
+    """(100,000, 3) gust torques of a thousand seconds."""
     air = AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(5))
     return np.array([air.sample() for _ in range(100_000)])
 
@@ -177,7 +177,7 @@ def test_motion_in_a_rotating_lab_equals_inertial_motion_seen_from_it(stored: Fl
     ).magnitude().max() > 0.5  # without the torque it is somewhere else
 
 
-def test_a_vehicle_that_stands_still_among_the_stars_turns_with_them() -> None:
+def test_a_vehicle_at_rest_among_the_stars_rotates_with_them_in_the_lab() -> None:
     """With dw/dt = 0, in any attitude, whatever its inertia: J dw/dt = T - w x J w, w = -W."""
     earth_body = Rotation.from_rotvec([0.3, 1.0, -0.5]).apply([3e-5, 0, 5e-5])
     torque = earth_torque_nm(TENSOR, NONE, -earth_body, earth_body)
@@ -197,7 +197,7 @@ def test_a_spinning_wheel_is_a_gyrocompass() -> None:
 
 
 @pytest.mark.slow
-def test_a_flown_vehicle_feels_the_earth_turn() -> None:
+def test_the_earth_s_rotation_acts_on_a_controlled_vehicle() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     rate = str((-np.degrees(earth)).tolist())
@@ -230,7 +230,7 @@ def bump(**more: str) -> str:
     return f'{{kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms"{rest}}}'
 
 
-def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
+def test_a_knock_changes_the_rate_by_the_declared_amount() -> None:
     """On a sphere about three axes at once, beginning and ending within steps and ticks."""
     motion = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE).trajectory()
     rate = np.degrees(motion.rate_body_rad_s)

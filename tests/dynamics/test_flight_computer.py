@@ -1,4 +1,4 @@
-"""Every set of actuators gives the torque that was wanted, says when it cannot, and is relieved of its momentum."""
+"""Every set of actuators delivers the commanded torque, reports its limits, and is desaturated."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SETS = {
 
 @dataclass
 class Asks:
-    """A controller that wants one torque of the body, whatever the rotors' momentum makes of its turn."""
+    """A controller that commands one constant torque of the body for any rotor momentum."""
 
     torque: Floats
     given: list[tuple[Floats, Floats]] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Asks:
 
 
 def manned(name: str, **more: str) -> tuple[FlightComputer, multibody.Simulation]:
-    """A free SimSat or TAS-2 at rest, and who flies it."""
+    """A free SimSat or TAS-2 at rest with its flight computer."""
     actuators, parts = SETS[name]
     changes = FREE | parts | {"motion.control": f"{{actuators: {actuators}}}"} | more
     loaded = loader.load("afit_simsat", changes)
@@ -83,7 +83,7 @@ def present_controls(flight_computer: FlightComputer, flight: multibody.Simulati
 
 
 def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
-    """(3, 3) of what turns with the body about its own axes: a wheel does not about its axle, which is free."""
+    """(3, 3) inertia about the body axes without the wheels' inertia about their free axles."""
     wheels = vehicle.wheels
     return vehicle.inertia_kg_m2 - (wheels.axes * wheels.inertia_kg_m2) @ wheels.axes.T
 
@@ -124,7 +124,7 @@ def test_the_body_gets_the_commanded_torque(name: str, within: float) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
-    """With all that is wanted within the limits, the controller hears that it got it."""
+    """If the command is within the limits, the controller is told the full torque as delivered."""
     flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
     flight_computer.law = law  # type: ignore[assignment]
@@ -136,7 +136,7 @@ def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_anti_windup_uses_the_actuator_limits(name: str) -> None:
-    """Turning at 0.5 rad/s: far more is wanted about x than any set can give, and the integral stands still.
+    """At 0.5 rad/s the command about x exceeds the limit of every set, and the integral is frozen.
 
     Ideal torques have a limit for each axis, the other sets one for all, beyond which the direction is kept.
     """

@@ -1,4 +1,4 @@
-"""The reference obeys the law of each element, joins without a jump where it should, and knocks with its impulse."""
+"""The reference follows the law of each element, is continuous where required, and applies knocks."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ EVERY = {
 
 @pytest.fixture
 def tour() -> Reference:
-    """Long slews that cruise, one too short to, and holds between them."""
+    """Long slews with a cruise phase, one too short for it, and holds between them."""
     return reference(HOLD, turn_to(12, -6, -160), turn_to(-8, 14, 80), HOLD, turn_to(-2, 14, 80))
 
 
@@ -97,7 +97,7 @@ def euler(roll: float, pitch: float, yaw: float) -> Rotation:
 
 
 def between(a: Rotation, b: Rotation) -> np.ndarray:
-    """Angles (rad) by the rotation vector: `magnitude` of nearly nothing is no better than 1e-8."""
+    """Angles (rad) by the rotation vector; `magnitude` of small rotations is accurate only to 1e-8."""
     return np.linalg.norm((a.inv() * b).as_rotvec(), axis=-1)
 
 
@@ -248,7 +248,7 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
 
 
 @pytest.mark.slow
-def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() -> None:
+def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     """The mean of the smoothstep is 1/2; the axis stands still, so this is exact."""
     up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
     ref = reference(HOLD, up, down)
@@ -405,7 +405,7 @@ def test_reference_holds_after_its_end_and_without_a_maneuver(tour: Reference) -
 
 
 def test_pointing_at_stars_starts_from_the_lab_axes() -> None:
-    """Whatever those are called: with the ICRS for lab, the angles are still counted from the start."""
+    """This holds also if the reference is the ICRS: angles are counted from the start."""
     motion = motion_config(HOLD, turn_to(3, -5, 30), STEP, start={"ra_deg": 83, "dec_deg": 2})
     lab_from_start = Rotation.from_rotvec([0.4, -1.0, 2.0])
     own = plan(motion)
@@ -425,7 +425,7 @@ def test_the_start_of_a_vehicle_in_the_lab_does_not_move_its_targets() -> None:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_the_reference_returns_new_unit_quaternions(name: str) -> None:
-    """A caller that writes into what it was given does not change what the next one is given."""
+    """Writing into a returned array does not change later results."""
     ref = reference(*EVERY[name])
     for t in np.linspace(0, ref.duration_s + 1, 9):
         state = ref.state_at(t)
@@ -439,7 +439,7 @@ def test_the_reference_returns_new_unit_quaternions(name: str) -> None:
 
 
 def test_the_reference_is_fast_enough_for_every_control_tick() -> None:
-    """12 us; the best of some, for the machine has other things to do."""
+    """12 us expected; the fastest of several runs is compared, as the machine may be busy."""
     for name in EVERY:
         ref = reference(*EVERY[name])
         t = ref.start_s[-2] + 0.3 * (ref.duration_s - ref.start_s[-2])

@@ -1,4 +1,4 @@
-"""The inertial measurement unit: what it feels against closed forms, its errors against the theory of each.
+"""The inertial measurement unit: ideal increments against closed forms, each error against its theory.
 
 Allan deviations are overlapped ones by the textbook (IEEE Std 952), from the angle theta, m samples of step to tau:
 sigma^2(tau) = mean of (theta_(k+2m) - 2 theta_(k+m) + theta_k)^2 / (2 tau^2). Their own relative scatter over a run
@@ -70,7 +70,7 @@ def euler_deg(navigator: Navigator) -> np.ndarray:
 def part(
     gyro: dict[str, Any] | None = None, accelerometer: dict[str, Any] | None = None, seed: int = 200
 ) -> ImuConfig:
-    """A unit without errors but for those named."""
+    """A unit with only the named errors."""
     return ImuConfig.model_validate(
         {
             "gyro": QUIET_GYRO | (gyro or {}),
@@ -92,7 +92,7 @@ def samples(angle: Floats, velocity: Floats | None = None, step_s: float = STEP)
 
 
 def steady(rate: Any, count: int, step_s: float = STEP) -> Increments:
-    """An even turn about an axis fixed in the body, in free fall."""
+    """A constant rate about a body-fixed axis, in free fall."""
     return samples(np.tile(np.array(rate, float) * step_s, (count, 1)), step_s=step_s)
 
 
@@ -101,7 +101,7 @@ def wxyz(rotation: Rotation) -> Floats:
 
 
 def still(attitude: Rotation, seconds: float, step_s: float, earth: Floats) -> Increments:
-    """What a unit on a vehicle at rest in the lab feels."""
+    """Ideal increments of a unit on a vehicle at rest in the lab."""
     knots = np.arange(0, seconds + 1.5, 1.0)
     ends = step_s * np.arange(1, round(seconds / step_s) + 1)
     attitudes = np.tile(wxyz(attitude), (len(knots), 1))
@@ -111,7 +111,7 @@ def still(attitude: Rotation, seconds: float, step_s: float, earth: Floats) -> I
 
 
 class Cone:
-    """A body whose z axis goes round a cone of half-angle a: lab_from_body = exp(a (cos wt, sin wt, 0)).
+    """A coning motion whose z axis moves on a cone of half-angle a: lab_from_body = exp(a (cos wt, sin wt, 0)).
 
     2 conj(q) dq/dt is its rate in its own axes: w (-sin a sin wt, sin a cos wt, cos a - 1).
     """
@@ -548,7 +548,7 @@ def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     assert abs(one.accelerometer.matrix[2, 2] - 1) < 4 * 300e-6
 
 
-def test_a_turn_beyond_the_limit_reads_the_limit_and_the_attitude_stays_wrong() -> None:
+def test_a_rate_beyond_the_limit_reads_the_limit_and_leaves_an_attitude_error() -> None:
     """A second of 20 deg/s with a limit of 10, then a second of 5: ten of the 25 degrees are lost for good."""
     one = unit({"rate_limit_deg_s": 10})
     navigator = Navigator(wxyz(Rotation.identity()))

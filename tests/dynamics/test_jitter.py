@@ -1,4 +1,4 @@
-"""Vibration against its own analytic sum: rms, spectrum, rates, what lies between the samples, and when it sounds."""
+"""Vibration against its analytic sum: rms, spectrum, rates, interpolation and active intervals."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def band(from_hz: float, to_hz: float, slope: float = 0.0) -> JitterBandConfig:
 def turning(
     end_s: float, rate: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 2
 ) -> Trajectory:
-    """A body that turns evenly about one axis."""
+    """A body at a constant rate about one axis."""
     t = np.linspace(0, end_s, samples)
     rate_rad_s = np.array(rate)
     start = Rotation.from_rotvec([0.3, -1.0, 2.0])
@@ -47,7 +47,7 @@ def shake(calm: Trajectory, parts: tuple, rng: np.random.Generator) -> Trajector
 
 
 def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarray:
-    """(N, 3) rotation vectors from the calm body to the shaken one, in arcseconds."""
+    """(N, 3) rotation vectors from the body without to that with vibration, arcsec."""
     return (calm.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec() / ARCSEC
 
 
@@ -228,7 +228,7 @@ def test_too_many_samples_are_refused_in_one_line() -> None:
 
 
 def shaking(*while_s: float, parts: object = None, always: object = ()) -> MotionConfig:
-    """Holds of a second, and between them the vibration for each of the given whiles."""
+    """Holds of a second, and between them the vibration for each of the given durations."""
     hold = {"kind": "hold", "duration": "1 s"}
     parts = parts or [{"kind": "line", "frequency_hz": 40, "rms_arcsec": RMS}]
     maneuver: list[object] = [hold]

@@ -1,4 +1,4 @@
-"""The laboratory in 3-D: the exported MJCF flies like the stepped model, stands where it should, and can be drawn."""
+"""The exported MJCF laboratory moves like the stepped model, has the scene's geometry, and can be drawn."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def star_lab() -> tuple[Scene, multibody.VehicleModel, Sources, Rotation]:
 
 
 def loaded(text: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The text as MuJoCo reads it, in its keyframe `start`."""
+    """The exported model in its keyframe `start`."""
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
@@ -223,7 +223,7 @@ def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
         assert (sign * np.sum(normal * (corner.mean(axis=1) - middle), axis=1) > 0).all()
 
 
-def test_the_field_s_corners_are_those_of_the_chip_and_lie_on_the_dome() -> None:
+def test_the_field_s_corners_are_the_chip_s_projected_onto_the_dome() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", [30.0, 8.0, -5.0], degrees=True)
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
@@ -334,7 +334,7 @@ def states(*attitudes: Rotation) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def opengl() -> None:
-    """Skips where not even an empty room can be drawn, with the reason."""
+    """Skip with the reason if not even an empty room can be drawn."""
     try:
         scene_picture.picture(NOTHING, np.zeros(0), (64, 48))
     except scene_picture.NoPicture as reason:

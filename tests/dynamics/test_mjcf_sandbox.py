@@ -1,4 +1,4 @@
-"""A stranger's vehicle reads no file outside of its folder, cannot crash skysim, and cannot fill memory or time."""
+"""An untrusted vehicle file reads only its folder, cannot crash skysim, and has limits of memory and time."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_any_file_name_outside_the_folder_is_refused(tmp_path: Path, names: str)
 def test_a_file_that_includes_itself_in_many_ways_is_read_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each way would be a folder of its own, to which each way leads again: for hours."""
+    """Without this, every include path would be read separately, for hours."""
     read = list[Path]()
 
     def noted(path: Path) -> ElementTree.Element:
@@ -259,7 +259,7 @@ def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, va
 def test_a_shipped_vehicle_is_loaded_in_process_and_any_other_in_a_child(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second import of MuJoCo would lengthen the start of every run."""
+    """A child process would import MuJoCo a second time and delay every run."""
     tried = list[str]()
     monkeypatch.setattr(
         mjcf, "run_guarded", lambda _script, path, **_limits: tried.append(path) or ""

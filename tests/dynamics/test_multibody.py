@@ -1,4 +1,4 @@
-"""The vehicle as it is composed and flown: masses, actuators, camera, tilt stop, and what a file may not have.
+"""The assembled vehicle: masses, actuators, camera, tilt stop, and refused files.
 
 The laws of mechanics are in test_physics_vehicle and test_physics_actuators.
 """
@@ -382,7 +382,7 @@ ROTOR = f'<body><joint name="rotor_%s" axis="0 1 0"/>{DISK}</body>'
 
 
 def carrying(parts: str) -> str:
-    """The bus with more on it."""
+    """The bus with further bodies."""
     return BUS.replace(CAMERA, CAMERA + parts)
 
 
@@ -509,7 +509,7 @@ def test_compiler_setting_that_undoes_the_declared_mass_is_refused(tmp_path: Pat
         built(tmp_path, BUS, '<compiler inertiafromgeom="true"/>', mass="80 kg")
 
 
-def test_vehicle_may_carry_wheels_that_turn(tmp_path: Path) -> None:
+def test_a_vehicle_may_have_passive_wheels(tmp_path: Path) -> None:
     """A wheel on a frictionless axle stays behind when the bus is turned: what turns is I - I_wheel."""
     wheel = WHEEL.replace(' name="wheel_a"', "")  # a joint of no name that skysim knows
     given = {"mass": "80 kg", "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"]}

@@ -1,4 +1,4 @@
-"""What stands in the way hides exactly what is behind it: boxes against the slab test, walls against a quadratic."""
+"""Occlusion: boxes against the slab test, walls against a quadratic equation."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def picture(lab: Lab) -> tuple[bytes, set[int], Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
-def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_path: Path) -> None:
+def test_a_mast_on_the_vehicle_hides_exactly_the_leds_behind_it(start: str, tmp_path: Path) -> None:
     lab = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
     bare = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start, light__occlusion="false")
     _, seen, truth = picture(lab)
@@ -111,7 +111,7 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None:
+def test_a_beam_in_the_lab_does_not_rotate_with_the_vehicle(tmp_path: Path) -> None:
     beam = SIMSAT.replace("<worldbody>", f"<worldbody>{mast(MAST_M)}", 1)
     counts = []
     for start in ["{yaw_deg: 0}", "{roll_deg: 3, yaw_deg: 60}", "{roll_deg: 20}"]:
@@ -127,7 +127,7 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_an_unobstructed_frame_is_unchanged_bit_for_bit(tmp_path: Path) -> None:
-    """With the switch on and off; and switched off a mast is as good as none."""
+    """With occlusion on and off; switched off, a mast has no effect."""
     on, off = (
         picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false")
     )
@@ -200,7 +200,7 @@ def test_stars_behind_the_body_are_hidden() -> None:
 
 
 def sources_at(place: Any) -> Sources:
-    """Sources at (N, 4) homogeneous places; all else is of no importance here."""
+    """Sources at (N, 4) homogeneous places; other properties are irrelevant here."""
     place = np.array(place, float)
     count = np.zeros(len(place), np.int64)
     number = np.zeros(len(place))

@@ -1,4 +1,4 @@
-"""Wheels, gimbals, fans and what drags at the vehicle, each against its closed form."""
+"""Wheels, gimbals, fans, drag and cables, each against its closed form."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def speeds(flight: multibody.Simulation) -> Floats:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_wheel_motor_turns_the_body_the_other_way_and_stops_at_its_limit(axis: int) -> None:
+def test_a_wheel_motor_turns_the_body_the_other_way_up_to_its_limit(axis: int) -> None:
     """Ask for 5 N m of a motor that has 0.2: the body goes with -0.2 t / (I - I_wheel), the total is nothing."""
     vehicle = multibody.build(vehicle_config(mount="free", wheels={"torque_limit": "0.2 N m"}))
     flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[axis], 5.0, 2.0))
@@ -115,7 +115,7 @@ def test_wheel_sticks_until_its_motor_beats_coulombs_friction(
 
 
 def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
-    """(3,) amplitude at a frequency, about the body's axes, of what is no slow drift in 0.2 s of flight."""
+    """(3,) amplitude at a frequency about the body axes over 0.2 s of flight, without slow drift."""
     flight = flown(vehicle, STILL, still(vehicle, 0.2))
     t = np.arange(len(flight.states)) * vehicle.model.opt.timestep
     turn = Rotation.from_quat(angles(flight)[:, :4], scalar_first=True).as_rotvec()
@@ -356,7 +356,7 @@ def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float)
     assert 2 * (up - down) == pytest.approx(period, rel=1e-9)
 
 
-def test_cable_turns_the_vehicle_back_by_the_shorter_way() -> None:
+def test_the_cable_turns_the_vehicle_back_by_the_shorter_way() -> None:
     """At 200 deg of yaw it is wound by 160 the other way: 0.1 N m/rad pull with +0.279 N m."""
     vehicle = multibody.build(
         vehicle_config(disturbances={"cable": {"stiffness": "0.1 N m / rad"}})

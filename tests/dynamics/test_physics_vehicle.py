@@ -1,6 +1,6 @@
-"""The vehicle against the great laws: what is kept is kept, what theory solves comes out as solved.
+"""The vehicle's motion against conservation laws and analytic solutions.
 
-MuJoCo knows no spin-stabilized body, no gyroscope and no elliptic function; every number here is worked out beside it.
+Every expected value here is computed independently of MuJoCo.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
 
 
 def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
-    """Angular momentum (3,) about the lab's origin and kinetic energy, a sum over the bodies one by one.
+    """Angular momentum (3,) about the lab's origin and kinetic energy, summed over the bodies.
 
-    Of MuJoCo only each body's own velocity, place, mass and principal inertia: L = sum m r x v + J w.
+    L = sum m r x v + J w, from each body's velocity, position, mass and principal inertia in MuJoCo.
     """
     model = flight.model
     data = mujoco.MjData(flight.model)
@@ -83,9 +83,9 @@ def carried(flight: multibody.Simulation, step: int) -> tuple[Floats, float]:
 
 @pytest.mark.long
 def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
-    """The issue's bar, 1e-8 N m s. Whatever the motors do between the vehicle's parts, the whole keeps its own.
+    """To 1e-8 N m s: torques between the vehicle's parts do not change the total momentum.
 
-    For 40 s of the 60 random rates of up to 1 rad/s at the gimbals and 0.3 N m at the wheels, another each 0.1 s.
+    For 40 s of 60 s, random gimbal rates up to 1 rad/s and wheel torques up to 0.3 N m change every 0.1 s.
     """
     vehicle = multibody.build(vehicle_config(**SPINNING))
     rng = np.random.default_rng(4)
@@ -106,7 +106,7 @@ def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
 
 @pytest.mark.slow
 def test_energy_and_momentum_are_conserved_without_control() -> None:
-    """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
+    """To 1e-8 J (of 1112) and 1e-8 N m s (of 5.6), with every wheel, rotor and gimbal free."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
     vehicle.model.opt.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -220,10 +220,10 @@ def asymmetric_top(
     [((6.0, 6.5, 9.0), 0.3, 0.8), ((9.0, 6.5, 6.0), 0.2, 1.0), ((6.0, 6.5, 9.0), 0.9, 0.33)],
     ids=["about the greatest moment", "about the least", "nearly about the middle one"],
 )
-def test_asymmetric_top_turns_as_jacobi_solved_it(
+def test_an_asymmetric_top_follows_jacobi_s_solution(
     inertia: tuple[float, float, float], first: float, third: float
 ) -> None:
-    """The issue's bar: 1e-6 rad within 60 s. It comes out below 1e-12, rounding's own size."""
+    """Required: 1e-6 rad within 60 s; rounding allows 1e-12."""
     vehicle = multibody.build(
         vehicle_config(mount="free", inertia=[f"{moment} kg m2" for moment in inertia])
     )

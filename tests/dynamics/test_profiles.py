@@ -1,4 +1,4 @@
-"""Attitude profiles: every format and every name of a column gives the motion that was meant, or one clear line."""
+"""Attitude profiles: every format and column name gives the intended motion or one error line."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
 
 
 def test_the_spline_beats_that_of_rotation_vectors_at_the_ends() -> None:
-    """Which the module says: SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
+    """SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
     t = np.linspace(0, 6, 4001)
     ours = angle(attitudes(fit_spline(sampled()), t), tumble(t)).max()
     theirs = angle(RotationSpline(TIMES, tumble(TIMES))(t), tumble(t)).max()
@@ -131,7 +131,7 @@ def test_a_quaternion_and_its_negative_are_the_same_attitude() -> None:
     assert angle(attitudes(spline, t), attitudes(fit_spline(sampled()), t)).max() < 1e-14
 
 
-def test_a_constant_rate_errs_with_the_fifth_power_of_the_step() -> None:
+def test_at_a_constant_rate_the_error_falls_with_the_fifth_power_of_the_step() -> None:
     """By 0.04 arcsec at the largest step that is allowed, 10 deg: of fourth order it errs only along the quaternion."""
     errors = []
     for step_deg in (9.99, 9.99 / 2):
@@ -458,7 +458,7 @@ def test_version_2_is_from_a_to_b_scalar_last(tmp_path: Path) -> None:
     assert angle(read_text(aem(part, version="2.0"), tmp_path).a_from_b, MOTION).max() < 1e-14
 
 
-def test_the_standard_s_own_example_is_read(tmp_path: Path) -> None:
+def test_the_aem_standard_s_example_is_read(tmp_path: Path) -> None:
     """CCSDS 504.0-B-1, figure 4-1, its useable span without the first line; EME2000 is turned by the frame bias."""
     rows = [
         "21:29:07.2555 0.56748 0.03146 0.45689 0.68427",
@@ -486,7 +486,7 @@ def test_the_standard_s_own_example_is_read(tmp_path: Path) -> None:
     assert angle(read.a_from_b, there).max() == pytest.approx(23e-3 * ARCSEC_RAD, rel=0.05)
 
 
-def test_the_frame_bias_is_that_of_the_iers_conventions(tmp_path: Path) -> None:
+def test_the_frame_bias_matches_the_iers_conventions(tmp_path: Path) -> None:
     """IERS 2010, 5.4.4: the pole of J2000 is at -16.617 mas and -6.819 mas in the ICRS, its equinox at -14.6 mas."""
     eme = segment(Rotation.identity(5), TIMES[:5], REF_FRAME_A="EME2000")
     icrs_from_mean = read_text(aem(eme), tmp_path).a_from_b[0].as_matrix()
@@ -514,7 +514,7 @@ def test_epochs_may_use_the_day_of_the_year(tmp_path: Path) -> None:
 
 
 def test_segments_are_joined(tmp_path: Path) -> None:
-    """One sample of both at the seam; then a step between them; the second with its frames the other way round."""
+    """With a common sample at the seam, with a step between segments, and with reversed frames in the second."""
     first = segment(MOTION[:21], TIMES[:21])
     second = segment(MOTION[20:41], TIMES[20:41])
     third = segment(
@@ -761,7 +761,7 @@ def test_a_profile_that_does_not_start_where_the_previous_element_ends_is_refuse
         plan(following(), tumble(np.array([3.0]))[0], (fit_spline(sampled(TIMES - 9.0)),))
 
 
-def test_the_vehicle_starts_where_the_first_of_two_profiles_does() -> None:
+def test_the_vehicle_starts_at_the_first_profile_s_attitude() -> None:
     first = fit_spline(sampled(TIMES + 3.0))
     second = fit_spline(sampled(TIMES + 20.0))
     motion = following(begin="first_sample").model_copy(update={"start": "profile"})

@@ -1,4 +1,4 @@
-"""The geometry of an MJCF file as plain shapes: kinds, sizes and places, and the vertices of meshes."""
+"""The geometry of an MJCF file as plain shapes: kinds, sizes, positions, and mesh vertices."""
 
 from __future__ import annotations
 

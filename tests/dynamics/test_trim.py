@@ -1,4 +1,4 @@
-"""Trim masses: where a motor holds them, and what they do to the vehicle's mass properties."""
+"""Trim masses: positions held by a motor, and effect on the vehicle's mass properties."""
 
 from __future__ import annotations
 

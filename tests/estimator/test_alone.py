@@ -1,4 +1,4 @@
-"""The estimator without anything but numpy, scipy, numba and OpenCV: in this checkout, and as a package of its own."""
+"""The estimator with only numpy, scipy, numba and OpenCV, in this checkout and as a separate package."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_estimator_solves_without_any_other_package() -> None:
 
 @pytest.mark.long
 def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> None:
-    """With what pip brings along, and nothing of this environment; then with the extra for dates."""
+    """With only the dependencies installed by pip, then with the extra for dates."""
     wheels = tmp_path / "wheels"
     bare = tmp_path / "bare"
     here = tmp_path / "here"

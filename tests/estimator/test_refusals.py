@@ -1,4 +1,4 @@
-"""What is no image, time, rotation, map or measurement is refused at the door: one line, with what is allowed."""
+"""Invalid images, times, rotations, maps and measurements are refused in one line with the allowed values."""
 
 from __future__ import annotations
 

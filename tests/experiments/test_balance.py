@@ -1,4 +1,4 @@
-"""`skysim balance`: the vehicle that MuJoCo moves is weighed and balanced; what cannot be weighed is refused."""
+"""`skysim balance`: mass properties are measured and balanced; undetermined ones are refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BALANCE = BalancePlan("wheels", 8.0, 5e-5, 4, True)
 def noisy_truth(
     flown: Flight, watch: Progress | None
 ) -> list[tuple[float, Rotation, Floats, Floats]]:
-    """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second, none shared."""
+    """Attitudes with 10 arcsec of noise at 2 Hz instead of solved frames, without common errors."""
     log = flown.simulate_motion(watch).telemetry()
     rng = random_stream(flown.lab.scene.seed, 999)
     every = round(0.5 / log.period_s)
@@ -155,7 +155,7 @@ def test_a_vehicle_that_cannot_be_balanced_is_refused(
 
 
 def record_of(rate_deg_s: float) -> BearingRecord:
-    """Yaw at a constant rate, level."""
+    """Record of a level yaw at a constant rate."""
     t_s = np.arange(10.0)
     attitudes = Rotation.from_rotvec(np.outer(np.radians(rate_deg_s) * t_s, [0, 0, 1]))
     return BearingRecord(

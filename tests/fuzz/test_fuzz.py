@@ -60,7 +60,7 @@ PLACE = some.floats(0, 1, allow_nan=False)  # of a file
 
 
 def edited(data: bytes, edit: tuple[str, float, int, bytes], other: bytes) -> bytes:
-    """A file with bytes put in, left out or put over, or with the rest of another one."""
+    """A file with bytes inserted, deleted or replaced, or with the end of another file."""
     how, place, length, new = edit
     at = round(place * len(data))
     if how == "splice":
@@ -74,7 +74,7 @@ def edited(data: bytes, edit: tuple[str, float, int, bytes], other: bytes) -> by
 
 @some.composite
 def files_of(draw: some.DrawFn, name: str) -> bytes:
-    """Any bytes; or a file of the corpus, or one that is shipped, edited up to six times."""
+    """Any bytes, or a corpus or shipped file edited up to six times."""
     corpus = some.sampled_from(seeds(name))
     new = some.binary(max_size=16) | some.sampled_from(TOKENS)
     edit = some.tuples(some.sampled_from(EDITS), PLACE, some.integers(1, 60), new)

@@ -1,4 +1,4 @@
-"""No reader of anybody's bytes without a fuzz target that reaches it, or a reason why none has to."""
+"""Every reader of outside data is reached by a fuzz target or has a stated reason."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ OUT_OF_REACH = {
 
 
 def readers() -> Iterator[str]:
-    """Every function that opens or takes apart what comes from outside: `module.function`."""
+    """Every function that opens or parses outside data: `module.function`."""
     for package in ("skysim", "estimator"):
         for path in sorted((ROOT / package).rglob("*.py")):
             module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
@@ -122,7 +122,7 @@ def readers() -> Iterator[str]:
 
 
 def functions(tree: ast.AST, above: str) -> Iterator[tuple[str, Any]]:
-    """A module's functions and its classes' methods, by name; what stands in a function is part of it."""
+    """A module's functions and methods by name; nested functions belong to their outer one."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield above + node.name, node
@@ -131,7 +131,7 @@ def functions(tree: ast.AST, above: str) -> Iterator[tuple[str, Any]]:
 
 
 def called() -> set[str]:
-    """What runs while every target takes some of its corpus."""
+    """Functions that run while every target reads part of its corpus."""
     codes: set[CodeType] = set()
 
     def watch(frame: FrameType, event: str, _: Any) -> None:

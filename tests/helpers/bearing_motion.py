@@ -17,7 +17,7 @@ PERIOD_S = 0.1  # of wheel speeds and random torque
 
 @dataclass(frozen=True)
 class Vehicle:
-    """True mass properties of a small vehicle with three wheels, and what acts on it."""
+    """True mass properties of a small vehicle with three wheels, and the torques on it."""
 
     inertia_kg_m2: Floats
     moment_kg_m: Floats
@@ -132,7 +132,7 @@ def record(
 
 
 def prior(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Prior, Vehicle]:
-    """What is assumed of a vehicle, and the vehicle with bias and wheel errors drawn: all within their deviations."""
+    """Assumed mass properties, and a vehicle with random bias and wheel errors within their standard deviations."""
     sigma = np.array(
         [*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[5e-4] * 3, *[1e-3] * 3]
     )

@@ -60,14 +60,14 @@ def run_commands(page: str, folder: Path) -> None:
 
 
 def answer(folder: Path, *words: str) -> Any:
-    """What a command prints with --json."""
+    """JSON printed by a command with --json."""
     done = subprocess.run([*SKYSIM, *words, "--json"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
 def missing_links(page: str) -> list[str]:
-    """Links of a page that lead nowhere."""
+    """Links of a page without a target."""
     links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text(page))
     assert links
     return [link for link in links if not (ROOT / page).parent.joinpath(link).exists()]

@@ -1,4 +1,4 @@
-"""Compiled functions run by the Python interpreter: NumPy refuses an index beyond an array, and nothing is compiled."""
+"""Run compiled functions by the Python interpreter: NumPy checks every index, and nothing is compiled."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 
 def interpreted(name: str) -> ModuleType:
-    """Import a second copy of a module, and of all of its package that it imports, without numba's compiler."""
+    """Import a second copy of a module and of its package's modules without numba's compiler."""
     root = name.split(".")[0]
     with pytest.MonkeyPatch.context() as patch:
         for module in [one for one in sys.modules if one.split(".")[0] == root]:

@@ -84,7 +84,7 @@ class Server:
         self.process.wait(60)
 
     def status(self, path: str = "", **headers: str) -> int:
-        """What a request without a browser and without the token's cookie gets."""
+        """HTTP status of a request without browser and token cookie."""
         asked = urllib.request.Request(self.url + path, headers=headers)
         try:
             return int(urllib.request.urlopen(asked, timeout=5).status)
@@ -92,7 +92,7 @@ class Server:
             return error.code
 
     def children(self, word: str) -> list[Any]:
-        """Its processes whose command has a word."""
+        """Its child processes whose command contains a word."""
         psutil = pytest.importorskip("psutil")
         found = []
         for one in psutil.Process(self.process.pid).children(recursive=True):
@@ -101,7 +101,7 @@ class Server:
         return found
 
     def come_to(self, word: str, count: int) -> int:
-        """How many such processes it has, once they are so many, else after a while."""
+        """Number of such processes: the expected one as soon as it is reached, else that at the time limit."""
         come(lambda: len(self.children(word)) == count)
         return len(self.children(word))
 
@@ -130,14 +130,14 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def tab(browser: Any, server: Server) -> Iterator[Any]:
-    """A tab for most tests, one after the other, as a person has it open."""
+    """One tab shared by most tests, as a person keeps it open."""
     with opened(browser, server.login, NARROW) as found:
         yield found
 
 
 @pytest.fixture
 def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The tab, with its first panel before it; a picture of how the test left it."""
+    """The tab with its first panel shown; saves a screenshot after the test."""
     tab.get_by_role("tab", name="Run").click()
     tab.get_by_role("button", name="fit", exact=True).click()
     yield tab
@@ -157,7 +157,7 @@ def pictured(page: Any, name: str) -> None:
 
 
 class opened:
-    """A tab, closed in the end."""
+    """A tab that is closed after use."""
 
     def __init__(self, browser: Any, address: str, size: dict[str, int]) -> None:
         self.page = browser.new_page(viewport=size)
@@ -181,7 +181,7 @@ class opened:
 
 
 def status(page: Any, starts: str) -> str:
-    """The tracker's status, once it begins so."""
+    """Wait until the tracker's status starts with this text; return it."""
     found = page.locator(".lab-card .mono", has_text=re.compile(f"^{starts}"))
     found.first.wait_for()
     return str(found.first.inner_text())
@@ -198,7 +198,7 @@ def angles(page: Any) -> np.ndarray:
 
 
 def source(page: Any) -> str:
-    """Which frame is drawn."""
+    """URL of the drawn frame."""
     return str(page.locator(".lab-frame canvas").get_attribute("data-frame"))
 
 
@@ -210,7 +210,7 @@ def changed(page: Any, before: str) -> None:
 
 
 def come(true: Callable[[], bool], within_s: float = QUICK_MS / 1000) -> bool:
-    """Whether something comes true within a while."""
+    """Whether a condition becomes true within a time limit."""
     until = time.monotonic() + within_s
     while not (found := true()) and time.monotonic() < until:
         time.sleep(0.1)
@@ -241,7 +241,7 @@ def choose_stage(page: Any, stage: str, algorithm: str) -> None:
 
 
 def set_to(page: Any, name: str, value: str) -> None:
-    """Type a key's value in the forms; wait for what comes of it."""
+    """Type a key's value in the forms and wait for the result."""
     frame = source(page)
     field = page.get_by_label(name, exact=True)
     field.fill(value)
@@ -250,7 +250,7 @@ def set_to(page: Any, name: str, value: str) -> None:
 
 
 def simulate(page: Any, frames: int) -> None:
-    """Begin to compute a flight of so many frames."""
+    """Start to compute a flight of this number of frames."""
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("exposure.frames")
     set_to(page, "exposure.frames", str(frames))
@@ -260,12 +260,12 @@ def simulate(page: Any, frames: int) -> None:
 
 
 def onto_the_page(page: Any) -> None:
-    """Leave the field that was typed in."""
+    """Remove the keyboard focus from the field."""
     page.locator(".lab-frame").click(position={"x": 5, "y": 5})
 
 
 def exported(page: Any, kind: str, folder: Path) -> Path:
-    """A file that the page gives."""
+    """Download a file from the page."""
     page.get_by_role("button", name="Export").click()
     with page.expect_download() as comes:
         page.locator(".q-menu .q-item", has_text=re.compile(f"^{kind}$")).click()
@@ -276,13 +276,13 @@ def exported(page: Any, kind: str, folder: Path) -> Path:
 
 
 def brightness(page: Any) -> float:
-    """Of the canvas, 0 to 255."""
+    """Mean brightness of the canvas, 0 to 255."""
     screenshot = page.locator(".lab-frame canvas").screenshot()
     return float(cv2.imdecode(np.frombuffer(screenshot, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
 
 
 def screen(page: Any, x: float, y: float) -> tuple[float, float]:
-    """Where a pixel of a frame is on the screen."""
+    """Screen position of a frame's pixel."""
     box = page.locator(".lab-frame canvas").bounding_box()
     left, top, scale = map(
         float, page.locator(".lab-frame canvas").get_attribute("data-placement").split()
@@ -291,7 +291,7 @@ def screen(page: Any, x: float, y: float) -> tuple[float, float]:
 
 
 def frame_pixel(page: Any, x: float, y: float) -> tuple[float, float]:
-    """Which pixel of a frame is at a place on the screen."""
+    """Pixel of a frame at a screen position."""
     (left, top), (right, below) = screen(page, 0, 0), screen(page, 1, 1)
     return (x - left) / (right - left), (y - top) / (below - top)
 
@@ -304,7 +304,7 @@ def picture(page: Any, **how: Any) -> np.ndarray:
 
 
 def pixels(page: Any) -> list[tuple[int, int, int]]:
-    """(x, y, DN) of the pixels that are enlarged."""
+    """(x, y, DN) of the pixels shown enlarged."""
     label = page.locator(".lab-loupe[aria-label^=pixels]").get_attribute("aria-label")
     x, y, across, down, *values = map(int, re.findall(r"\d+", label))
     assert len(values) == across * down
@@ -312,7 +312,7 @@ def pixels(page: Any) -> list[tuple[int, int, int]]:
 
 
 def differs(page: Any, before: np.ndarray, box: tuple[int, int, int, int]) -> bool:
-    """Whether a part of the screen (left, top, right, bottom) looks another than in a picture from before."""
+    """Whether a part of the screen (left, top, right, bottom) differs from an earlier picture."""
     left, top, right, bottom = box
     clip = {"x": left, "y": top, "width": right - left, "height": bottom - top}
     return bool((np.abs(picture(page, clip=clip) - before[top:bottom, left:right]) > 20).sum() > 30)

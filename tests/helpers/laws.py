@@ -1,4 +1,4 @@
-"""What property tests share: which functions they prove, what they are fed, what counts as an answer."""
+"""Shared by property tests: the functions they cover, their inputs, and valid answers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 def law(*functions: Any, slow: bool = False) -> Callable[[Test], Test]:
-    """A property test, and the public functions of the estimator that it states a law of."""
+    """Mark a property test with the public functions of the estimator that it covers."""
     PROVED.update(name_of(one) for one in functions)
     return settings(
         max_examples=max(EXAMPLES // 10, 2) if slow else EXAMPLES,
@@ -50,7 +50,7 @@ def name_of(one: Any) -> str:
 def public() -> Iterator[str]:
     """Every function and method of the estimator without an underscore, where it is defined.
 
-    Left out: what numba compiles, which is called from within these; and protocols, which do nothing.
+    Functions compiled by numba, which these call, and protocols are left out.
     """
     for info in pkgutil.walk_packages(estimator.__path__, "estimator."):
         module = importlib.import_module(info.name)
@@ -64,7 +64,7 @@ def public() -> Iterator[str]:
 
 
 def methods(of: type) -> Iterator[str]:
-    """Those of a class that are public, its properties too."""
+    """Public methods and properties of a class."""
     for name, one in vars(of).items():
         if not name.startswith("_") and isinstance(one, classmethod | property):
             yield name_of(one.__func__ if isinstance(one, classmethod) else one)
@@ -73,7 +73,7 @@ def methods(of: type) -> Iterator[str]:
 
 
 def answered(call: Callable[[], T], way: type[Exception] = ValueError) -> T | None:
-    """The answer; None where it was refused, which takes one line."""
+    """The result, or None if the call was refused in one line."""
     try:
         return call()
     except way as error:
@@ -89,7 +89,7 @@ def units(rng: np.random.Generator, count: int) -> Floats:
 
 
 def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
-    """Stars anywhere, moving and near by more than real ones, brightest first."""
+    """Random stars, brightest first, with larger proper motions and parallaxes than real ones."""
     hip = np.arange(1, count + 1)
     ra = rng.uniform(0, 7, count)
     dec = np.arcsin(rng.uniform(-1, 1, count))
@@ -99,12 +99,12 @@ def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
 
 
 def turn(rng: np.random.Generator, most_rad: float = np.pi) -> Rotation:
-    """A rotation by up to an angle."""
+    """A random rotation by up to an angle."""
     return Rotation.from_rotvec(rng.uniform(0, most_rad) * units(rng, 1)[0])
 
 
 def assert_covariance(matrix: Floats) -> None:
-    """Symmetric, and nowhere negative: to rounding."""
+    """Check that a matrix is symmetric and positive semidefinite to rounding."""
     size = np.abs(matrix).max()
     np.testing.assert_allclose(matrix, np.swapaxes(matrix, -1, -2), rtol=0, atol=1e-9 * size)
     assert (np.linalg.eigvalsh(matrix) >= -1e-9 * size).all()

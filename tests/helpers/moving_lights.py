@@ -1,4 +1,4 @@
-"""Lights before a camera that turns at a constant rate, exposed row by row: exact centroids and streaks for tests."""
+"""Exact centroids and streaks of lights before a camera with a rolling shutter that rotates at a constant rate."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ class Moving:
         return self.cam_from_ref.inv().apply(lever + distance[:, None] * rays)
 
     def pixels(self, t_s: Floats) -> Floats:
-        """(N, 2) of each light at a time of its own."""
+        """(N, 2) pixels of the lights, each at its own time."""
         turn = Rotation.from_rotvec(-np.outer(t_s, self.rate_rad_s))
         return self.camera.pixels(
             turn.apply(self.cam_from_ref.apply(self.place_ref)) - self.sight.lever_cam_m
         )
 
     def found_px(self, offset_s: float) -> Floats:
-        """(N, 2) where a light is at a time after mid-exposure of the row where it is then."""
+        """(N, 2) pixels of lights at a time after mid-exposure of their rows."""
         xy_px = self.still_px
         for _ in range(15):
             xy_px = self.pixels(self.camera.row_delays_s(xy_px) + offset_s)
         return xy_px
 
     def centroids(self, rng: np.random.Generator | None = None) -> Centroids:
-        """Centroids and streaks, each streak with any sign; with errors if there is a generator."""
+        """Centroids and streaks of random sign, with errors if there is a generator."""
         xy_px = self.found_px(0.0)
         streak_px = self.found_px(EXPOSURE_S / 2) - self.found_px(-EXPOSURE_S / 2)
         signs = np.where(np.arange(len(xy_px)) % 2, -1.0, 1.0)[:, None]
@@ -71,6 +71,6 @@ class Moving:
 def moving(
     rng: np.random.Generator, rate_deg_s: Floats, count: int = 30, sight: Sight = STARS
 ) -> Moving:
-    """Lights anywhere on the chip."""
+    """Lights at random pixels of the chip."""
     still_px = rng.uniform([20, 20], [1580, 1180], (count, 2))
     return Moving(Rotation.random(rng=rng), np.radians(rate_deg_s), still_px, sight)

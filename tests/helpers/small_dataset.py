@@ -1,4 +1,4 @@
-"""What tests of datasets share: a small scene, and what is in a folder."""
+"""Shared by tests of datasets: a small scene and the contents of a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Add the image of a kernel to a patch, whichever of its three forms it has."""
+"""Add the image of a kernel of any of the three forms to a patch."""
 
 from __future__ import annotations
 

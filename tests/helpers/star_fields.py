@@ -1,4 +1,4 @@
-"""What the tests of star identification share: a random sky, its frames, and the error of a solution."""
+"""Shared by tests of star identification: a random sky, its frames, and the error of a solution."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ SEARCHED = 80
 
 
 def random_sky(count: int, seed: int):
-    """Uniform directions, and magnitudes that grow as the real sky's: ten to the half."""
+    """Uniform directions, with star counts that grow as 10^(0.5 magnitude)."""
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(count, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -27,7 +27,7 @@ SKY = sky_index.build(VECTORS, MAG, WIDE_RAD)
 
 
 def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MAG):
-    """Tangents, magnitudes and rows of the stars in the field, brightest first, through a focal length `zoom` times."""
+    """Tangents, magnitudes and rows of the field's stars, brightest first; the focal length is `zoom` times longer."""
     x, y, z = truth.apply(vectors).T
     tangent = zoom * np.column_stack([x, y]) / np.where(z > 0.1, z, np.inf)[:, None]
     inside = (
@@ -49,5 +49,5 @@ def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> star_evidence.Detectio
 
 
 def attitude_error(solution: Solution, truth: Rotation):
-    """The small turn from the truth to the answer, in camera axes."""
+    """Small rotation from the truth to the answer, in camera axes."""
     return (Rotation.from_quat(solution.cam_from_ref_xyzw) * truth.inv()).as_rotvec()

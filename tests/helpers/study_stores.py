@@ -1,4 +1,4 @@
-"""What tests of studies share: a study, what a store holds, and doing a study into one."""
+"""Shared by tests of studies: a study, the contents of a store, and running a study into a store."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def done(
     resume: bool = False,
     watch: Callable[[runner.Progress], object] | None = None,
 ) -> runner.Progress:
-    """Do a study's missing trials, in this process if no engine is named."""
+    """Run a study's missing trials, in this process if no engine is given."""
     with store.writing(path) as kept:
         runner.prepare_store(study_plan, kept, resume)
         return runner.run(study_plan, kept, engine or engines.Serial(), watch)

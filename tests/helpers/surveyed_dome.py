@@ -30,13 +30,13 @@ def leds(count: int, half_deg: float = 40.0) -> LedMap:
 
 
 def model(count: int) -> SurveyModel:
-    """The dome as it is assumed."""
+    """The assumed dome."""
     lever = Lever(np.array([0.02, -0.03, 0.38]), Rotation.from_euler("z", 20, degrees=True))
     return SurveyModel(CAMERA, leds(count), lever, NOISE_PX, LIST_SIGMA_M)
 
 
 def attitudes(rng: np.random.Generator, count: int, tilt_deg: float = 25.0) -> Rotation:
-    """body_from_lab of tilts evenly over the cap, all yaws."""
+    """body_from_lab with tilts uniform over the cap and any yaw."""
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     about = rng.uniform(0, 2 * np.pi, count)
     lean = Rotation.from_rotvec(
@@ -46,5 +46,5 @@ def attitudes(rng: np.random.Generator, count: int, tilt_deg: float = 25.0) -> R
 
 
 def pixels(of: SurveyModel, place_m: Floats, attitude: Rotation) -> Floats:
-    """(N, 2) pixels of LEDs at these places, far outside behind the camera."""
+    """(N, 2) pixels of LEDs at these places; those behind the camera get pixels far outside."""
     return np.nan_to_num(project(attitude, place_m, of.lever, of.camera), nan=-1e9)

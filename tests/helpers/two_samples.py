@@ -12,7 +12,7 @@ LEAST_COUNT = 20  # of both samples in a bin
 
 
 def histogram_p(first: NDArray[Any], second: NDArray[Any]) -> float:
-    """P of chi-square for one distribution of both, with neighboring numbers merged to LEAST_COUNT."""
+    """P-value of chi-square that both have one distribution, with neighboring values merged to LEAST_COUNT."""
     values, index = np.unique(np.concatenate([first, second]), return_inverse=True)
     counts = np.stack(
         [np.bincount(half, minlength=len(values)) for half in np.split(index, [len(first)])]

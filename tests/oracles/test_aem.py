@@ -32,7 +32,7 @@ def utc(count: int) -> list[datetime.datetime]:
 def test_our_aem_is_valid_and_has_the_intended_metadata(
     tmp_path: Path, frames: tuple[str, str], count: int
 ) -> None:
-    """Version, frames, span and every digit of every quaternion; and it survives being written by them as XML."""
+    """Version, frames, span and every digit of every quaternion; also after ccsds-ndm-py rewrites it as XML."""
     meant = Rotation.random(count, rng=np.random.default_rng(count))
     path = tmp_path / "truth.aem"
     files.write_text(
@@ -63,7 +63,7 @@ def test_our_aem_is_valid_and_has_the_intended_metadata(
 
 
 def test_ccsds_ndm_refuses_a_malformed_aem() -> None:
-    """So that the tests above can fail."""
+    """This shows that the tests above can fail."""
     good = run_export.message(
         "x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2)
     )

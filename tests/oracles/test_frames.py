@@ -1,7 +1,7 @@
-"""Frames of ours, solved by tetra3rs and by astrometry.net: their coordinates are those in our headers.
+"""Our frames solved by tetra3rs and astrometry.net: their coordinates agree with our headers.
 
-Neither gets anything of ours but the file and its camera's width (tetra3rs: its calibration); each is lost in space,
-with centroids and a catalog of its own. What they may be off by is predicted from their residuals:
+Each gets only the file and the camera's width (tetra3rs: its calibration), and solves lost in space
+with its own centroids and catalog. The allowed errors are predicted from their residuals:
 docs/findings/oracles.md.
 """
 
@@ -70,7 +70,7 @@ def test_a_wrong_header_is_detected() -> None:
 
 
 @pytest.mark.slow
-def test_the_predicted_errors_are_those_of_least_squares() -> None:
+def test_the_predicted_errors_match_least_squares() -> None:
     """Attitudes and plates of stars of unequal errors, by Monte Carlo: 2,000 draws tell sigma to 1.6 %."""
     rng = np.random.default_rng(2)
     camera = oracles.load(SHEFEX, "tetra3rs", 1).camera

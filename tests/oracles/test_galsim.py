@@ -106,7 +106,7 @@ def ours_px(image: Kernel, x: float, y: float, size: int) -> Floats:
 def worst(image: Kernel, parts: list[Any], seed: int) -> float:
     """The largest difference over the peak, of images of the same light in a circle within the reach.
 
-    Wings without an end are cut, and what is beyond is put back: theirs gets the same light in the circle.
+    Infinite wings are cut and their light restored, so GalSim's image is scaled to the same light in the circle.
     """
     size = 2 * int(np.ceil(image.reach_px)) + 3
     row, column = np.indices((size, size))

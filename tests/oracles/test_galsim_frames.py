@@ -1,4 +1,4 @@
-"""Skies that GalSim drew from Gaia's stars, solved by our estimator: nothing of ours is in the frames."""
+"""Skies drawn by GalSim from Gaia's stars and solved by our estimator; no code of ours makes the frames."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ FRAMES = 60
 
 
 def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(FRAMES, H, W) numbers of ours and of getframes'."""
+    """(FRAMES, H, W) pixel values of skysim and of getframes."""
     ours = {
         "quantum_efficiency": 1.0,
         "full_well_e": 4e4,

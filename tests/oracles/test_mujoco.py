@@ -1,4 +1,4 @@
-"""The pixel chain against MuJoCo's own camera: a bright ball is drawn by OpenGL where our optics say."""
+"""Our projection against MuJoCo's camera: OpenGL draws a bright ball at the pixel that our optics predict."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def world_xml(quaternion_wxyz: tuple[float, ...], place_m: tuple[float, ...]) ->
 
 
 def drawn(xml: str, places_m: np.ndarray, file: Path) -> np.ndarray:
-    """(N, H, W) pictures of the ball at N places. Skips where no OpenGL context can be made."""
+    """(N, H, W) pictures of the ball at N places. Skips if no OpenGL context can be created."""
     task = {
         "xml": xml,
         "places_m": places_m.tolist(),
@@ -125,7 +125,7 @@ def drawn(xml: str, places_m: np.ndarray, file: Path) -> np.ndarray:
 
 
 def middles(pictures: np.ndarray) -> np.ndarray:
-    """(N, 2) centroids of what is bright; each picture has one ball, all of it in the frame."""
+    """(N, 2) centroids of the bright pixels; each picture has one whole ball."""
     y, x = np.indices(pictures.shape[1:])
     bright = pictures > pictures.max() / 2
     assert (bright.sum(axis=(1, 2)) > 20).all()

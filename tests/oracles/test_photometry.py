@@ -1,4 +1,4 @@
-"""What photutils and sep measure on our frames is the light that the truth names (extra `oracle`)."""
+"""photutils and sep measure the true light of our frames (extra `oracle`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLEAN = {
 
 @pytest.fixture(scope="module")
 def stars() -> dict[str, Any]:
-    """A still frame of bright stars, background off, and the truth of those that stand alone and inside."""
+    """A still frame of bright stars without background, and the truth of isolated stars inside the frame."""
     loaded = loader.load("shefex2", CLEAN)
     frame, truth = simulate_motion(loaded).render(0)
     part = loaded.camera.detector
@@ -46,7 +46,7 @@ def stars() -> dict[str, Any]:
 
 
 def within_its_noise(flux: np.ndarray, stars: dict[str, Any], area_px: float) -> None:
-    """All together and each: shot noise of the star, read noise of the aperture."""
+    """Check all errors and each one against the star's shot noise and the aperture's read noise."""
     sigma = np.sqrt(stars["electrons"] + area_px * stars["noise_e"] ** 2)
     pull = (flux - stars["electrons"]) / sigma
     assert np.abs(pull).max() < 4

@@ -1,6 +1,6 @@
-"""Places and magnitudes of Sun, Moon and planets are Skyfield's with JPL's DE421 (extra `oracle`).
+"""Positions and magnitudes of Sun, Moon and planets match Skyfield with JPL's DE421 (extra `oracle`).
 
-Skyfield has its own light time, deflection, aberration, Earth rotation and magnitudes; the shipped ephemeris is
+Skyfield computes light time, deflection, aberration, Earth rotation and magnitudes itself; the shipped ephemeris is
 fitted to DE423.
 """
 
@@ -86,7 +86,7 @@ def test_places_match_skyfield(skyfield: Skyfield, on_ground: bool) -> None:
 def test_satellites_match_skyfield(skyfield: Skyfield, tmp_path: Path) -> None:
     """Places in the GCRS, apparent places from a site with light time and aberration, and where they are sunlit.
 
-    Skyfield's Earth casts the shadow of a sphere and lights a satellite or not: near the limb they may differ.
+    Skyfield uses a spherical Earth and a sharp shadow, so results near the limb may differ.
     """
     from skyfield.api import EarthSatellite
 

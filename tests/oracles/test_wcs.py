@@ -1,4 +1,4 @@
-"""The pixel chain against astropy's own world coordinate system, built from the header that our frames carry."""
+"""Our projection against astropy's world coordinate system from our frames' headers."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_north_is_up_and_east_is_left_without_roll() -> None:
         np.testing.assert_allclose(theirs, wanted, rtol=0, atol=1e-6)
 
 
-def test_astropy_s_pixels_are_the_frame_s_own_indices() -> None:
+def test_astropy_s_pixel_coordinates_equal_array_indices() -> None:
     """FITS counts from 1, arrays from 0: the pointing lands on the principal point in both counts."""
     header = WCS(Header(wcs.header(CAMERA, star_sources.cam_from_icrs(40.0, 30.0, 10.0))))
     center = SkyCoord(40.0, 30.0, unit="deg")

@@ -1,4 +1,4 @@
-"""Pictures for the eye: marks where the truth is, stretches that compare."""
+"""Annotated pictures: marks at true positions and equal stretches."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_invisible_sources_are_not_marked_and_a_legend_names_the_colors() -> Non
         assert len(picture) == 1200 + plots.LEGEND_PX
 
 
-def test_a_contact_sheet_stretches_all_frames_alike() -> None:
+def test_a_contact_sheet_stretches_all_frames_equally() -> None:
     rng = np.random.default_rng(2)
     bright, dim = (rng.normal(100, 1, (40, 50)) for _ in range(2))
     bright[18:23, 23:28] = 1000

@@ -1,4 +1,4 @@
-"""A run in other tools' formats: what is read back is what was flown, by formulas and readers that are not ours."""
+"""Exports to other tools' formats round-trip by independent formulas and readers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
 
 
 def sky_flight(folder: Path) -> Flight:
-    """A scene under the stars run into a folder: frames, truths, solutions."""
+    """Folder of a run of a sky scene: frames, truths, solutions."""
     flight = open_flight(
         loader.load("shefex2", {"exposure.frames": "3", "camera.distortion": LENS})
     )
@@ -58,7 +58,7 @@ def sky_flight(folder: Path) -> Flight:
 
 
 def dome_flight(folder: Path) -> Flight:
-    """A dome photographed into a folder by a noise-free camera: frames and truths."""
+    """Folder of a noise-free run of a dome scene: frames and truths."""
     settings = {
         "exposure.frames": "2",
         "motion.start": "{roll_deg: 4, yaw_deg: 70}",
@@ -87,7 +87,7 @@ def dome(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def read_aem(path: Path) -> tuple[dict[str, str], list[datetime.datetime], Floats]:
-    """Keywords, epochs and (K, 4) Q1 Q2 Q3 QC, by the notation's rules alone."""
+    """Keywords, epochs and (K, 4) Q1 Q2 Q3 QC, read by the rules of the notation alone."""
     head, _, rest = path.read_text("ascii").partition("DATA_START\n")
     pairs = (
         line.split(" = ", 1)
@@ -100,7 +100,7 @@ def read_aem(path: Path) -> tuple[dict[str, str], list[datetime.datetime], Float
 
 
 def matrix_b_from_a(q: Floats) -> Floats:
-    """M_BA with X_B = M_BA X_A, as CCSDS 504.0-B-2, annex F2.1, writes it out."""
+    """M_BA with X_B = M_BA X_A by CCSDS 504.0-B-2, annex F2.1."""
     q1, q2, q3, qc = q
     return np.array(
         [
@@ -326,7 +326,7 @@ def camera(distortion: tuple[float, ...], focal_length: str) -> CameraConfig:
 
 
 def misfits(lens: CameraConfig) -> tuple[float, float]:
-    """Greatest distance, px, of astropy's way to the sky and ours back; and of the header's inverse polynomials from
+    """Largest error, px, of astropy's projection to the sky and ours back, and of the header's inverse polynomials from
     ours."""
     cam_from_icrs = star_sources.cam_from_icrs(83.0, -5.0, 37.0)
     header = WCS(fits.Header(wcs.header(lens, cam_from_icrs)))

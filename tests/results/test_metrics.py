@@ -1,4 +1,4 @@
-"""Errors split by hand, and the chi-square that a true covariance gives."""
+"""Components of errors by hand, and the chi-square of a true covariance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRUTH = Rotation.from_rotvec([0.4, -1.1, 2.0])
 
 
 def turned(x: float, y: float, z: float) -> Rotation:
-    """The truth, then a turn in camera axes."""
+    """The truth followed by a rotation in camera axes."""
     return Rotation.from_rotvec([x, y, z]) * TRUTH
 
 

@@ -18,7 +18,7 @@ TIMES = ("time_ms",)  # of this run, not of the scene
 
 
 def digest(path: Path) -> str:
-    """Hash of a file; of a table without the times that its run took."""
+    """Hash of a file; tables are hashed without computing times."""
     if path.name != "solutions.ecsv":
         return hashlib.sha256(path.read_bytes()).hexdigest()
     table = Table.read(path)
@@ -27,7 +27,7 @@ def digest(path: Path) -> str:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Of all files but the reports, which name their command."""
+    """Hashes of all files except reports, which contain their command."""
     files = [
         path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".html"
     ]
@@ -63,7 +63,7 @@ def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(
 
 
 def test_a_run_along_a_given_table_is_saved(tmp_path: Path) -> None:
-    """The table has no file that the check of the plan could read again."""
+    """A table in memory has no file that the check of the plan could read."""
     level = [0.0] * 4
     table = Table(
         {

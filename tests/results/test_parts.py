@@ -1,4 +1,4 @@
-"""The list of parts: quantities against geometry, and what drive, code and layout change; tables of prices."""
+"""The list of parts: quantities against geometry, effects of drive, code and layout, and price tables."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_the_cheapest_sufficient_survey_is_chosen() -> None:
     )
 
 
-def test_the_table_adds_up() -> None:
+def test_the_parts_table_sums_to_its_total() -> None:
     parts = listed()
     rows = [
         row for row in csv.reader(to_csv(parts, "mine").splitlines()) if not row[0].startswith("#")

@@ -1,4 +1,4 @@
-"""Frames for a plant outside of skysim: at the attitude, rate and time that it gives, with noise by number."""
+"""Frames for an external plant: at its attitude, rate and time, with noise by frame number."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def difference_dn(one: Frame, other: Frame) -> Floats:
 
 
 def test_the_truth_is_the_given_pose_at_mid_exposure(lab: Lab, attitude: Rotation) -> None:
-    """And the stars are where a camera of that attitude sees them, with streaks of the rate."""
+    """Stars are at the positions for this attitude, with streaks of the rate."""
     frame, truth = skysim.render_at(lab, attitude, RATE, t_s=7.5)
     assert frame.t_mid_s == truth.t_s == pytest.approx(7.5, abs=1e-12)
     assert (truth.lab_from_body * attitude.inv()).magnitude() < 1e-12

@@ -1,4 +1,4 @@
-"""Laws of reports: nothing is lost or obeyed on the way to a page, and every form says the same."""
+"""Laws of reports: text is kept and never interpreted, and every output format has the same content."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def of(*blocks: Block) -> Report:
 
 
 def everywhere(text: str) -> Report:
-    """A report with a text wherever it may come from outside."""
+    """A report with the text in every place that accepts outside text."""
     table = Table(
         [Column(text), Column("note", kind="aside")], [[text, text], [Cell(text, "bad", 3.0), ""]]
     )
@@ -92,7 +92,7 @@ def test_a_text_from_outside_is_text_in_html() -> None:
 
 
 def test_a_text_from_outside_opens_no_element_in_markdown() -> None:
-    """But in code, where Markdown shows it literally."""
+    """Code is excepted, as Markdown shows it literally."""
     outside_of_code = re.sub(
         r"^(`{3,})\w*\n.*?^\1$", "", everywhere(HOSTILE).markdown(), flags=re.DOTALL | re.MULTILINE
     )
@@ -215,7 +215,7 @@ def test_the_terminal_ends_with_the_answer_and_shows_only_its_blocks(
     ]
 
 
-def test_a_long_table_is_cut_on_the_terminal_and_says_so(
+def test_a_long_table_is_cut_on_the_terminal_with_a_note(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     report.print_table(Table([Column("n")], [[n] for n in range(100)]))

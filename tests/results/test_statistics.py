@@ -1,4 +1,4 @@
-"""Intervals of proportions, means and quantiles: against their own equations, and how often they hold the truth."""
+"""Intervals of proportions, means and quantiles: against their equations, and their coverage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A flight's figures, table and plot, from a made-up flight whose every number is known."""
+"""A flight's figures, table and plot, from an artificial flight with known numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cameras that come with skysim: every value has its source, every preset is a camera, and derived figures hold."""
+"""Shipped cameras: every value has a source, every preset is valid, and derived figures match."""
 
 from __future__ import annotations
 

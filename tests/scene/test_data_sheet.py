@@ -1,4 +1,4 @@
-"""A camera file from the numbers of a data sheet: parsed, assumed where silent, valid as a preset."""
+"""A camera file from a data sheet: parsing, assumptions for missing values, validity as a preset."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ CALIBRATION = OpencvCalibration(
 
 
 def by_opencv(path: Path, **more: Any) -> Path:
-    """A file as OpenCV itself writes it."""
+    """A file written by OpenCV."""
     focal = CALIBRATION.focal_px
     (x, y) = CALIBRATION.center_px
     keys = {
@@ -162,7 +162,7 @@ def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> N
 
 @pytest.fixture
 def lens(tmp_path: Path) -> Path:
-    """A calibration of a camera like shefex2's, its lens a little other than the scene has it."""
+    """A calibration of a camera like shefex2's with a slightly different lens."""
     calibration = OpencvCalibration(
         659, 493, 2540.5, (331.25, 244.5), (-0.12, 0.04, 6e-4, -4e-4, 0.0)
     )
@@ -249,7 +249,7 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
 
 
 def scene_pointing(truth: Any, calibration: OpencvCalibration) -> list[float]:
-    """RA and Dec, deg, of the image's middle by OpenCV's way back through the lens."""
+    """RA and Dec, deg, of the image's center by OpenCV's undistortion."""
     focal = calibration.focal_px
     (x, y) = calibration.center_px
     matrix = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])

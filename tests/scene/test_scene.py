@@ -1,4 +1,4 @@
-"""Units are what they say, and every kind of bad input is one line that helps."""
+"""Scene files: units, and one helpful error line for every kind of bad input."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def line_number(text: str, fragment: str) -> int:
 
 
 def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
-    """The one line that a bad scene gets."""
+    """One-line error text for a bad scene."""
     with pytest.raises(InputError) as refusal:
         loader.load(path, overrides)
     message = str(refusal.value)
@@ -155,7 +155,7 @@ def test_a_section_s_quantities_become_si(
 
 
 def parts_of(annotation: object) -> set[type[ConfigModel]]:
-    """Every section that an annotation names, and theirs."""
+    """Every section that an annotation names, recursively."""
     if isinstance(annotation, type) and issubclass(annotation, ConfigModel):
         fields = annotation.model_fields.values()
         return {annotation}.union(*(parts_of(field.annotation) for field in fields))
@@ -163,7 +163,7 @@ def parts_of(annotation: object) -> set[type[ConfigModel]]:
 
 
 def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
-    """Whether it, or each of it, is filled by a value such as "48 in"."""
+    """Whether an annotation, or each of its elements, takes a value such as "48 in"."""
     parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
     sizes = [one.quantity for one in metadata if isinstance(one, ErrorSchema)]
     own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(
@@ -230,7 +230,7 @@ def test_the_afit_scene_has_the_thesis_s_values() -> None:
     assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
 
 
-def test_a_scene_is_frozen() -> None:
+def test_a_scene_is_immutable() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         loader.load("shefex2").seed = 3
 
@@ -917,7 +917,7 @@ def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
 
 
 def test_a_base_is_found_beside_the_scene_and_may_have_its_own_base(tmp_path: Path) -> None:
-    """And the files that it names are those beside itself, not beside the scene on top of it."""
+    """Files named in the base are resolved beside the base, not beside the scene."""
     model = (SCENES / "vehicles" / "simsat.xml").read_text()
     written(tmp_path, "below/own.xml", model)
     written(
@@ -986,7 +986,7 @@ def test_an_error_is_reported_with_the_file_that_contains_it(tmp_path: Path) -> 
 
 
 def test_a_list_replaces_the_base_s_list_whole(tmp_path: Path) -> None:
-    """The base has a first element with a duration; but this list has taken its place."""
+    """The base's first element has a duration, but the scene's list replaces the base's."""
     mine = written(
         tmp_path,
         "mine.yaml",
@@ -1041,7 +1041,7 @@ def test_a_lens_is_focused_at_infinity_by_default() -> None:
 
 @pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
 def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
-    """There the image would be greater than the object; at the focal length there is none at all."""
+    """Nearer, the image would be larger than the object; at the focal length there is no image."""
     message, _ = complaint_and_place(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
     assert re.match(r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message)
 
@@ -1152,7 +1152,7 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
 
 
 def test_a_duplicate_key_is_refused(tmp_path):
-    """YAML itself would take the last one without a word."""
+    """A plain YAML loader would silently take the last one."""
     path = tmp_path / "twice.yaml"
     path.write_text((SCENES / "shefex2.yaml").read_text() + "\nseed: 3\n")
     with pytest.raises(InputError, match=r"^seed: duplicate key \(.*twice.yaml, line \d+\)$"):

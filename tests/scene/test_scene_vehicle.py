@@ -1,4 +1,4 @@
-"""A scene's vehicle, motion and base: units, what goes together, and one line for whatever does not."""
+"""A scene's vehicle, motion and base: units, and one error line for contradicting keys."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_other_kinds_and_lists_replace_the_base_s_and_null_removes_a_section(
 
 
 def test_a_base_beside_the_scene_resolves_its_own_files(tmp_path: Path) -> None:
-    """The base's vehicle is beside the base, though the scene is elsewhere."""
+    """The base's vehicle file is found beside the base although the scene is in another folder."""
     lab = tmp_path / "lab"
     campaign = tmp_path / "campaign"
     lab.mkdir()

@@ -1,4 +1,4 @@
-"""An option that has no effect is refused where it is written, and it really has none."""
+"""An option without effect is refused at its place, and it really has none."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ KEYS = [case.key for case in CASES]
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=KEYS)
 def test_a_key_without_effect_is_refused(case: Case) -> None:
-    """In one line: the key, why, what is allowed, where; and not where it has an effect."""
+    """One line has the key, the reason, allowed values and the place; where it has an effect, it is accepted."""
     settings = case.settings
     with pytest.raises(InputError) as refused:
         loader.load(case.scene, settings | {case.key: case.value})
@@ -279,7 +279,7 @@ def test_a_key_without_effect_is_refused(case: Case) -> None:
 
 
 def test_every_rule_has_a_case() -> None:
-    """But the one for a map, which needs a file (below)."""
+    """The rule for a map needs a file and has its own test below."""
     covered = {
         rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)
     }
@@ -291,7 +291,7 @@ def test_every_rule_has_a_case() -> None:
 
 
 def test_every_key_of_a_rule_is_a_key_of_the_schema() -> None:
-    """A misspelled one would never be refused."""
+    """A misspelled key would never be refused."""
     schema = (Path(__file__).parents[2] / "data/schema/scene.json").read_text()
     for rule in unused.RULES:
         for key in rule.keys:
@@ -329,7 +329,7 @@ OTHERS = [case for case in CASES if case.key not in SAMPLE and "tracker.name" no
 @pytest.mark.long
 @pytest.mark.parametrize("case", OTHERS, ids=lambda case: case.key)
 def test_no_other_refused_key_changes_anything(case: Case) -> None:
-    """But those of external trackers, which are other programs."""
+    """Keys of external trackers, which are other programs, are excepted."""
     check_no_effect(case)
 
 
@@ -351,7 +351,7 @@ def check_no_effect(case: Case) -> None:
     ids=lambda case: case.key,
 )
 def test_an_allowed_key_changes_the_result(case: Case) -> None:
-    """Else the test above could not fail."""
+    """This shows that the test above can fail."""
     settings = SMALL | {"exposure.first": "50 ms"} | case.settings | case.useful
     plain = outcome(case.scene, settings)
     changed = outcome(case.scene, settings | {case.key: case.value})
@@ -403,7 +403,7 @@ def test_a_section_as_an_override_sets_its_keys() -> None:
 
 
 def test_with_a_map_the_survey_has_no_effect(tmp_path: Path) -> None:
-    """But for a solver that uses the surveyed surface."""
+    """Solvers that use the surveyed surface are excepted."""
     (tmp_path / "leds.ecsv").write_text("")
     own = written(tmp_path, "base: afit_simsat_ideal\ntracker: {map: leds.ecsv}\n")
     with pytest.raises(

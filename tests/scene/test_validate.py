@@ -1,4 +1,4 @@
-"""Files are checked before anything is flown; editors get a schema that knows what we know."""
+"""Files are checked before a run; the schema for editors has the same rules."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHIPPED = {
 
 
 class Plain(yaml.SafeLoader):
-    """YAML as editors read it: a moment is a text."""
+    """YAML loader as in editors: times are text."""
 
 
 Plain.yaml_implicit_resolvers = {

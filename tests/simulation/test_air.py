@@ -1,4 +1,4 @@
-"""Frames of a scene with air: where the stars are, how bright, and what the skyline hides."""
+"""Frames of a scene with air: star positions and brightness, and stars hidden by the skyline."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
-def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
+def test_a_tracker_with_its_site_is_as_accurate_as_without_air(altitude_deg: float) -> None:
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
     settings = {"tracker.refraction": "true"}
     later = {"exposure.first": "600 s"}

@@ -65,7 +65,7 @@ def bumped() -> Bumped:
 def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The first frame is solved once more before, and that report is none of the flight's."""
+    """The first frame is also solved once before; that report is not part of the flight."""
     solved: list[Frame] = []
     solve = factory.solve_frame
 
@@ -91,13 +91,13 @@ def off_deg(telemetry: Telemetry) -> Floats:
 
 
 def imu_error_deg(telemetry: Telemetry) -> Floats:
-    """(K, 3) of the IMU's attitude, in body axes."""
+    """(K, 3) error of the IMU's attitude in body axes, deg."""
     assert telemetry.lab_from_imu is not None
     return np.degrees((telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec())
 
 
 def in_sigma(telemetry: Telemetry) -> Floats:
-    """(K, 3) the filter's error about each body axis over what it believes of it."""
+    """(K, 3) the filter's error about each body axis over its standard deviation."""
     assert telemetry.lab_from_filter is not None
     error = (telemetry.lab_from_filter.inv() * telemetry.lab_from_body).as_rotvec()
     return np.abs(error) / telemetry.sigma_attitude_rad
@@ -136,8 +136,8 @@ def test_the_imu_errs_permanently_by_the_missed_rotation(bumped: Bumped) -> None
 
 @pytest.mark.slow
 def test_the_filter_s_covariance_covers_its_errors(bumped: Bumped) -> None:
-    """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
-    turns are missed, and after.
+    """The error is always within four sigma: before the first solution, while the gyros are
+    saturated, and afterwards.
     """
     telemetry = bumped.telemetry
     assert in_sigma(telemetry)[1:].max() < 4
@@ -224,7 +224,7 @@ def test_solutions_used_by_the_filter_equal_those_of_the_saved_frames(bumped: Bu
 @pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
 def test_a_solution_arrives_after_its_latency(latency_s: float) -> None:
-    """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
+    """The filter's sigma falls at the first tick after exposure end plus latency, with a correct attitude."""
     flight = open_flight(
         changed(
             filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
@@ -256,7 +256,7 @@ def test_the_loop_with_latency_survives_the_accident() -> None:
 
 
 def test_a_frame_without_an_answer_does_not_change_the_filter() -> None:
-    """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
+    """With a capped lens there is no solution; the filter continues with the gyros and its sigma grows."""
     flight = open_flight(
         changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
     )

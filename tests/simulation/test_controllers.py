@@ -1,4 +1,4 @@
-"""A user's controller: the same motion by every route, and never a run that ends without saying why."""
+"""A user's controller: the same motion by every interface, and an error text for every failure."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ SHORT = {
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package with entry points, as pip would leave it."""
+    """An installed package with entry points, as pip makes it."""
     (tmp_path / "mypd.py").write_text(PD)
     about = tmp_path / "mypd-1.0.dist-info"
     about.mkdir()
@@ -106,7 +106,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def flown(changes: dict[str, Any] | None = None, **parts: Any) -> Telemetry:
-    """The motion alone of `skysim.simulate`, without its frame."""
+    """The motion of `skysim.simulate` without its frame."""
     scene = skysim.load_scene("simsat_slew", SHORT | (changes or {}))
     with open_flight(scene, **parts) as flight:
         return flight.simulate_motion().telemetry()
@@ -359,7 +359,7 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
 
 
 def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
-    """Or `skysim run`, which checks its plan, would start it twice."""
+    """Otherwise `skysim run`, which checks its plan first, would start it twice."""
     started = tmp_path / "started"
     programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
     lab = build_lab(

@@ -32,7 +32,7 @@ RING_M = 0.08
 
 
 def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
-    """Lights at (n, 3) places in camera axes, one pixel accurate each."""
+    """Lights at (n, 3) places in camera axes, each with an error of one pixel."""
     count = len(arm_m)
     nothing = np.zeros(len(arm_m))
     xy_px = lab.camera.optics.project(offset_m)
@@ -225,7 +225,7 @@ def render_moving(
 
 
 def lit_by_known(exposure: Exposure, lab: Lab) -> Lit:
-    """The light by which the tracker finds itself."""
+    """Sources that the tracker's map contains."""
     (lit,) = (lit for lit in beam_of(lab.camera.lights, exposure).lits if lit.known)
     return lit
 
@@ -348,7 +348,7 @@ def test_a_station_s_position_error_acts_as_a_lever_error() -> None:
     assert not station["LED survey"].any()
 
 
-def test_a_station_s_sights_err_by_angle_times_distance() -> None:
+def test_a_station_s_cross_errors_are_angle_times_distance() -> None:
     """Angles of 10″ at some 3.3 m, and distances of 0.16 mm, err by 0.16 mm along each axis."""
     sight = INSTRUMENT.replace("arcsec: 0", "arcsec: 10").replace('"0 mm"', '"0.16 mm"')
     station = variances_of({"instrument": f"{sight}}}"})

@@ -46,7 +46,7 @@ def images(shots: list[Shot]) -> list[bytes]:
 
 @pytest.fixture
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Indices of the frames that a flight renders, as they come."""
+    """Indices of the frames in the order in which a flight renders them."""
     indices: list[int] = []
     render_frame = flight_module.render_frame
 
@@ -78,7 +78,7 @@ HEADS = {"motion__maneuver": "[{kind: hold, duration: 1 s}]", "exposure__rate_hz
 def test_each_exposure_is_rendered_once(
     name: str, changes: Mapping[str, str], cameras: int, has_filter: bool, rendered: list[int]
 ) -> None:
-    """And, where only the motion is wanted, those alone that the filter needs."""
+    """If only the motion is requested, only frames for the filter are rendered."""
     scene = scene_of(name, 3, **changes)
     shots = list(open_flight(scene).shots())
     assert len(shots) == 3 * cameras
@@ -122,7 +122,7 @@ def test_a_shot_equals_the_frame_rendered_alone(changes: Mapping[str, str], solv
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["simsat_bump", "simsat_slew", "shefex2", "two_heads"])
 def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
-    """To the last bit: with the filter in the loop, and without."""
+    """The motion is equal bit for bit, with and without the filter in the loop."""
     scene = scene_of(name, 6)
     shots, forgetful = (
         list(open_flight(scene, keeps_history=keeps).shots()) for keeps in (True, False)
@@ -140,7 +140,7 @@ def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_flight_without_history_has_the_same_motion() -> None:
-    """Nothing of the motion depends on how much is kept; what is older is gone."""
+    """The motion does not depend on the kept history; older parts are dropped."""
     scene = scene_of("simsat_slew", 3)
     long = open_flight(scene)
     short = open_flight(scene, keeps_history=False)
@@ -198,7 +198,7 @@ def test_only_selected_frames_are_rendered_and_match_those_of_the_whole_run(
 
 
 @pytest.mark.slow
-def test_an_endless_flight_goes_on_with_the_frames_of_the_scene() -> None:
+def test_an_endless_flight_continues_the_scene_s_frames() -> None:
     scene = scene_of("shefex2", 2)
     more = scene_of("shefex2", 5)
     with open_flight(scene, endless=True, keeps_history=False) as flight:
@@ -280,7 +280,7 @@ def test_steps_are_the_same_flight_as_a_loop_over_shots() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_a_torque_turns_the_vehicle_as_eulers_equation_says() -> None:
+def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
     """From rest about a principal axis: T t / J and T t^2 / 2 J. Then about all axes, by what momentum it gives."""
     scene = scene_of("afit_simsat", 2, **BALANCED)
     flight = open_flight(scene)
@@ -310,7 +310,7 @@ def test_a_torque_turns_the_vehicle_as_eulers_equation_says() -> None:
 
 @pytest.mark.parametrize("actuators", ["ideal", "wheels"])
 def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(actuators: str) -> None:
-    """For the steps that it is given for. The wheels, of 0.010125 kg m2, take up the momentum that the vehicle gets."""
+    """It acts in the steps for which it is given; the wheels (0.010125 kg m2) take up the opposite momentum."""
     changes = BALANCED | {
         "vehicle.wheels": "{torque_limit: '0.6 N m'}",
         "motion.control": f"{{law: pid, actuators: {actuators}}}",
@@ -398,7 +398,7 @@ def test_the_state_is_the_trajectory_s_present_one() -> None:
 
 
 def test_imu_samples_since_a_time_are_the_latest_ones() -> None:
-    """As the gyros give them while the vehicle moves: none is changed or lost later."""
+    """Samples are final when the gyros deliver them: none is changed or lost later."""
     flight = open_flight(scene_of("simsat_bump", 1, exposure__first="0.6 s"))
     assert len(flight.imu_samples().t_s) == 0
     while flight.now_s < 0.5:
@@ -452,7 +452,7 @@ def test_a_frame_that_is_not_exposed_is_refused() -> None:
 
 
 def observed_at(flight: Flight, t_s: float) -> Shot:
-    """An observation by the flight when it has come to that time."""
+    """An observation by the flight at this time."""
     while flight.now_s < t_s - 1e-9:
         flight.step()
     return flight.observe(solves=False)

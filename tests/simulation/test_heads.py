@@ -149,7 +149,7 @@ def test_under_a_dome_a_head_that_looks_below_the_rim_sees_nothing() -> None:
 
 @pytest.mark.slow
 def test_the_filter_uses_the_frames_of_all_heads() -> None:
-    """Also where only those of the main camera are asked for; its frames and updates are the same."""
+    """This holds even if only the main camera's frames are requested; its frames and updates are the same."""
     changes = SHORT | {"exposure.frames": 6, "exposure.rate_hz": 10}
     scene = load_scene("two_heads", changes)
     every = list(open_flight(scene).shots())

@@ -1,4 +1,4 @@
-"""Lights: a new one is one file with its schema; the forecast counts what is drawn and names what hides it."""
+"""Lights: a new kind is one file with its schema; the forecast counts drawn lights and names occluders."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ LAMP_ID = 3_000_000_000
 class LighthouseConfig(LightConfig):
     """One lamp that shines down and blinks.
 
-    lit : how long it shines in every period, from the scene's start on
+    lit : on-time in every period, from the scene's start
     """
 
     kind: Literal["lighthouse"]
@@ -85,7 +85,7 @@ class CurtainConfig(LightConfig):
 
 @dataclasses.dataclass(frozen=True)
 class Curtain(Obstacle):
-    """Hides what is beyond it."""
+    """Hide sources beyond it."""
 
     beyond_m: float
 
@@ -157,7 +157,7 @@ def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_no
 
 
 def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
-    """Lamp and LEDs beyond it are gone from the frame and listed as hidden; those before it are as without it."""
+    """Lamp and LEDs beyond it are absent from the frame and listed as hidden; those before it are unchanged."""
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
     lab = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}")
     free = lab_with(lamp)
@@ -176,7 +176,7 @@ def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
 
 
 def test_a_lighthouse_is_a_section_of_the_scene() -> None:
-    """Read with units, written with its keys, and refused by them."""
+    """It is read with units, written with its keys, and errors name them."""
     scene = loader.load("afit_simsat", LEVEL | {"lights": f"[{LAMP}]"})
     (config,) = scene.lights
     assert isinstance(config, LighthouseConfig)
@@ -233,7 +233,7 @@ def test_the_forecast_and_the_run_agree_on_stars_behind_the_earth() -> None:
     assert not any(len(shot.truth.sources.id) for shot in shots)
 
 
-def test_the_forecast_sees_the_stars_through_the_air_as_the_frames_do() -> None:
+def test_the_forecast_applies_the_air_as_the_frames_do() -> None:
     """Raised, dimmed, and none below the skyline: the electrons of the forecast are those of the frame's truth."""
     night = {
         "light.air": "{scintillation: false, horizon: {azimuth_deg: [0, 180], altitude_deg: [20, 20]}}",

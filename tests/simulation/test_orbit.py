@@ -1,4 +1,4 @@
-"""A scene whose camera is in an orbit: aberration of each frame, what the tracker knows of it, and the Earth."""
+"""A camera in orbit: aberration of each frame, the tracker's correction, and the Earth."""
 
 from __future__ import annotations
 

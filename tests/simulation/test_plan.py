@@ -1,4 +1,4 @@
-"""The check of a plan: its facts against counts and closed forms, and a warning for each mistake that names the key."""
+"""The check of a plan: facts against counts and closed forms, and a warning with its key for each mistake."""
 
 from __future__ import annotations
 
@@ -479,7 +479,7 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
 def test_a_mistake_is_warned_of_with_its_key(
     scene: str, changes: dict[str, str], key: str, words: str
 ) -> None:
-    """And with what to change it to; the plan as it ships gives no such warning."""
+    """The warning names the remedy; the shipped plan gives no such warning."""
     tilted = {"motion__maneuver": TILTED} if key.endswith("cap_deg") else {}
     lines = [
         line
@@ -539,7 +539,7 @@ def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys:
 
 
 def test_a_bright_background_is_the_only_warning_that_it_causes() -> None:
-    """The lights in it are saturated too, and their pixels above no threshold."""
+    """The lights are saturated, too, but no pixel is above a threshold."""
     (line,) = check(lab_of("shefex2", background="[{kind: uniform, e_s: 5.0e6}]")).findings
     assert line.startswith(
         "background: 200001 electrons in a pixel without a light, of 39956 at saturation; lower it"
@@ -775,7 +775,7 @@ def test_a_check_costs_a_fraction_of_a_second() -> None:
 
 @pytest.mark.slow
 def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) -> None:
-    """Half a turn about z in two seconds: 2.5 rad/s^2, where the wheels give a hundredth of that."""
+    """180 deg about z in two seconds need 2.5 rad/s^2; the wheels give a hundredth of that."""
     t_s = np.linspace(0, 2, 41)
     yaw_deg = 90 * (1 - np.cos(np.pi * t_s / 2))
     file = tmp_path / "fast.csv"

@@ -1,4 +1,4 @@
-"""What `skysim check` says of stray light, exclusion angles, the air, reflections and drift with the temperature."""
+"""`skysim check` on stray light, exclusion angles, air, reflections and thermal drift."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_a_baffle_replaces_the_advice_to_add_one() -> None:
 
 
 @pytest.mark.slow
-def test_the_tracker_of_a_plan_knows_the_orbit_s_velocity() -> None:
+def test_the_tracker_of_a_plan_has_the_orbit_s_velocity() -> None:
     """Else its stars are off by the orbit's aberration, up to 5.2"."""
     errors = [
         plan_of("shefex2", orbit=ORBIT, **keys)[0].beliefs.direction_error

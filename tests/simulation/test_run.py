@@ -1,4 +1,4 @@
-"""The whole chain without noise returns the truth; frames stand alone; the streams are order-free."""
+"""The noise-free chain returns the truth; frames are independent; random streams do not depend on order."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def shots_of(scene: Scene) -> list[Shot]:
 def true_centroids(truth: Truth) -> Centroids:
     """The true pixels, brightest first, as if they had been measured to a hundredth of a pixel.
 
-    They are the images of the LEDs' centers. The centers of light are up to 1e-3 px from these in perspective.
+    These are the images of the LEDs' centers; by perspective the centers of light differ by up to 1e-3 px.
     """
     order = np.argsort(-truth.sources.electrons)
     count = len(order)
@@ -114,7 +114,7 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["shefex2", "nps_tas2_ideal", "apl_dome_ideal"])
 def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) -> None:
-    """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
+    """Without noise, the images' wings and readout smear must not merge the lights into one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
     lab = build_lab(
         loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()})
@@ -188,7 +188,7 @@ def test_a_wrong_lever_causes_the_reference_s_error() -> None:
 # What the frames are made of
 
 
-def test_the_camera_points_where_the_scene_says() -> None:
+def test_the_camera_has_the_scene_s_pointing() -> None:
     flight = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
     _, truth = flight.render(0)
     right, down, sight = truth.cam_from_lab.as_matrix()
@@ -474,7 +474,7 @@ def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
 
 
 def test_a_frame_has_the_commanded_exposure_time() -> None:
-    """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
+    """It opens on time; its truth and glare (1e5 e-/s) are those of its own exposure."""
     glare = "[{kind: uniform, e_s: 1e5}]"
     scene = controlled(3, "4 ms", "{mean_dn: 1000, min_stars: 1000}", background=glare)
     shots = shots_of(scene)

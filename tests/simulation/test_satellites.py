@@ -1,4 +1,4 @@
-"""Satellites in a scene: drawn as streaks, in the truth, and rejected by the tracker as one thing each."""
+"""Satellites in a scene: drawn as streaks, listed in the truth, and each rejected by the tracker as one object."""
 
 from __future__ import annotations
 

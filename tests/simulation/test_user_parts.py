@@ -1,4 +1,4 @@
-"""Trackers and profiles given in Python, prescribed motions, and what the vehicle cannot follow."""
+"""Trackers and profiles given in Python, prescribed motions, and motions that the vehicle cannot follow."""
 
 from __future__ import annotations
 
@@ -339,7 +339,7 @@ def sky() -> Run:
 
 @pytest.mark.slow
 def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
-    """What it returns, in every form; and it gets each image once, in order, unchanged."""
+    """Every form of return value is accepted; the function gets each image once, in order, unchanged."""
     truth = sky[0].truth.cam_from_lab
     images = []
     error = Rotation.from_rotvec([1e-4, 0, 0])

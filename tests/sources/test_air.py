@@ -50,7 +50,7 @@ def horizontal(axes: Floats, directions: Floats) -> tuple[Floats, Floats]:
 @pytest.mark.parametrize(
     "weather", [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)]
 )
-def test_refraction_is_that_of_astropy(
+def test_refraction_matches_astropy(
     place: tuple[float, float, float], weather: tuple[float, ...]
 ) -> None:
     """Within 0.1" down to 15 degrees of AltAz with air less AltAz without: ERFA's A tan Z + B tan^3 Z.
@@ -149,7 +149,7 @@ def kasten_young(altitude_rad: Floats) -> Floats:
     return 1 / (np.sin(altitude_rad) + 0.50572 * (h_deg + 6.07995) ** -1.6364)
 
 
-def test_air_masses_are_those_of_kasten_and_young() -> None:
+def test_air_masses_match_kasten_and_young() -> None:
     altitude = np.radians(np.linspace(3, 90, 200))
     np.testing.assert_allclose(starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012)
     assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(

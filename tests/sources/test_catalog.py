@@ -65,13 +65,13 @@ def test_famous_stars_have_the_almanac_s_positions(stars: Catalog, hip: int) -> 
 
 
 @pytest.mark.parametrize(("hip", "v_mag"), [(hip, v) for hip, (_name, v) in FAMOUS_V.items()])
-def test_famous_stars_are_as_bright_as_the_bright_star_catalog_says(
+def test_famous_stars_have_the_bright_star_catalog_s_magnitudes(
     stars: Catalog, hip: int, v_mag: float
 ) -> None:
     assert stars.v_mag[index(stars, hip)] == pytest.approx(v_mag, abs=0.05)
 
 
-def test_counts_are_the_reference_s(stars: Catalog) -> None:
+def test_star_counts_match_the_reference(stars: Catalog) -> None:
     # Reference §2, hip2 alone: V<5 1618, V<6 5025. Nineteen stars are supplied, five left out.
     assert abs(np.sum(stars.v_mag < 5) - 1618) <= 24
     assert abs(np.sum(stars.v_mag < 6) - 5025) <= 24
@@ -183,7 +183,7 @@ def test_catalog_info_has_counts_and_sources(stars: Catalog) -> None:
     assert "I/311" in report["meta"]["catalog"]
 
 
-def test_take_keeps_the_epoch(stars: Catalog) -> None:
+def test_taking_a_subset_keeps_the_epoch(stars: Catalog) -> None:
     few = stars.take(stars.v_mag < 0)
     assert set(few.hip) == {30438, 32349, 69673}  # Canopus, Sirius, Arcturus
     assert few.epoch_jyear == stars.epoch_jyear

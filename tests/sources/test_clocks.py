@@ -1,4 +1,4 @@
-"""The LED controllers' oscillators, and the camera's timing: phases wander, and every run has its own."""
+"""Oscillators of LED controllers and timing of the camera: phases drift and differ between runs."""
 
 from __future__ import annotations
 

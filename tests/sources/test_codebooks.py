@@ -115,14 +115,14 @@ def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(
 @pytest.mark.parametrize("distance", [5, 7])
 @pytest.mark.slow
 def test_cyclic_words_have_the_stated_distance_at_any_shift(distance: int) -> None:
-    """From each other's shifts, and from their own."""
+    """Words differ from each other's shifts and from their own."""
     words = codebook(CyclicCodeConfig(kind="cyclic", distance=distance), 400)
     for shift in range(1, words.shape[1]):
         assert distances(words, np.roll(words, shift, axis=1)).min() >= distance
 
 
 def test_gray_words_of_successive_numbers_differ_in_one_bit() -> None:
-    """But where the word of ones alone is left out."""
+    """Codes without the word of ones are excepted."""
     words = codebook(PlainCodeConfig(kind="gray"), 400)
     apart = (words[1:] != words[:-1]).sum(axis=1)
     assert sorted(set(apart.tolist())) == [1, 2]

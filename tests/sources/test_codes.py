@@ -18,7 +18,7 @@ SCENE = "coded_spiral"
 
 
 def codes(clock: Clocks | None, dropout: float = 0.0, depth: float = 0.6) -> LedCodes:
-    """Forty LEDs, with a bit a frame or of 20 ms."""
+    """Forty coded LEDs with one bit per frame or per 20 ms."""
     if clock is None:
         plain = PlainCodeConfig(kind="gray", depth=depth, dropout=dropout)
         return LedCodes(codebook(plain, 40), plain, None, 3)

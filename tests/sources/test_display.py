@@ -56,7 +56,7 @@ def shown(**more: Any) -> Sources:
 
 
 def own_m(place_m: np.ndarray) -> np.ndarray:
-    """Places on FLAT in its own axes: its middle at the apex and the offset, turned about x, then about y."""
+    """Places on FLAT in its own axes: center at apex plus offset, rotated about x, then about y."""
     a, b = np.radians([4, -3])
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -122,7 +122,7 @@ def test_fibers_show_the_stars_of_a_projected_sky() -> None:
 
 
 @pytest.mark.parametrize("block", [1, 2, 3])
-def test_stars_stand_in_the_middle_of_blocks_of_pixels_on_the_panel(block: int) -> None:
+def test_stars_are_centered_in_blocks_of_pixels_on_the_panel(block: int) -> None:
     """Of an even number of columns the middle is between two: odd blocks are at halves of a pitch, even at wholes."""
     wanted = lit(EVERYWHERE)
     drawn = lit(PANEL | {"block": block})
@@ -174,7 +174,7 @@ def test_levels_are_the_nearest_grays(grays: int, gamma: float) -> None:
 
 
 def test_stars_on_one_pixel_add_up_to_white() -> None:
-    """The brightest's number stands for them."""
+    """The sum has the number of the brightest star."""
     points = {"kind": "listed", "cap_deg": 5, "levels": [0.25, 0.5, 0.8, 0.9]}
     points["directions_deg"] = [[0, 1], [0, 1.0001], [90, 2], [90, 2.0001]]
     drawn = lit(PANEL | {"points": points, "gray_levels": 65536, "gamma": 1})
@@ -237,7 +237,7 @@ def test_pixels_of_a_row_light_up_together_and_rows_one_after_another() -> None:
 
 @pytest.mark.parametrize("duty", [0.002, 0.1, 0.3])
 @pytest.mark.parametrize(("frames", "part"), [(0, 0.5), (1, 0.4), (2, 0.6), (7, 0.35), (20, 0.65)])
-def test_a_panel_flickers_as_the_reference_says(duty: float, frames: int, part: float) -> None:
+def test_a_panel_s_flicker_matches_the_reference(duty: float, frames: int, part: float) -> None:
     """Reference 1.3: sqrt(f (1 - f) - w / 3) / (n + f) for pulses of a share w <= f <= 1 - w, over all beginnings."""
     got = light_s(refreshed(duty), (frames + part) / 60)
     law = np.sqrt(part * (1 - part) - duty / 3) / (frames + part)
@@ -256,7 +256,7 @@ def still_frame(lab: Lab) -> tuple[Frame, Truth]:
 
 
 def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
-    """A pixel's light in exposures begun evenly over a frame."""
+    """A pixel's light in exposures with start times uniform over a frame."""
     begins = (np.arange(4000) + 0.5) / 4000 / 60
     pulses = drawn.period_s[5], drawn.start_s[5], drawn.on_s[5]
     return np.array([lit_moments_s(begin, begin + exposure_s, *pulses)[0] for begin in begins])

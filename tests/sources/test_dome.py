@@ -1,4 +1,4 @@
-"""The dome's surface against its own equation and the FARO-arm figures; the boards against a ruler."""
+"""The dome's surface against its equation and the FARO-arm figures; the boards against distances."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sou
     assert max(spread) < 1e-14
 
 
-def test_outer_leds_stand_off_the_surface_by_the_sagitta(afit: Sources) -> None:
+def test_outer_leds_of_a_board_are_off_the_surface_by_the_sagitta(afit: Sources) -> None:
     """A tangent plate of half-diagonal h under a dome of curvature radius R stands off by h^2 / 2R."""
     made = surface(MEASURED)
     gap = np.linalg.norm(made.meet(np.zeros(3), afit.place[:, :3]) - afit.place[:, :3], axis=1)
@@ -246,12 +246,12 @@ def test_boards_are_uniform_in_area() -> None:
 
 
 def logs(leds: Sources) -> np.ndarray:
-    """Each LED's brightness against the declared one, its logarithm."""
+    """Logarithm of each LED's brightness over the declared one."""
     return np.asarray(np.log(leds.strength / led_strength_e_s_sr(16e-3, "white", BAND)))
 
 
 @pytest.mark.parametrize("scatter", [0.07, 0.09])
-def test_intensities_scatter_by_as_much_as_declared(scatter: float) -> None:
+def test_intensities_scatter_as_declared(scatter: float) -> None:
     """Lognormal, as AFIT's Table 2 (reference A8: 7-9 %): moments of the logarithm to four of their sigmas."""
     drawn = logs(lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")) / scatter
     n = len(drawn)
@@ -302,7 +302,7 @@ def test_nine_per_cent_ranks_as_normal_order_statistics() -> None:
 
 
 def likelihood(boards: np.ndarray) -> float:
-    """How probable Table 2 is among boards, by the standard deviation of its nine values: log density, Normal."""
+    """Log probability density of Table 2's standard deviation among simulated boards, by a normal law."""
     spread = np.log(boards.std(axis=1))
     seen = np.log(np.std(TABLE_2) / np.mean(TABLE_2))
     return float(-((seen - spread.mean()) ** 2) / (2 * spread.var()))

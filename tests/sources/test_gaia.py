@@ -1,4 +1,4 @@
-"""The simulated sky: counts, doubles where other observers saw them, and every star that the tracker knows."""
+"""The simulated sky: counts, published positions of doubles, and every star of the tracker's catalog."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def known() -> Catalog:
 
 
 def axes(stars: Catalog) -> tuple[Floats, Floats, Floats]:
-    """(N, 3) unit vectors to the stars, east and north there."""
+    """(N, 3) unit vectors to the stars, and toward their local east and north."""
     ra = stars.ra_rad
     dec = stars.dec_rad
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
@@ -63,7 +63,7 @@ def test_a_rebuilt_catalog_equals_the_committed_file(tmp_path: Path) -> None:
     assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
 
 
-def test_counts_are_those_of_hipparcos_and_of_the_handbook(sky: Catalog, known: Catalog) -> None:
+def test_star_counts_match_hipparcos_and_the_handbook(sky: Catalog, known: Catalog) -> None:
     # A pair that Hipparcos saw as one star of V 4.9 is two fainter ones here.
     for limit in (3, 4, 5, 6):
         assert np.sum(sky.v_mag < limit) == pytest.approx(np.sum(known.v_mag < limit), rel=0.02)
@@ -248,7 +248,7 @@ def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
 
 
 def test_variability_does_not_change_the_tracker_s_catalog() -> None:
-    """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
+    """The scene's stars have the drawn brightness; the tracker's catalog and all positions are unchanged."""
     labs = (
         build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"})
     )

@@ -1,4 +1,4 @@
-"""Where LEDs sit against rulers, counting and the sky; how they are driven against the thesis's own law."""
+"""Positions of LEDs against distances, counts and the sky; their drive against the thesis's law."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_poisson_disk_layout_keeps_its_distance_and_leaves_no_gap(surface: dic
 
 
 @pytest.mark.long
-def test_poisson_disk_covers_as_random_sequential_adsorption_does(
+def test_a_poisson_disk_layout_has_the_density_of_random_sequential_adsorption(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Disks of the spacing's diameter jam at a cover of .547, which t darts miss by some c / sqrt(t) (Feder's law).
@@ -205,7 +205,7 @@ def test_the_hardware_seed_determines_the_dome(layout: dict) -> None:
 
 
 def test_levels_are_drawn_from_the_list_and_magnitudes_by_pogson() -> None:
-    """Each as often as any other, to four sigmas of n draws; five magnitudes are a hundredfold."""
+    """Levels are equally frequent to four sigmas of n draws; five magnitudes are a factor of 100."""
     levels = lit({"kind": "fibonacci", "count": 3000, "levels": [1.0, 0.5, 0.25]}).on_s / 1e-3
     values, counts = np.unique(levels, return_counts=True)
     np.testing.assert_array_equal(values, [0.25, 0.5, 1.0])
@@ -287,7 +287,7 @@ def test_a_board_on_the_rim_of_a_hemisphere_faces_along_the_lab_s_x() -> None:
     np.testing.assert_allclose(steps, 0.008, rtol=0, atol=1e-15)
 
 
-def test_glue_moves_each_led_in_its_board_s_plane_by_as_much_as_declared() -> None:
+def test_glue_moves_each_led_in_its_board_s_plane_as_declared() -> None:
     """Reference 1.3: 0.12 mm. Normal along two axes: moments of each to four of their sigmas."""
     ideal = lit(BOARDS, MEASURED)
     real = lit(BOARDS | {"glue_scatter": "0.12 mm"}, MEASURED)
@@ -401,7 +401,7 @@ def test_count_and_limit_choose_the_brightest_that_are_on_the_dome() -> None:
     assert {27989, 24436, 25336, 25930, 26311, 26727} <= set(to_limit.id)
 
 
-def test_a_millimeter_off_the_nominal_position_errs_as_in_the_apl_dome() -> None:
+def test_a_millimeter_off_the_nominal_position_causes_the_apl_dome_s_error() -> None:
     """Reference 5: on a sphere of 4 ft a camera 1 mm off its center is wrong by 169 arcsec, d/R sin of the angle."""
     dome_4ft = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
     leds = lit(SKY | {"limit_mag": 6.0, "cap_deg": 80, "camera": ["0 m", "0 m", "0 m"]}, dome_4ft)
@@ -415,7 +415,7 @@ def test_a_millimeter_off_the_nominal_position_errs_as_in_the_apl_dome() -> None
 # Lists
 
 
-def test_listed_directions_are_on_the_surface_and_positions_as_they_are() -> None:
+def test_listed_directions_are_put_on_the_surface_and_positions_kept() -> None:
     leds = lit(
         {"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]}, MEASURED
     )
@@ -496,7 +496,7 @@ def test_the_exported_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str
 
 
 @pytest.mark.parametrize("winding", ["latitude", "spiral", "meridian"])
-def test_an_led_is_on_its_tape_where_the_list_says(winding: str) -> None:
+def test_an_led_is_at_its_listed_place_on_its_tape(winding: str) -> None:
     """LEDs that follow each other on one tape are a pitch apart: by the chord, which is a little less."""
     layout = {
         "kind": "string",
@@ -729,7 +729,7 @@ def light_s(leds: Sources, which: int, begin_s: float, length_s: float) -> float
 
 
 def sequential(count: int, **more: Any) -> dict[str, Any]:
-    """One board of so many LEDs on an Arduino."""
+    """One board of this number of LEDs on an Arduino."""
     board = {"azimuth_deg": 10, "tilt_deg": 5, "leds": list(range(count))} | more
     return {"kind": "patch_boards", "cap_deg": 40, "pitch": "8 mm", "boards": [board]}
 
@@ -789,7 +789,7 @@ def test_a_layout_without_boards_requires_leds_per_controller() -> None:
 
 
 def relative_sd(leds: Sources, which: int, exposure_s: float) -> float:
-    """Flicker from frame to frame: the LED's light in exposures begun evenly over its cycle."""
+    """Frame-to-frame flicker: relative deviation of the light over start times uniform in the cycle."""
     begins = (np.arange(4000) + 0.5) / 4000 * leds.period_s[which]
     got = np.array([light_s(leds, which, begin, exposure_s) for begin in begins])
     return float(got.std() / got.mean())
@@ -799,7 +799,7 @@ def relative_sd(leds: Sources, which: int, exposure_s: float) -> float:
 @pytest.mark.parametrize(
     ("cycles", "part"), [(2, 0.5), (6, 0.6), (3, 2 / 3), (9, 0.05), (20, 0.93)]
 )
-def test_a_short_pulse_flickers_as_the_reference_says(
+def test_a_short_pulse_s_flicker_matches_the_reference(
     cycles: int, part: float, level: float
 ) -> None:
     """Reference 1.3: in an exposure of (n + f) cycles n or n + 1 pulses fall: sqrt(f (1 - f)) / (n + f)."""
@@ -813,7 +813,7 @@ def test_a_short_pulse_flickers_as_the_reference_says(
 
 
 @pytest.mark.parametrize(("count", "published"), [(5, 0.063), (2, 0.017), (9, 0.117)])
-def test_full_slots_at_33_ms_flicker_as_the_reference_computed(
+def test_the_flicker_of_full_slots_at_33_ms_matches_the_reference(
     count: int, published: float
 ) -> None:
     """Variance f (1 - f) - w / 3 of a pulse of share w <= f <= 1 - w: 6.3, 1.7 and 11.7 % for 5, 2 and 9 LEDs."""
@@ -839,7 +839,7 @@ def test_whole_cycles_do_not_flicker(count: int) -> None:
 TABLE_7 = {1000: 146.7, 500: 116.0, 400: 87.8, 200: 44.9, 1: 16.6}
 
 
-def test_table_7_s_levels_come_in_its_order_and_in_proportion_to_their_time() -> None:
+def test_the_measured_order_and_ratio_of_levels_matches_table_7() -> None:
     """Reference A10: the ordering; 200-500 us are linear, and the published slopes are one number to 5 per cent."""
     levels = [on_us / 1000 for on_us in TABLE_7]
     leds = lit(sequential(5, levels=levels), drive={"kind": "sequential"})

@@ -1,4 +1,4 @@
-"""What an LED sends: inverse square, Lambert's cosine, and its pulses against brute-force sampling."""
+"""Emission of LEDs: inverse-square law, Lambert's cosine, and pulses against brute-force sampling."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_the_lobe_is_the_cosine_to_its_exponent(exponent: float) -> None:
     )
 
 
-def test_a_measured_lobe_goes_through_its_points_and_between_them() -> None:
+def test_a_measured_lobe_is_interpolated_through_its_points() -> None:
     emitter = measured([0, 30, 60, 75], [1.0, 0.9, 0.5, 0.2])
     made = [
         irradiance(np.cos(np.radians(angle)), emitter=emitter) / 5e12

@@ -1,4 +1,4 @@
-"""Levels by which every LED is known by its surroundings: compared pair by pair, by angles."""
+"""Levels that make every LED's neighborhood unique, compared pair by pair by angles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCENE = "coded_spiral"
 def surroundings(
     place: np.ndarray, level: np.ndarray, led: int, nearest: int
 ) -> tuple[tuple[int, ...], ...]:
-    """All turns of the levels of the nearest LEDs, by their angles in the picture of a camera that looks at one."""
+    """All rotations of the levels of the nearest LEDs, ordered by angle in a camera that looks at one."""
     others = np.argsort(np.linalg.norm(place - place[led], axis=1))[1 : nearest + 1]
     up = place[led]
     right = np.cross([0.3, 0.5, 0.8], up)

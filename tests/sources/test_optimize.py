@@ -1,4 +1,4 @@
-"""Optimized places against other layouts, at attitudes they were not made for; stars' LEDs in the chip's own band."""
+"""Optimized layouts against others at independent attitudes; stars' LEDs in the chip's band."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def lit(layout: dict) -> Sources:
 
 
 def spread(kind: str, count: int, cap_deg: float) -> Sources:
-    """As many LEDs of another layout; poisson_disk fills the cap, and those too many are left out."""
+    """The same number of LEDs of another layout; of poisson_disk, which fills the cap, the excess is left out."""
     if kind != "poisson_disk":
         return lit({"kind": kind, "count": count, "cap_deg": cap_deg})
     spacing_m = 1.22 * np.sqrt(0.66 * 2 * np.pi * (1 - np.cos(np.radians(cap_deg))) / count)
@@ -62,7 +62,7 @@ def best() -> Sources:
 
 @pytest.mark.slow
 def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None:
-    """Brightness is drawn after the search, from the same stream: a kept search changes no byte, and no other dome."""
+    """Brightness is drawn after the search from the same stream; a cached search changes no dome."""
     few = WANTED | {"count": 12, "rounds": 1, "levels": [1, 0.5], "spacing": "20 mm"}
     spreads.optimized_places.cache_clear()
     first = lit(few)
@@ -80,7 +80,7 @@ def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None
 
 
 def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) -> Floats:
-    """Of the estimator's own formula at random attitudes, in order: tr((sum J'J)^-1), by central differences."""
+    """Sorted variances at random attitudes: tr((sum J'J)^-1) with J by central differences."""
     rng = np.random.default_rng(77)
     tilt = np.arccos(1 - rng.random(count) * (1 - np.cos(np.radians(tilt_deg))))
     turns = rng.uniform(0, 7, (2, count))
@@ -289,7 +289,7 @@ def test_an_led_is_as_bright_as_the_chip_finds_its_star() -> None:
 
 
 def test_doubles_within_a_disk_are_merged_to_one_led_of_their_light() -> None:
-    """No light is lost, and no two are nearer than a disk, though merged ones stand between their stars' places."""
+    """Light is conserved, and no two LEDs are nearer than a disk, although merged ones are between their stars."""
     wide = lit(SKY)
     fine = dome.sources(
         DomeConfig.model_validate(

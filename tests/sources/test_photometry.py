@@ -1,4 +1,4 @@
-"""Magnitudes and candelas -> photo-electrons, against the reference's numbers, measured stars and closed forms."""
+"""Photo-electrons of magnitudes and candelas against the reference, measured stars and closed forms."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_a_thick_chip_is_redder_than_cmos_and_that_than_interline() -> None:
 
 
 def gaia_offset(v_i: float) -> float:
-    """G-V against that of a G2 star, by our black body."""
+    """G-V relative to that of a G2 star, by our black body."""
     band = Band(GAIA_G_NM * 1e-9, np.array(GAIA_G))
     return float(synthetic_mag(0.0, np.nan, v_i, band))
 
@@ -181,7 +181,7 @@ def test_measured_stars_from_b5_to_k0_are_black_bodies_in_a_broad_band(v_i: floa
 
 
 @pytest.mark.parametrize(("v_i", "short_mag"), [(1.03, 0.05), (2.005, 0.25)])
-def test_measured_cool_stars_are_brighter_than_black_bodies_by_what_the_docs_say(
+def test_measured_cool_stars_exceed_black_bodies_by_the_documented_factor(
     v_i: float, short_mag: float
 ) -> None:
     assert gaia_offset(v_i) - (G_V[v_i] - G_V[0.713]) == pytest.approx(short_mag, abs=0.02)
@@ -275,7 +275,7 @@ def test_the_eye_s_response_matches_the_cie_s() -> None:
 
 
 def pupil_sr() -> float:
-    """A 35 mm lens at f/8 seen from 33 in."""
+    """Solid angle of a 35 mm lens at f/8 from 33 in."""
     return float(np.pi / 4 * (0.035 / 8) ** 2 / (33 * 0.0254) ** 2)
 
 
@@ -362,7 +362,7 @@ def test_ec655_has_the_reference_s_signal_to_noise(
     assert np.all(off <= rounding)
 
 
-def test_snr_is_that_of_drawn_pixels() -> None:
+def test_snr_matches_simulated_pixels() -> None:
     """Mean over standard deviation of 20,000 sums of 25 pixels, each Poisson light plus Gaussian read noise."""
     rng = np.random.default_rng(3)
     n = 20_000
@@ -384,7 +384,7 @@ def test_a_number_is_flat_and_its_integral_exact() -> None:
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_curves_are_efficiencies_of_silicon_and_say_where_they_come_from(curve: str) -> None:
+def test_efficiency_curves_are_plausible_and_state_their_source(curve: str) -> None:
     band = Band.from_efficiency(curve)
     text = curve_file(curve).read_text()
     assert text.startswith("#")

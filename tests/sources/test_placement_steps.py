@@ -83,7 +83,7 @@ def test_the_largest_common_share_of_two_fields_is_over_all_rotations() -> None:
     )
 
     def shown(i: int, j: int) -> float:
-        """The most that two fields share at any turn, but for a field laid on itself without one."""
+        """Largest common share of two fields at any rotation, except of a field with itself without rotation."""
         turn = fields[j] / fields[i][:, None]
         unit = np.isclose(np.abs(turn), 1) & ~(np.eye(*turn.shape, dtype=bool) & (i == j))
         far = np.abs(

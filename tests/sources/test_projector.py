@@ -1,4 +1,4 @@
-"""A projector onto a dome: spots and places against traced rays, light against radiometry."""
+"""A projector onto a dome: spots and positions against traced rays, light against radiometry."""
 
 from __future__ import annotations
 

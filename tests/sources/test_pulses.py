@@ -1,4 +1,4 @@
-"""When an LED is lit: against counting finely, and against closed forms."""
+"""Lit time of LEDs against fine sampling and closed forms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COUNT = 400_000
 def counted(
     begin: float, end: float, period: float, start: float, on: float
 ) -> tuple[float, float, float]:
-    """The same by looking at 400,000 moments."""
+    """The same by sampling 400,000 instants."""
     t = begin + (end - begin) * (np.arange(COUNT) + 0.5) / COUNT
     lit = t[(t - start) % period < on]
     return len(lit) / COUNT * (end - begin), float(lit.mean()), float(lit.std())
@@ -74,7 +74,7 @@ def lit_s(*interval_and_pulses: float) -> float:
 
 
 def sampled_lit_s(begin: float, end: float, period: float, start: float, on: float) -> float:
-    """The pulse train looked at in the middle of each of 20,000 equal slices."""
+    """Lit time by sampling the pulse train at the centers of 20,000 equal intervals."""
     slices = 20_000
     t = begin + (end - begin) * (np.arange(slices) + 0.5) / slices
     return float(np.mean(np.mod(t - start, period) < on) * (end - begin))
@@ -85,7 +85,7 @@ span = st.floats(0, 5)
 
 @settings(max_examples=200, derandomize=True, deadline=None)
 @given(span, span, st.floats(0.2, 3), st.floats(-2, 2), st.floats(0, 1))
-def test_lit_time_is_that_of_brute_force_sampling(
+def test_lit_time_matches_brute_force_sampling(
     begin: float, length: float, period: float, start: float, duty: float
 ) -> None:
     exact = float(lit_s(begin, begin + length, period, start, duty * period))

@@ -127,7 +127,7 @@ def test_diffuse_light_of_a_floor_under_one_led_matches_a_hand_calculation() -> 
 
 
 @pytest.mark.slow
-def test_a_dome_that_stands_on_the_floor_keeps_its_light() -> None:
+def test_a_dome_on_the_floor_conserves_its_light() -> None:
     """Wall and floor absorb what the LED emits; patches beside the edge, where K is singular, make 3 %."""
     rim = Rim(half_rad=math.radians(120))
     wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 1.0), rim=rim)
@@ -201,7 +201,7 @@ def bounce(name: str, start: Floats, toward: Floats) -> tuple[Floats, Floats]:
 
 
 def miss(name: str, toward: Floats, led_m: Floats) -> Floats:
-    """(N,) distance at which reflected rays from the camera pass an LED in front of them."""
+    """(N,) miss distance of reflected rays from the camera to an LED ahead of them."""
     hit, along = bounce(name, CAMERA_M, toward)
     to_led = led_m - hit
     ahead = np.sum(to_led * along, axis=1)
@@ -209,7 +209,7 @@ def miss(name: str, toward: Floats, led_m: Floats) -> Floats:
 
 
 def brute_force(name: str, led_m: Floats) -> Floats:
-    """The directions in the field whose reflected rays pass through the LED, by ever finer searches."""
+    """Directions in the field whose reflected rays pass through the LED, by successively finer searches."""
     count = 241
     rays = grid(count=count)
     missed = miss(name, rays.reshape(-1, 3), led_m).reshape(count, count)

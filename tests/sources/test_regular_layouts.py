@@ -1,4 +1,4 @@
-"""Geodesic and tape layouts against counting, published chords and rulers laid on the surface."""
+"""Geodesic and tape layouts against counts, published chords and arc lengths on the surface."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def test_circles_on_a_sphere_have_their_spacing_and_circumference() -> None:
 
 
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
-def test_strips_lie_on_meridians_a_pitch_apart_and_reach_the_rim(on: dict[str, Any]) -> None:
+def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(on: dict[str, Any]) -> None:
     place_m = lit(
         {"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on
     ).place[:, :3]
@@ -249,7 +249,7 @@ def test_strips_are_between_half_a_spacing_and_a_spacing_apart() -> None:
         assert 0.038 < apart_m < 0.08 * 1.01
 
 
-def test_tape_leds_err_by_pitch_and_glue() -> None:
+def test_tape_led_positions_have_pitch_and_glue_errors() -> None:
     """By 1 % of the pitch of each tape, and by 2 mm sideways, with a correlation of 1 / e after 0.3 m."""
     layout = {"kind": "string", "winding": "meridian", "pitch": "20 mm", "spacing": "2 cm"}
     ideal = lit(layout).place[:, :3]

@@ -121,7 +121,7 @@ def test_a_dome_down_to_below_the_bearing_has_all_of_its_shell() -> None:
 
 
 @pytest.mark.slow
-def test_the_check_says_how_a_dome_fits_its_room() -> None:
+def test_the_check_states_how_a_dome_fits_its_room() -> None:
     """A cap of R = 1.5 m from 0.9 m up, on a bearing 1 m above the floor, in quarters through a door."""
     room = "{height: 2.9 m, bearing_height: 1 m, width: 4 m, door: [0.9 m, 2.1 m], segments: 4}"
     surface_text = "{kind: sphere, apex: 1.5 m, radius: 1.5 m, rim_height: 0.9 m}"

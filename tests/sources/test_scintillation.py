@@ -18,7 +18,7 @@ def one(air_mass: float, aperture_m: float, exposure_s: float, height_m: float =
 
 
 def profile() -> tuple[Floats, Floats, Floats]:
-    """Heights, Hufnagel-Valley's Cn^2 and Bufton's wind over the sea, so strong that 10.66 ∫ Cn^2 h^2 / V dh is
+    """Heights, Hufnagel-Valley's Cn^2 and Bufton's wind, scaled so that 10.66 ∫ Cn^2 h^2 / V dh is
     10^-5 C_Y^2."""
     h = np.linspace(0.5, 24_999.5, 25_000)
     strength = 0.00594 * (21 / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1000)

@@ -1,4 +1,4 @@
-"""Catalog stars -> apparent directions, against astropy's SkyCoord and against hand-made numbers."""
+"""Apparent directions of catalog stars against astropy's SkyCoord and hand calculations."""
 
 import datetime
 
@@ -32,7 +32,7 @@ def stars() -> Catalog:
 
 
 def star(**fields: float) -> Catalog:
-    """One made-up star; angles in radians, at 2000.0."""
+    """One artificial star; angles in radians, at 2000.0."""
     zero = np.zeros(1)
     names = [name for name in Catalog.__slots__ if name not in ("hip", "epoch_jyear")]
     arrays = {name: zero + fields.get(name, 0.0) for name in names}

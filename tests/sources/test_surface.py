@@ -1,4 +1,4 @@
-"""Surfaces against their own equations, rigid motion, differences and the measured dome; clouds against theory."""
+"""Surfaces against their equations, rigid motion, finite differences and the measured dome; clouds against theory."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def written(path: Path, points_m: np.ndarray, head: str = "# FARO arm\nx,y,z") -
 
 
 def off_equation(name: str, points_m: np.ndarray) -> np.ndarray:
-    """How far undisplaced points are from each kind's textbook equation; written out here once more."""
+    """Deviation of undisplaced points from each kind's textbook equation."""
     x, y, z = points_m.T / INCH_M
     off = {
         "sphere": np.hypot(np.hypot(x, y), z + 2) / 50 - 1,
@@ -150,7 +150,7 @@ def test_normals_match_the_numerical_gradient(name: str, cloud: dict) -> None:
 
 @pytest.mark.parametrize("name", [*KINDS, "cloud"])
 def test_offset_and_tilt_are_a_rigid_motion_about_the_center(name: str, cloud: dict) -> None:
-    """Turn the rays instead: first about x by 3 deg, then about y by -2 deg, written out as matrices."""
+    """The rays are rotated instead: first about x by 3 deg, then about y by -2 deg, by explicit matrices."""
     part = cloud if name == "cloud" else KINDS[name]
     still = made(part)
     moved = made(part, **MOVED)
@@ -274,7 +274,7 @@ def test_a_panel_and_a_vault_end_at_their_sides() -> None:
     np.testing.assert_array_equal(np.isnan(vault.meet(np.zeros(3), along)[:, 0]), [False, True] * 2)
 
 
-def test_a_drum_hangs_from_its_upper_edge() -> None:
+def test_a_drum_extends_down_from_its_upper_edge() -> None:
     height_in = np.array([29.9, 30.1, -19.9, -20.1])
     met = made(DRUM).meet(np.zeros(3), np.column_stack([np.full(4, 48.0), np.zeros(4), height_in]))
     np.testing.assert_array_equal(np.isnan(met[:, 0]), [False, True, False, True])
@@ -283,7 +283,7 @@ def test_a_drum_hangs_from_its_upper_edge() -> None:
 # The thesis's dome
 
 
-def test_the_design_contour_comes_from_its_wall() -> None:
+def test_the_design_contour_follows_from_its_wall_thickness() -> None:
     """Reference A3: 48.033 in at the apex, 48.010 in at the rim, 40 deg off; less than .05 % between."""
     angle = np.radians([0, 40])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
@@ -512,7 +512,7 @@ def test_the_drawn_mesh_is_on_the_surface(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["rimmed", "narrow", "panel"])
 def test_the_drawn_mesh_extends_to_the_rim(name: str) -> None:
-    """Half a degree beyond the last ring there is nothing."""
+    """Half a degree beyond the last ring the surface has ended."""
     shape = made(DRAWN[name])
     last = mjcf_export.shell_m(shape, 0.6)[-1]
     beyond = last / np.linalg.norm(last, axis=1, keepdims=True) - [0.0, 0.0, 0.017]

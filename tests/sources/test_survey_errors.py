@@ -1,4 +1,4 @@
-"""What the tracker believes of its dome errs as its survey says: by chi-square, by geometry, bit for bit at zero."""
+"""Errors of the tracker's map follow its survey: by chi-square, by geometry, and exactly zero without errors."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def believing(**changes: str) -> tuple[DomeTracker, Lab]:
 
 
 def is_chi_square(normal: Floats) -> None:
-    """Whether independent numbers are standard normal, as far as their mean square can tell."""
+    """Whether the mean square of independent numbers is that of the standard normal law."""
     count = normal.size
     low, high = chi2.ppf([RARE / 2, 1 - RARE / 2], count)
     assert low < np.sum(normal**2) < high
@@ -77,7 +77,7 @@ def test_every_led_of_the_map_has_its_own_error_about_each_axis() -> None:
     np.testing.assert_array_equal(eyes.leds.id, lab.camera.sources.id)
 
 
-def test_over_the_seeds_the_camera_s_position_errs_by_lever_sigma() -> None:
+def test_the_camera_s_position_error_over_seeds_is_lever_sigma() -> None:
     true_m = np.array([0.0, 0.01, 0.381])
     error = [survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
     is_chi_square(np.array(error) / 1e-4)
@@ -173,7 +173,7 @@ def test_a_further_survey_error_does_not_change_the_others() -> None:
 
 
 def test_the_survey_does_not_change_the_hardware() -> None:
-    """Frames are the same whatever is believed."""
+    """Frames do not depend on the tracker's map."""
     frames = []
     for survey in ("{}", ALL.format(lever="5 mm", seed=1)):
         lab = build_lab(loaded(tracker__survey=survey, exposure=BARE_CAMERA["exposure"]))

@@ -1,4 +1,4 @@
-"""A total station's errors: their covariance against Monte Carlo, and against what a ruler would say."""
+"""A total station's errors: their covariance against Monte Carlo and geometry."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     assert np.sqrt(steep[1, 1]) == pytest.approx(20 * ARCSEC * 0.5, rel=1e-12)
 
 
-def test_distances_err_by_a_plus_b_ppm() -> None:
+def test_distance_errors_are_a_plus_b_ppm() -> None:
     """sigma^2 = a^2 + (b D)^2 over surveys: a in each distance, b in the scale of a survey."""
     config = station(
         **{
@@ -206,7 +206,7 @@ def test_the_tracker_uses_the_station_s_measurements() -> None:
     assert low < squares.sum() < high
 
 
-def test_the_error_across_the_line_from_the_bearing_is_that_of_drawn_errors() -> None:
+def test_the_error_across_the_line_of_sight_matches_simulated_errors() -> None:
     own_m2 = survey_errors.station_covariance_m2(station(), PLACES_M)
     normal = np.random.default_rng(2).standard_normal((DRAWS, len(PLACES_M), 3))
     error_m = np.einsum("nij,dnj->dni", np.linalg.cholesky(own_m2), normal)
@@ -309,7 +309,7 @@ def test_a_station_at_an_led_is_refused() -> None:
         survey_errors.station_covariance_m2(station(position=["0 m", "0 m", "1.2 m"]), PLACES_M)
 
 
-def test_over_the_seeds_the_focal_length_errs_as_its_survey_says() -> None:
+def test_the_focal_length_error_over_seeds_matches_its_survey_sigma() -> None:
     config = SurveyErrorsConfig.model_validate({"focal_length_sigma": {"tolerance": "20 um"}})
     error = [
         survey_errors.assumed_focal_length_m(0.035, config.model_copy(update={"seed": seed}))

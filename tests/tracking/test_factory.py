@@ -1,4 +1,4 @@
-"""What the vehicle believes of its attitude: the gyros added up, and every way in which that goes wrong."""
+"""Attitude knowledge of the vehicle: integration of the gyros, its errors, and the tracker's settings."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ NO_CONTROL = {
 
 
 def flown(until_s: float, **changes: str) -> Flight:
-    """SimSat, balanced and left alone unless the changes say otherwise."""
+    """A balanced SimSat without control, unless changed."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {until_s} s}}"}
     given = NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
     return simulate_motion(loader.load("afit_simsat", given))
 
 
 def telemetry_of(flight: Flight) -> Telemetry:
-    """Of a flight with an IMU."""
+    """Telemetry of a flight with an IMU."""
     telemetry = flight.telemetry()
     assert telemetry.lab_from_imu is not None
     return telemetry
 
 
 def error(telemetry: Telemetry) -> Floats:
-    """(K, 3) turn in lab axes from where the vehicle is to where the navigator has it, rad."""
+    """(K, 3) rotation in lab axes from the true attitude to the navigator's, rad."""
     assert telemetry.lab_from_imu is not None
     return (telemetry.lab_from_imu * telemetry.lab_from_body.inv()).as_rotvec()
 
@@ -155,7 +155,7 @@ def test_under_imu_control_the_vehicle_follows_the_navigator_s_error() -> None:
 # --- what it feels ------------------------------------------------------------------------------------------
 
 
-def test_the_imu_measures_the_vibration() -> None:
+def test_the_imu_measures_vibration() -> None:
     """The navigator adds up the shaken vehicle's rates: it is where that is, seen from where it was zeroed."""
     shake = "[{kind: line, frequency_hz: 20, rms_arcsec: [200, 0, 0]}]"
     flight = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
@@ -325,7 +325,7 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
 def test_a_dome_that_no_tracker_supports_is_refused_in_one_line(
     changes: dict[str, str], why: str
 ) -> None:
-    """And it is rendered all the same: a lab may light one LED."""
+    """It is still rendered, as a lab may light one LED."""
     lab = build_lab(loader.load("afit_simsat_ideal", changes))
     with pytest.raises(
         InputError, match=f"light: the star tracker cannot use .*: {why}"
@@ -362,7 +362,7 @@ def test_a_surface_that_is_no_upright_ellipsoid_is_warned_of(surface: str, doubt
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
 def test_a_camera_outside_of_the_dome_is_warned_of(scene: str) -> None:
-    """Its frames would be black, without a word."""
+    """Its frames would be black without explanation."""
     far = {
         "vehicle.camera": "[0 m, 1.3 m, 0 m]",
         "vehicle.inertia": "[120 kg m2, 120 kg m2, 120 kg m2]",

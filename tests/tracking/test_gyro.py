@@ -38,8 +38,8 @@ def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
 
 
 @pytest.mark.slow
-def test_the_rate_of_a_frame_is_that_of_the_samples_of_the_whole_flight() -> None:
-    """What the frame gets when it is due needs none that come later; nor those that a flight forgets."""
+def test_the_rate_of_a_frame_does_not_depend_on_the_buffer_of_samples() -> None:
+    """The rate at the frame's due time needs neither later samples nor those that a flight drops."""
     scene = load("shefex2", FLIGHT | {"tracker.gyro": "true"})
     flight = open_flight(scene)
     shots = list(flight.shots())
@@ -61,7 +61,7 @@ def test_the_rate_of_a_frame_is_that_of_the_samples_of_the_whole_flight() -> Non
 
 
 @pytest.mark.slow
-def test_the_rate_is_honest_and_none_if_saturated() -> None:
+def test_the_rate_has_a_correct_covariance_and_is_absent_if_saturated() -> None:
     """Its error over the units of production: squared, over the claim, 3 in the mean (biases and noise are normal)."""
     nees = []
     for unit in range(40):

@@ -127,7 +127,7 @@ def test_a_program_gets_the_pixels_and_its_answer_is_returned() -> None:
 
 @pytest.mark.parametrize("kind", ["png", "fits"])
 def test_the_frame_s_folder_is_removed_with_the_program(kind: str) -> None:
-    """The frame alone: the truth that a run's own files carry is not in it."""
+    """The folder has the frame alone, without the truth of a run's files."""
     text = "for line in g:\n    h = json.loads(line); print(json.dumps({'frame': 7, 'status': h['file']}), flush=True)"
     runs = program(READY + text, kind=kind)
     path = Path(runs.solve(PICTURE).status)
@@ -209,7 +209,7 @@ def test_a_program_that_does_not_read_times_out() -> None:
 def test_a_program_is_restarted_and_abandoned_after_three_successive_failures(
     tmp_path: Path,
 ) -> None:
-    """The first dies once; of the other every one does."""
+    """The first program dies once; the other dies at every start."""
     mark = str(tmp_path / "mark")
     answer = 'print(\'{"frame": 7, "status": "fine"}\', flush=True)'
     once = f"if not os.path.exists({mark!r}): open({mark!r}, 'x'); sys.exit(1)\n    "
@@ -296,7 +296,7 @@ class Offset:
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with an entry point, as pip would leave it."""
+    """An installed package with an entry point, as pip makes it."""
     (tmp_path / "offset.py").write_text(OFFSET)
     about = tmp_path / "offset-1.0.dist-info"
     about.mkdir()
@@ -423,7 +423,7 @@ def commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page's files, its package as pip would leave it, and a `python` that is this one."""
+    """Folder with the page's files, its package as installed by pip, and this `python`."""
     folder = tmp_path_factory.mktemp("page")
     for block in blocks("python"):
         (folder / re.match(r"# (\w+\.py)\n", block)[1]).write_text(block)
@@ -456,7 +456,7 @@ def said(folder: Path, words: list[str]) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join)
-def test_the_page_s_commands_do_what_it_says(folder: Path, words: list[str]) -> None:
+def test_the_page_s_commands_run_without_wrong_attitudes(folder: Path, words: list[str]) -> None:
     page = said(folder, words)
     wrong = re.search(r"(\d+) wrong", page)
     assert wrong is None or wrong[1] == "0"
@@ -504,7 +504,7 @@ def of_lost(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
 
 
 def pixel_of_lost(quaternion: np.ndarray, star: np.ndarray) -> list[float]:
-    """Its Attitude::Rotate and Camera::SpatialToCamera: where a star falls, from the upper left corner."""
+    """LOST's Attitude::Rotate and Camera::SpatialToCamera: pixel of a star from the upper left corner."""
     _, x, y, z = multiplied(
         multiplied(quaternion, np.array([0, *star])), quaternion * [1, -1, -1, -1]
     )

@@ -130,7 +130,7 @@ def test_a_new_camera_from_options_names_what_is_not_stated(
 
 
 def test_questions_are_asked_again_after_a_wrong_answer(camera: Command, tmp_path: Path) -> None:
-    """A required one also after none; those of a lens or a row time are not asked without one."""
+    """An empty answer to a required question counts as wrong; lens and row-time questions depend on answers."""
     answers = ["", "1936x1216", "5.86", "5.86 um", "", "", "", "12", "", "32513", "", "", "", ""]
     done = camera("new", answers="\n".join(answers) + "\n")
     assert done.stderr.splitlines()[:2] == [

@@ -26,7 +26,7 @@ def commands(command: Any, name: str = "") -> dict[str, Any]:
 
 
 def command_of(words: list[str]) -> tuple[str, Any, list[str]]:
-    """The path of the command that some words call, the command, and the words left; `camera FILE` is `camera show`."""
+    """Path of the command that the words call, the command, and the remaining words; `camera FILE` is `camera show`."""
     path = ""
     command = ROOT
     while inner := getattr(command, "commands", {}):

@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it leaves behind, and one line for whatever the user got wrong."""
+"""The command line: printed text, written files, and one error line for each wrong input."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_without_opengl_the_run_continues_and_reports_the_missing_picture(
 
 
 @pytest.mark.long
-def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) -> None:
+def test_render_writes_only_frames_with_their_truth(rendered: Path) -> None:
     assert {p.name for p in rendered.iterdir()} == {
         "frame_0000.fits",
         "frame_0000.png",
@@ -240,7 +240,7 @@ def test_solve_needs_no_hint(skysim: Skysim, rendered: Path, tmp_path: Path) -> 
 def test_solve_ignores_an_impossible_header_date_with_a_warning(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
-    """As if there were none, when aberration is left out."""
+    """Aberration is then left out, as without a date."""
     frames = {}
     for name, date in (
         ("none", None),
@@ -298,7 +298,7 @@ def test_solve_takes_a_folder_and_states_why_an_image_is_refused(
 
 
 @pytest.mark.slow
-def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_accepts_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     path = rendered / "frame_0000.png"
     ran = skysim(
         "solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path
@@ -373,7 +373,7 @@ def test_a_stage_of_a_run_is_named_by_its_option(
 
 @pytest.mark.long
 def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> None:
-    """Above the scene's own and above --set; TRIAD takes two stars where the scene's QUEST takes all."""
+    """The option overrides the scene and --set; TRIAD uses two stars where the scene's QUEST uses all."""
     words = [
         "run",
         "shefex2",
@@ -396,7 +396,7 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
-    """By a run and by a rendering, which are of the same frames."""
+    """By `run` and by `render`, which make the same frames."""
     growing = "tracker.exposure_control={mean_dn: 500, min_stars: 1000}"
     words = ["shefex2", "--frames", "2", "--out", tmp_path, "--set", growing]
     ran = json.loads(skysim("run", *words, "--json").out)
@@ -791,7 +791,7 @@ def test_an_option_without_effect_is_refused_in_one_line(skysim: Skysim) -> None
 
 
 def test_compare_takes_options_of_any_of_its_trackers() -> None:
-    """Each is refused for the other tracker alone; one that serves none is refused."""
+    """An option is refused only if no compared tracker uses it."""
     words = ["tracker.solver=quest", "tracker.options={a: 1}"]
     both = ["own", "mine"]
     assert load("shefex2", 1, None, words, both).tracker.name == "own"

@@ -63,12 +63,12 @@ Check = Callable[[Path], bool]
 
 
 def asked(*words: str) -> Any:
-    """What a command prints as JSON. Raises ValueError where it fails."""
+    """JSON printed by a command. Raises ValueError if the command fails."""
     return json.loads(printed(*words, "--json"))
 
 
 def printed(*words: str) -> str:
-    """What a command prints. Raises ValueError where it fails."""
+    """Text printed by a command. Raises ValueError if the command fails."""
     from typer.testing import CliRunner
 
     from skysim.apps.cli.main import app
@@ -80,12 +80,12 @@ def printed(*words: str) -> str:
 
 
 def flown(folder: Path, *words: str) -> Any:
-    """The one row of a run of SHEFEX-2's camera at rest, as the command tells it."""
+    """The only row of a run of SHEFEX-2's camera at rest, from the command's JSON."""
     return asked("run", *SCENE, "--out", str(folder), *words)["rows"][0]
 
 
 def looks(row: Any, ra_deg: float, dec_deg: float, roll_deg: float) -> bool:
-    """Whether a run's frame was solved there."""
+    """Whether a run's frame was solved at this pointing."""
     wanted = np.array([ra_deg, dec_deg, roll_deg])
     return row["status"] == "solved" and bool(
         np.abs(np.array(row["estimate_deg"]) - wanted).max() < 0.05
@@ -151,7 +151,7 @@ def drawn_at(folder: Path, *sets: str) -> Floats:
 
 
 def moved(folder: Path) -> bool:
-    """A step up and one to the left."""
+    """Move the pointing one step up and one to the left."""
     drawn_deg = drawn_at(folder, "motion.start.dec_deg=7", "motion.start.ra_deg=88")
     return bool(np.abs(drawn_deg - [88, 7, 20]).max() < 1e-3)
 
@@ -176,7 +176,7 @@ def image_processing(folder: Path) -> bool:
 
 
 def ideal_model(folder: Path) -> bool:
-    """What is left are doubles that the tracker takes for one star."""
+    """Remaining differences are double stars that the tracker merges."""
     points = studied(folder)
     return points["identified"][0] == 1 and points["cross_arcsec_rms"][0] < 0.5
 
@@ -187,7 +187,7 @@ def noisy_model(folder: Path) -> bool:
 
 
 def studied(folder: Path, *words: str) -> Any:
-    """A small study's table."""
+    """Table of a small study."""
     path = folder / "monte_carlo.yaml"
     files.write_text(path, STUDY)
     report = asked(
@@ -197,7 +197,7 @@ def studied(folder: Path, *words: str) -> Any:
 
 
 def identifiers(folder: Path) -> bool:
-    """All in one study, each looking at the thirty brightest lights."""
+    """All identifiers in one study, each using the thirty brightest lights."""
     named = f"factors.model={{key: tracker.identifier, values: [{', '.join(VERSIONS)}]}}"
     points = studied(
         folder,
@@ -226,7 +226,7 @@ def monte_carlo(folder: Path) -> bool:
 
 
 def how_many(folder: Path) -> bool:
-    """Half as many runs, and a field of twice the width."""
+    """Half the number of runs, and twice the field width."""
     sets = ("--set", "replicates=20", "--set", "factors.field.values=['12 mm']")
     points = studied(folder, *sets)
     return points["identified_trials"] == [20, 20] and points["field"] == ["12 mm"] * 2
@@ -292,7 +292,7 @@ def proc_cat(folder: Path) -> bool:
 
 
 def attitudes(folder: Path) -> bool:
-    """The deterministic one from two stars, and least squares."""
+    """The deterministic attitude from two stars, and least squares."""
     one = field()
     names = ("triad", "least_squares")
     sigma_rad = np.full(len(one.rows), ARCSEC_RAD)
@@ -313,7 +313,7 @@ def true_sky(folder: Path) -> bool:
 
 
 def from_a_camera(folder: Path) -> bool:
-    """A video file stands for the camera: OpenCV opens both alike."""
+    """A video file replaces the camera: OpenCV opens both in the same way."""
     import cv2
 
     asked("render", *SCENE, "--out", str(folder))
@@ -334,7 +334,7 @@ def from_a_camera(folder: Path) -> bool:
 
 
 def estimate(folder: Path) -> bool:
-    """With a hint near the axis the stars are named; with a wrong one there is nothing to be named from."""
+    """With a hint near the axis the stars are identified; with a wrong hint there are no candidates."""
     one = field()
     known = catalog(5.1)
     axis = one.seen.mean(axis=0) / np.linalg.norm(one.seen.mean(axis=0))
@@ -347,7 +347,7 @@ def estimate(folder: Path) -> bool:
 
 
 def false_stars(folder: Path) -> bool:
-    """Three false lights, brighter than all stars: the first triangle is none."""
+    """Three false lights are brighter than all stars, so the first triangle is false."""
     one = field()
     known = catalog(5.1)
     side = np.cross(one.seen[0], [0.0, 0.0, 1.0])
@@ -366,7 +366,7 @@ def false_stars(folder: Path) -> bool:
 
 
 def magnitude_errors(folder: Path) -> bool:
-    """Mean and variance come back: magnitudes off by .1 with an alternating .05 about it."""
+    """Mean and variance are recovered from magnitudes off by 0.1 with an alternating 0.05 about it."""
     one = field()
     known = catalog(5.1)
     off = 0.1 + 0.05 * (-1.0) ** np.arange(len(one.rows))

@@ -1,4 +1,4 @@
-"""What came from outside is shown as it is: no markup of ours, and nothing that a terminal obeys."""
+"""Text from outside is printed literally: no markup is interpreted and no control character reaches the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOSTILE = "m[red].png [/b] no match [/tmp/x] :bug: \\"
 
 
 class Screen(io.StringIO):
-    """A terminal."""
+    """A string buffer that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True

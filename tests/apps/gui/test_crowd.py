@@ -32,7 +32,7 @@ WORKERS = 2
 
 
 class Hand:
-    """In place of a worker process."""
+    """Substitute for a worker process."""
 
     alive: ClassVar[set[Any]] = set()
 
@@ -46,7 +46,7 @@ class Hand:
 def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
+    """The event loop keeps running while twenty tabs wait: it counts between any two of their polls."""
     monkeypatch.setattr(session, "Session", Hand)
     monkeypatch.setattr(session, "QUEUE_S", 0.001)
     monkeypatch.setattr(Hand, "alive", set())
@@ -122,7 +122,7 @@ def test_twenty_tabs_share_two_workers(browser: Any, tmp_path: Path) -> None:
 
 
 def place(page: Any) -> int:
-    """How many wait before a page; -1 if it does not wait."""
+    """Number of pages that wait before this one; -1 if it does not wait."""
     found = re.search(
         r"2 of 2 workers in use(?:; (\d+) before this page)?\.",
         page.locator(".lab-wait").inner_text(),

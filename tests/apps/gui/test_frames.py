@@ -1,4 +1,4 @@
-"""Frames on their way to the browser: reduced to the screen's pixels while they follow one another."""
+"""Frames sent to the browser are reduced to the screen's pixels while frames follow one another."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def decoded(data: bytes) -> tuple[dict[str, Any], np.ndarray]:
 
 
 class Source:
-    """In place of a session: the worker shows an image of number 1, or has ended (None)."""
+    """Substitute for a session: the worker shows an image of number 1, or has ended (None)."""
 
     def __init__(self, image: np.ndarray | None) -> None:
         self.image = image
@@ -119,7 +119,7 @@ def test_all_pixels_are_served_while_the_worker_keeps_them() -> None:
         assert asyncio.run(ServedFrame(pixels, {}, worker).response(display, whole=True)) is None
 
 
-def test_other_limits_come_with_all_pixels() -> None:
+def test_limits_of_a_reduced_frame_are_those_of_all_pixels() -> None:
     frame = served(sky(2))
     for screen_px in ((0, 0), (999, 999)):
         found = response(frame, Display(screen_px, "min to max"))[0]["limits"]
@@ -267,7 +267,7 @@ def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.Monkey
 
 
 def split(message: bytes) -> tuple[int, np.ndarray]:
-    """Number and pixels of a message."""
+    """Image number and pixels of a message."""
     length, number = np.frombuffer(message, "<u4", 2)
     assert len(message) == 8 + length
     return int(number), decoded(message[8:])[1]
@@ -458,7 +458,7 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
 
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
-def test_successive_frames_come_over_one_request(square: Any) -> None:
+def test_successive_frames_are_sent_over_one_request(square: Any) -> None:
     square.mouse.move(5, 5)
     asked = list[str]()
     square.on("request", lambda request: asked.append(request.url))

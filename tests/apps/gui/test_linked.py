@@ -1,4 +1,4 @@
-"""The frame, the laboratory in 3-D and the table of lights show the same lights, and a hovered one in all of them."""
+"""Frame, 3-D laboratory and table show the same lights; a hovered light is highlighted in all of them."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def dome(browser: Any, server: Server) -> Any:
 
 
 def drawn(page: Any, name: str) -> str:
-    """What the 3-D picture says of itself."""
+    """State reported by the 3-D view."""
     return str(page.locator(".lab-space canvas").first.get_attribute(f"data-{name}") or "")
 
 

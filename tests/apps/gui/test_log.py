@@ -1,4 +1,4 @@
-"""The log of identifications, with the camera's noise and without."""
+"""The log of identifications with and without camera noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What remains of a page that is closed: nothing."""
+"""A closed page is freed completely."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from skysim.apps.gui.page.tab import Tab
 
 
 class Hand:
-    """In place of a worker process."""
+    """Substitute for a worker process."""
 
     def close(self) -> None:
         """End."""
 
 
 def test_a_closed_page_is_freed(tmp_path: Path) -> None:
-    """Also its upload area, whose route FastAPI keeps."""
+    """This includes its upload area, whose route FastAPI keeps."""
 
     async def story() -> weakref.ref[Tab]:
         core.loop = asyncio.get_running_loop()

@@ -389,7 +389,7 @@ def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
 
 
 def focused(page: Any, name: str) -> None:
-    """Wait until a list has the keyboard."""
+    """Wait until a list has the keyboard focus."""
     page.wait_for_function(
         "name => document.activeElement.closest('[aria-label]')?.ariaLabel === name", arg=name
     )
@@ -558,7 +558,7 @@ def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) ->
 
 
 def rolled(page: Any, name: str) -> float:
-    """The roll that a picture was solved to."""
+    """Solved roll of a picture."""
     facts = page.locator(
         ".lab-panels .mono", has_text=re.compile(rf"^{name}: solved")
     ).last.inner_text()

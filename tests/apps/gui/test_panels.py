@@ -1,4 +1,4 @@
-"""The lab's parts without a browser: keys' turns, forms of the schema, marks, guard, worker, Monte Carlo."""
+"""The lab's parts without a browser: rotation keys, schema forms, marks, guard, worker, Monte Carlo."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from skysim.sources import catalog, stars
 
 
 def test_a_solar_system_body_is_listed_with_name_and_magnitude() -> None:
-    """In the sensor's labels and in what the page says of a true light."""
+    """In the sensor's labels and in the page's text about a true light."""
     sensor = SimpleNamespace(prefix="HIP")
     assert [SensorView.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
         "Jupiter",
@@ -90,7 +90,7 @@ def test_typed_angles_are_the_camera_s_under_the_stars() -> None:
 def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
     dec_deg: float,
 ) -> None:
-    """A star in the image's middle stands, after a key to the right, a fiftieth of the field to the left of it."""
+    """After the right key, a star at the image's center is a fiftieth of the field to its left."""
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
     before = geometry.from_angles(STARS, mount, (83.0, dec_deg, 20.0))
     after = geometry.moved(STARS, mount, before, geometry.FINE, 0.0, 0.0)
@@ -138,7 +138,7 @@ def test_every_key_of_the_2005_program_is_in_the_key_help() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.yaml")))
 def test_a_form_s_unchanged_values_give_the_same_scene(name: str) -> None:
-    """What stands in the fields, put over the file, changes nothing: units, defaults and lists come back."""
+    """Overriding the file by the fields' values changes nothing: units, defaults and lists round-trip."""
     values = forms.fields(name, {})
     again = {one.key: one.text for one in values if not one.is_set and one.text != "null"}
     before, after = (
@@ -148,7 +148,7 @@ def test_a_form_s_unchanged_values_give_the_same_scene(name: str) -> None:
 
 
 def rounded(tree: object) -> object:
-    """Numbers to six digits, as the fields have them."""
+    """Numbers rounded to six digits, as shown in the fields."""
     if isinstance(tree, dict):
         return {key: rounded(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
@@ -167,7 +167,7 @@ def test_fields_know_their_unit_and_their_choices() -> None:
 
 
 def test_changing_a_section_s_kind_shows_its_keys_and_keeps_common_ones() -> None:
-    """The file's own kind comes back as the file has it; edits of the section go with its kind."""
+    """Returning to the file's kind restores the file's section; edits of a section are dropped with its kind."""
     at_first = {one.key: one for one in forms.fields("shefex2", {})}
     assert at_first["camera.shutter.kind"].allowed_values == (
         "global",
@@ -387,7 +387,7 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
         assert np.linalg.norm(pointed - wanted, axis=1).max() < within_rad, scene
 
 
-def test_names_of_stars_are_those_of_bright_stars() -> None:
+def test_named_stars_are_bright_and_names_are_unique() -> None:
     stars = catalog.read("hipparcos_hp6.5")
     v_mag = dict(zip(stars.hip.tolist(), stars.v_mag.tolist(), strict=True))
     assert max(v_mag[hip] for hip in NAMES) < 3.4
@@ -468,10 +468,10 @@ def test_a_shared_page_requires_its_token(headers: dict[str, str], query: str, s
         ("/", "GET", "", {}, 200, 3),
     ],
 )
-def test_files_of_the_page_are_asked_for_once(
+def test_static_files_of_the_page_are_cached(
     path: str, method: str, query: str, headers: dict[str, str], status: int, asked: int
 ) -> None:
-    """All other responses are made anew; each answer is whole, and a layer further out may change its headers."""
+    """Other responses are not cached; each answer is complete, and an outer layer may change its headers."""
     calls = []
     answers = list[list[dict]]()
 
@@ -531,7 +531,7 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
 def test_closed_pages_are_collected_once_while_no_frame_is_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
+    """A garbage collection takes as long as many frames, so frames must not wait for it."""
     collected = list[float]()
     frames = TabFrames(lambda _: None)
     monkeypatch.setattr(server, "release_memory", lambda: collected.append(time.monotonic()))
@@ -646,7 +646,7 @@ def test_the_port_is_removed_from_a_host() -> None:
 
 @pytest.mark.slow
 def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothing() -> None:
-    """Of two tabs' workers one points elsewhere; the other, forked afterwards, is at the scene's start."""
+    """One tab's worker has moved; another, forked afterwards, is at the scene's start."""
 
     async def story() -> None:
         scene = str(loader.find("shefex2").resolve())
@@ -767,7 +767,7 @@ def test_a_flight_equals_that_of_the_command_line_and_keeps_its_frames() -> None
 
 @pytest.mark.long
 def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tracker's own settings say so; a stage that does not exist is refused."""
+    """The tracker's settings show the stages; an unknown stage is refused."""
     used: list[str] = []
     solved = photo.solved_photo
 

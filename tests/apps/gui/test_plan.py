@@ -49,7 +49,7 @@ def test_a_check_equals_that_of_the_command() -> None:
 
 @pytest.mark.slow
 def test_a_regular_dome_is_ambiguous_and_a_random_one_is_not() -> None:
-    """The rings of a geodesic dome repeat after a fifth of a turn."""
+    """The rings of a geodesic dome repeat after 72 deg."""
     shares = {}
     for kind, size in (("geodesic", "frequency: 32"), ("poisson_disk", "count: 800")):
         settings = {"light.layout": f"{{kind: {kind}, {size}, cap_deg: 40}}"}
@@ -119,7 +119,7 @@ def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() 
 def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(
     pixels: float, taken: list[int]
 ) -> None:
-    """Its image moves by less than a pixel. A frame whose exposure lasts beyond the hold does not count."""
+    """Images then move by less than a pixel. A frame exposed beyond the hold does not count."""
     legs = ", ".join(
         f"{{kind: slew, roll_deg: {roll}}}, {{kind: hold, duration: 5 s}}" for roll in (3, 0)
     )
@@ -156,7 +156,7 @@ def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
 
 @pytest.mark.slow
 def test_a_survey_continues_with_the_frames_flown() -> None:
-    """Its frames are those at the planned attitudes, and more of them measure more LEDs, with errors as estimated."""
+    """Frames are at the planned attitudes; more frames measure more LEDs with the estimated errors."""
     worker = Worker()
     bench = {"motion.control": "prescribed", "motion.maneuver": "[]"}
     worker.open("afit_simsat", bench, False)
@@ -214,7 +214,7 @@ def check_map(worker: Worker, found: SurveyFound) -> None:
 
 @pytest.mark.slow
 def test_a_survey_has_the_frames_of_its_flights_once() -> None:
-    """None of another maneuver. Those of two attitudes are too few, which is said, and the next ones are planned."""
+    """No frame of another maneuver counts. Two attitudes are reported as too few, and the next ones are planned."""
     worker = Worker()
     bench = {"motion.control": "prescribed", "exposure.frames": "2"}
     worker.open("afit_simsat", bench, False)
@@ -273,7 +273,7 @@ def test_a_plan_needs_two_frames() -> None:
 
 
 def test_colors_differ_in_lightness() -> None:
-    """The scale's luminance rises all along, so that eyes that see fewer colors see it as well."""
+    """The scale's luminance is monotonic, so that color-blind readers can read it."""
     luminance = color_scale(np.linspace(0, 1, 64)) @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(luminance) > 0)
 

@@ -1,4 +1,4 @@
-"""Pushing the vehicle in the 3-D view: what torque it gets, what it does, and what its frames see."""
+"""Pushing the vehicle in the 3-D view: torque, motion, and frames."""
 
 from __future__ import annotations
 

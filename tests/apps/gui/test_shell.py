@@ -1,4 +1,4 @@
-"""What surrounds the lab's panels: the list of actions, theme, splitter, narrow windows, wording."""
+"""The frame around the lab's panels: list of actions, theme, splitter, narrow windows, wording."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_colors_are_distinguishable_with_color_blindness(eye: str) -> None:
 
 @pytest.mark.slow
 def test_the_time_of_the_first_frame_excludes_compilation() -> None:
-    """Also of a tracker that was chosen later: its first frame takes about as long as its second."""
+    """This holds for a tracker chosen later, too: its first frame takes about as long as its second."""
     bench = Workbench.open("shefex2", {})
     for overrides in ({}, {"tracker.identifier": "pyramid"}):
         bench = Workbench.open("shefex2", overrides, bench)
@@ -225,7 +225,7 @@ def change_theme(page: Any) -> None:
 
 
 def ground(page: Any) -> str:
-    """Color behind the panels."""
+    """Background color of the panels."""
     return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
 
 
@@ -319,7 +319,7 @@ def test_a_closed_or_unchanged_laboratory_is_not_redrawn(
         return int(canvas.get_attribute("data-drawn") or 0)
 
     def moved(key: str) -> int:
-        """How many pictures are drawn for a key."""
+        """Number of pictures drawn after a key press."""
         page.wait_for_timeout(1000)
         before = pictures()
         frame = source(page)

@@ -84,7 +84,7 @@ def test_steps_are_distinguished_from_continuous_changes() -> None:
 
 
 def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However soon after a page's opening or an edit it begins."""
+    """This holds directly after opening a page or an edit."""
     sent: list[str] = []
     monkeypatch.setattr(history.ui, "run_javascript", sent.append)
     shown = SimpleNamespace(state=VIEWS[0])
@@ -110,7 +110,7 @@ def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch)
 
 
 def written(page: Any, *parts: str) -> bool:
-    """Whether the address comes to have these parts."""
+    """Whether the address has these parts after a short wait."""
     return come(lambda: all(part in address(page) for part in parts))
 
 

@@ -36,7 +36,7 @@ pytestmark = [
 
 
 def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> None:
-    """Every frame is computed while keys move the camera; then it plays to its last frame at any speed."""
+    """The flight is computed while keys move the camera; then it plays to its last frame at any speed."""
     chosen(page, "Scene", "simsat_slew")
     page.get_by_text("SimSat slews on its reaction wheels").wait_for()
     status(page, "solved")

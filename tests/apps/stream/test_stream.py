@@ -124,7 +124,7 @@ def test_a_frame_is_sent_when_due_and_dropped_one_period_later(
 
 
 def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
-    """With time for every other frame, those that come are the run's; the header says how many did not."""
+    """With time for every second frame, received frames equal the run's; the header counts dropped ones."""
     packets: list[Packet] = []
 
     class Slow(Pace):
@@ -292,7 +292,7 @@ def test_a_client_that_disconnects_during_a_response_is_ignored(
 def test_counters_of_disconnected_clients_are_bounded_and_summed(
     hub: tuple[http.FrameHub, str],
 ) -> None:
-    """A hundred clients take a frame each: counters of the newest are kept one by one, of the others as a sum."""
+    """Of a hundred clients with one frame each, the newest have single counters and the others a sum."""
     stays = urllib.request.urlopen(hub[1] + "/stream.raw", timeout=10)
     assert unpack(stays) is not None
     for _ in range(100):

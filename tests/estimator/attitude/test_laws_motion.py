@@ -1,4 +1,4 @@
-"""Laws of a turning camera: velocities, frames at one time, rates from streaks, disks and rows, and their errors."""
+"""Laws of a rotating camera: image velocities, frames at one time, rates from streaks, disks and rows, and errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GLOBAL = replace(CAMERA, row_time_s=0.0)
 
 
 def any_rate(rng: np.random.Generator, most_deg_s: float = 5.0) -> Floats:
-    """Degrees per second about any axis, at least one across the boresight."""
+    """A random rate about any axis with at least 1 deg/s across the boresight."""
     across = units(rng, 1)[0] * [1, 1, 0]
     return rng.uniform(1.0, most_deg_s) * (
         across / np.linalg.norm(across) + [0, 0, rng.uniform(-0.3, 0.3)]
@@ -46,7 +46,7 @@ def exact(rate_rad_s: Floats) -> RateEstimate:
     Camera.row_delays_s,
 )
 @given(rng=SEEDS)
-def test_images_move_as_the_rate_says(rng: np.random.Generator) -> None:
+def test_images_move_at_the_rate_s_predicted_velocity(rng: np.random.Generator) -> None:
     for sight in STARS, DOME, DOME._replace(radius_m=rng.uniform(1.0, 1.4, 30)):
         seen = replace(moving(rng, any_rate(rng), sight=sight), camera=GLOBAL)
         rays = GLOBAL.rays(seen.still_px)

@@ -45,7 +45,7 @@ def covariances(rng: np.random.Generator, size: int, count: int = COUNT) -> Floa
 
 @law(nearfield.tangent_gradients, nearfield.tangent_jacobian, systematic.geometry)
 @given(rng=SEEDS)
-def test_tangents_change_as_their_derivatives_say(rng: np.random.Generator) -> None:
+def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -> None:
     bearing, pupil = places(rng)
     step_m = rng.normal(0, 1e-6, pupil.shape)
     turned_rad = rng.normal(0, 1e-6, 3)

@@ -45,7 +45,7 @@ def rms_and_error(squares: np.ndarray) -> tuple[float, float]:
 
 
 def agrees(squares: np.ndarray, published: float) -> bool:
-    """Within three deviations of ours and of the reference's 500 trials, which spread as ours do, and its digits."""
+    """Whether the value agrees within three standard errors of ours and of the reference, and its rounding."""
     rms, error = rms_and_error(squares)
     theirs = error * np.sqrt(len(squares) / 500)
     digits = len(f"{published:.10f}".rstrip("0")) - 2
@@ -130,7 +130,7 @@ def noise_alone(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors, (trials, 3) in rad, and the covariances claimed for .1 px.
 
-    The errors are counted from what the method says without noise; for an exact one that is the truth.
+    Errors are relative to the method's noise-free result, which is the truth for an exact method.
     """
     rng = np.random.default_rng(seed)
     one = bench.GEOMETRIES[surface]

@@ -473,7 +473,7 @@ def test_the_covariance_of_three_axes_matches_a_hand_calculation() -> None:
 
 
 def looking(x: list, y: list, z: list) -> Rotation:
-    """cam_from_icrs from the camera's axes among the stars."""
+    """cam_from_icrs from the camera axes in ICRS."""
     return Rotation.from_matrix(np.array([x, y, z], dtype=float))
 
 
@@ -506,7 +506,7 @@ def test_right_ascension_declination_and_roll_match_a_hand_calculation(case: str
 
 
 def from_angles(ra: float, dec: float, roll: float) -> Rotation:
-    """cam_from_icrs by three turns: Z by the right ascension, Y by the declination, then roll about the sight."""
+    """cam_from_icrs by three rotations: Z by right ascension, Y by declination, then roll about the boresight."""
     to_sight = Rotation.from_euler(
         "ZYX", [ra, -dec, -roll]
     )  # intrinsic: carries +X to the sight, +Z to up

@@ -41,7 +41,7 @@ def seen(position_m: Floats) -> Floats:
 
 
 def solved(rays: Floats, sigma_rad: Floats, position_m: Floats) -> Floats:
-    """(3,) error of the rotation in camera axes, from rays and believed places."""
+    """(3,) error of the rotation in camera axes, solved from rays and the map's places."""
     found, _ = rotation_only(
         rays,
         sigma_rad,

@@ -1,4 +1,4 @@
-"""The dome's self-survey, on frames made by a projection of its own."""
+"""The dome's self-survey on frames made by an independent projection."""
 
 from dataclasses import replace
 from time import perf_counter, process_time
@@ -31,7 +31,7 @@ SMALL = Camera(800, 600, 900.0, (398.0, 303.0), (-0.08, 0.03, 0.001, -0.0007, 0.
 def pixels(
     body_from_lab: Rotation, place_m: np.ndarray, lever: Lever, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels and whether they are on the chip, by trigonometry of its own: angle off axis, azimuth, Brown's law."""
+    """Pixels and whether they are on the chip, by independent trigonometry: off-axis angle, azimuth, Brown's law."""
     q = lever.cam_from_body.apply(body_from_lab.apply(place_m) - lever.camera_body_m)
     off = np.arccos(q[:, 2] / np.linalg.norm(q, axis=1))
     azimuth = np.arctan2(q[:, 1], q[:, 0])
@@ -66,7 +66,7 @@ def dome(count: int, half_deg: float) -> np.ndarray:
 
 
 def attitudes(rng: np.random.Generator, count: int, tilt_deg: float) -> Rotation:
-    """Tilts evenly over the cap, all yaws."""
+    """Attitudes with tilts uniform over the cap and any yaw."""
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     about = rng.uniform(0, 2 * np.pi, count)
     lean = Rotation.from_rotvec(
@@ -94,7 +94,7 @@ def filmed(
     noise_px: float,
     imu_deg: float = 1.0,
 ) -> list[DomeFrame]:
-    """What the camera sees, with start attitudes wrong by imu_deg an axis."""
+    """Frames of the camera with initial attitudes wrong by imu_deg per axis."""
     frames = []
     for k in range(len(turned)):
         xy, on_chip = pixels(turned[k], place_m, lever, camera)
@@ -125,13 +125,13 @@ def small_survey(
 
 
 def size_and_turn(found: np.ndarray, truth: np.ndarray) -> tuple[float, Rotation]:
-    """The size and the turn of the lab that bring a survey's lights onto the true ones."""
+    """Scale and rotation of the lab that map a survey's lights onto the true ones."""
     turn = Rotation.align_vectors(truth, found)[0]
     return float(np.sum(truth * turn.apply(found)) / np.sum(found**2)), turn
 
 
 def errors_rad(found: Rotation, truth: Rotation) -> np.ndarray:
-    """(F, 3) attitude errors in body axes, without the turns of lab and body that no pixel knows."""
+    """(F, 3) attitude errors in body axes, without the unobservable rotations of lab and body."""
     left, right = align_attitudes(found, truth)
     return (left * found * right * truth.inv()).as_rotvec()
 
@@ -256,7 +256,7 @@ def gauged(
     turned: Rotation,
     lever: Lever,
 ) -> tuple[np.ndarray, Rotation, np.ndarray]:
-    """The truth, turned and grown as the survey says it holds the gauge: least squares onto the start map."""
+    """The truth rotated and scaled to the survey's gauge: least squares onto the initial map."""
     turn = Rotation.align_vectors(start[kept], place[kept])[0]
     size = (
         1.0
@@ -308,7 +308,7 @@ def test_the_covariance_matches_the_scatter_of_surveys(sigma_m: float, length_kn
 def misnamed(
     rng: np.random.Generator, frames: list[DomeFrame], lights: int, share: float
 ) -> list[DomeFrame]:
-    """The same frames with a share of their lights called by another's row."""
+    """The same frames with a share of their lights assigned to wrong rows."""
     wrong = []
     for frame in frames:
         other = (frame.led + rng.integers(1, lights, len(frame.led))) % lights
@@ -360,7 +360,7 @@ def test_wrong_names_ruin_plain_least_squares() -> None:
     assert np.degrees(np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2))) > 0.1
 
 
-def test_a_light_seen_once_stays_at_its_start_and_is_not_called_surveyed() -> None:
+def test_a_light_seen_once_keeps_its_start_position_unsurveyed() -> None:
     place, turned, lever = small_dome(33)
     rng = np.random.default_rng(34)
     frames = filmed(rng, turned, place, lever, SMALL, 0.1)
@@ -484,7 +484,7 @@ def test_the_rotations_between_two_sets_of_attitudes_are_found() -> None:
 def afit_errors_deg(
     found: DomeSurvey, rng: np.random.Generator, place: np.ndarray, trials: int
 ) -> tuple[float, float]:
-    """rms cross and roll of new frames, to 25 degrees of tilt, solved with what the survey found."""
+    """rms cross and roll errors of new frames with tilts to 25 deg, solved with the surveyed map."""
     turned = attitudes(rng, trials, 25)
     solved = []
     for frame in filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.5):

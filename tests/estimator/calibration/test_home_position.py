@@ -1,4 +1,4 @@
-"""The thesis's calibration: its epsilons against the noise put in, its catalog against the dome it came from."""
+"""The thesis's calibration: its epsilons against the injected noise, its catalog against the true dome."""
 
 from dataclasses import replace
 
@@ -81,7 +81,7 @@ def at_home(rng: np.random.Generator, frames: int) -> list[Sighting]:
 
 
 def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
-    """Between what the greatest of so many independent sample deviations of unit variance lies, but for RARE."""
+    """Bounds, but for RARE, of the largest of this many independent sample deviations of unit variance."""
     chance = np.array([RARE / 2, 1 - RARE / 2]) ** (1 / count)
     low, high = np.sqrt(stats.chi2.ppf(chance, freedom) / freedom)
     return float(low), float(high)
@@ -91,7 +91,7 @@ def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
 
 
 def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
-    """How much too wide a pair astride the boresight reads about the bearing, on a perfect centered sphere."""
+    """Excess angle of a pair centered on the boresight about the bearing, on a perfect centered sphere."""
     half = wide_rad / 2
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
     point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
@@ -118,7 +118,7 @@ def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
     assert -5 < found < -4
 
 
-def test_with_the_sine_a_point_lies_on_its_ray_r_minus_m_away() -> None:
+def test_with_the_sine_a_point_is_on_its_ray_at_distance_r_minus_m() -> None:
     rng = np.random.default_rng(60)
     rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (50, 2)))
     point, _ = nearfield.thesis_points(rays, SPHERE, LEVER, sine=True)
@@ -145,7 +145,7 @@ IMU_RAD = 1.9861e-3 / R_M  # .0933 degree: Table 9's epsilon_position, were it a
 
 @pytest.fixture(scope="module")
 def stops() -> list[Sighting]:
-    """300 stops of two frames, truly all at home, the IMU wrong by IMU_RAD about each axis at each stop."""
+    """300 stops of two frames, all at home, with an IMU error of IMU_RAD about each axis at each stop."""
     rng = np.random.default_rng(62)
     level = Rotation.identity()
     wrong = Rotation.from_rotvec(rng.normal(0, IMU_RAD, (300, 3)))
@@ -314,7 +314,7 @@ def test_a_camera_mounted_askew_gives_the_same_positions() -> None:
     assert np.abs(off[:, :2]).max() < 0.12e-3 * 0.02 * 1.3
 
 
-def test_the_map_for_a_tracker_lies_on_the_surface_in_the_catalog_s_directions(
+def test_the_tracker_map_has_the_catalog_s_directions_on_the_surface(
     home: HomeCatalog,
 ) -> None:
     oval = LedMap(

@@ -88,7 +88,7 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Gen
 
 @law(mass_dynamics.difference_steps, mass_dynamics.transition, mass_dynamics.torque_noise)
 @given(rng=SEEDS)
-def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
+def test_a_transition_matrix_predicts_small_changes(rng: np.random.Generator) -> None:
     """Of a state and of the parameters, by its derivatives; its noise is a covariance."""
     assumed, _ = prior(SMALL, rng)
     states = mass_properties.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))

@@ -35,7 +35,7 @@ LENS = np.array([CAMERA.focal_px, *CAMERA.center_px, *CAMERA.distortion])
 
 
 def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sightings]:
-    """Lights overhead, all of them seen in every frame of a camera that leans and turns."""
+    """Lights overhead that are all seen in every frame of a tilting and rotating camera."""
     across = rng.uniform(-0.4, 0.4, (LIGHTS, 2))
     place = np.column_stack(
         [across, 1.2 - 0.3 * np.sum(across**2, axis=1) + rng.uniform(-0.1, 0.1, LIGHTS)]
@@ -61,7 +61,7 @@ def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sight
 
 
 def nudged(rng: np.random.Generator, true: Bundle, by: float) -> Bundle:
-    """Everything a little off."""
+    """The parameters with small random errors."""
     return true.apply_step(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
 
 
@@ -406,7 +406,7 @@ def test_any_frames_give_a_survey_or_are_refused(
 
 
 def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotation]:
-    """Star fields all over the sensor, a tenth of a pixel off."""
+    """Star fields over the whole sensor with errors of a tenth of a pixel."""
     truths = Rotation.random(count, rng=rng)
     frames = []
     for k in range(count):
@@ -446,7 +446,7 @@ def test_any_star_fields_determine_a_lens_or_are_refused(
 
 
 class Namer:
-    """A tracker that knows what it sees: the light's row in the list is its name."""
+    """A perfect identifier: a light's name is its row in the list."""
 
     def __init__(self, frames: list[StarFrame], seen: bool) -> None:
         vectors = np.concatenate([frame.vectors_ref for frame in frames])

@@ -1,4 +1,4 @@
-"""Laws of the survey's plan and of its faults."""
+"""Laws of the survey's plan and of the detection of faults."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ CLOSE_M = 0.004
 def close_group(
     rng: np.random.Generator, levels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, LightTable]:
-    """List, places, covariance and light of four LEDs in a row, and 56 far from one another, of these levels."""
+    """List, places, covariance and light of four LEDs in a row and of 56 distant ones with these levels."""
     place_m = 10 * rng.normal(0, 1, (60, 3))
     place_m[:4] = place_m[0] + CLOSE_M * np.arange(4)[:, None] * [1.0, 0.0, 0.0]
     listed = place_m + LIST_M * rng.normal(0, 1, place_m.shape)
@@ -213,7 +213,7 @@ def test_equal_leds_get_the_assignment_of_least_distance(rng: np.random.Generato
 @law(survey_faults.names)
 @given(rng=SEEDS)
 def test_brightness_identifies_leds_exchanged_in_the_list(rng: np.random.Generator) -> None:
-    """Of neighbors the light decides; of LEDs farther apart the place, and an exchange is reported."""
+    """Brightness identifies neighbors and position distant LEDs; an exchange is reported."""
     levels = np.exp(np.linspace(0, -30, 60))
     listed, place_m, covariance, table = close_group(rng, levels)
     wrong = np.arange(60)
@@ -237,7 +237,7 @@ def test_brightness_identifies_leds_exchanged_in_the_list(rng: np.random.Generat
 
 @law(survey_faults.names)
 @given(rng=SEEDS)
-def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> None:
+def test_no_other_light_gets_the_name_of_a_dark_led(rng: np.random.Generator) -> None:
     """LED 1 is dark, and its name was given to the light of LED 2, which is called 2 again."""
     listed, place_m, covariance, table = close_group(rng, np.exp(np.linspace(0, -30, 60)))
     covariance[2] = np.nan
@@ -253,9 +253,7 @@ def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> No
 
 @law(survey_faults.exchanged)
 @given(rng=SEEDS, gain=some.floats(0.1, 10))
-def test_exchanged_lights_are_named_whatever_the_gain(
-    rng: np.random.Generator, gain: float
-) -> None:
+def test_exchanged_lights_are_found_at_any_gain(rng: np.random.Generator, gain: float) -> None:
     levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
     shown = np.ones((10, 12), dtype=bool)
     light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))

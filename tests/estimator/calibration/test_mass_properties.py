@@ -1,4 +1,4 @@
-"""Mass properties on an air bearing: analytic motions, an independent integration, errors as large as claimed."""
+"""Mass properties on an air bearing against analytic motions, an independent integration, and claimed errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NINE = slice(0, 9)
 
 
 def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Floats]:
-    """Motion from rest of the wheels, level, with this rate; its states at all times and its rates (3, N)."""
+    """Motion from level attitude with wheels at rest and this rate: states at all times and rates (3, N)."""
     still = replace(
         record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3))
     )
@@ -86,7 +86,7 @@ def nees(estimate: MassEstimate, vehicle: Vehicle) -> float:
 
 
 def draws(count: int, seed: int) -> list[tuple[BearingRecord, LabConstants, float, MassEstimate]]:
-    """Records of draws of noise, random torque and assumptions: each with the NEES of the batch."""
+    """Records with random noise, torque and assumptions, each with the NEES of the batch estimate."""
     rows = []
     for child in np.random.SeedSequence(seed).spawn(count):
         rng = np.random.default_rng(child)
@@ -110,7 +110,7 @@ def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
 
 
 @pytest.mark.long
-def test_a_hundred_draws_err_as_their_covariance_says() -> None:
+def test_the_errors_of_a_hundred_draws_match_their_covariance() -> None:
     """The sum of 100 NEES of nine values is chi-square of 900 degrees of freedom."""
     values = [value for _, _, value, _ in draws(100, 1)]
     assert chi2.ppf(1e-4, 900) < sum(values) < chi2.ppf(1 - 1e-4, 900)

@@ -44,7 +44,7 @@ def on_sensor(camera: Camera, count: int, rng: np.random.Generator) -> np.ndarra
 
 @dataclass(frozen=True)
 class Field:
-    """Frames with their true attitudes, and which stars bear a wrong name."""
+    """Frames with their true attitudes, and which stars have a wrong name."""
 
     frames: list[StarFrame]
     cam_from_ref: Rotation
@@ -154,7 +154,7 @@ def test_twenty_frames_calibrate_the_field_to_a_fiftieth_of_a_pixel(
 
 
 @pytest.mark.long
-def test_the_covariance_of_the_lens_matches_its_errors(
+def test_the_covariance_of_the_lens_matches_the_errors(
     clean: list[tuple[Field, Calibration]],
 ) -> None:
     nees = []
@@ -302,7 +302,7 @@ def test_the_magnitude_zero_is_the_median_over_different_stars() -> None:
 
 @dataclass
 class Nearest:
-    """Knows the names, and believes those of stars within 3 px of where the believed camera would have them."""
+    """An identifier that names stars within 3 px of their position by the assumed camera."""
 
     camera: Camera
     stars: StarCatalog

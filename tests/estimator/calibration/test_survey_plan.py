@@ -34,7 +34,7 @@ FOCAL_ERROR = 0.01
 
 
 def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
-    """A dome as it is, and the attitudes of its plan."""
+    """A true dome and the attitudes of its plan."""
     true = model(count)
     candidates = attitudes(np.random.default_rng(1), 300)
     rows = survey_plan.choose(true, candidates, true.visible(candidates), frames)
@@ -49,11 +49,11 @@ def simulated(
     uses_assumed: bool = False,
     change: Callable[[DomeFrame], DomeFrame] | None = None,
 ) -> DomeSurvey:
-    """A survey of noisy pixels with a list, a lever, a lens and start attitudes that are off.
+    """A survey of noisy pixels with errors of list, lever, lens and initial attitudes.
 
-    sigma_factor : by which the noise is smaller than it is believed
+    sigma_factor : factor by which the noise is smaller than assumed
     uses_assumed : whether lever and focal length are measurements; the focal length then errs at random, else by 1 %
-    change       : of each frame, which the survey then tolerates by a robust loss
+    change       : applied to each frame; the survey then uses a robust loss
     """
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):
@@ -96,7 +96,7 @@ def simulated(
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_factor", [1.0, 3.0])
 def test_surveys_have_the_predicted_errors(sigma_factor: float) -> None:
-    """Within 20 %, whatever noise is believed. The focal length has one error a survey: 9 % of chance with 60."""
+    """To 20 % for any assumed noise. The focal length has one error per survey: 9 % of scatter with 60 surveys."""
     true, held = planned(LEDS, FRAMES)
     predicted = survey_plan.predict(true, held, true.visible(held))
     rng = np.random.default_rng(2)
@@ -172,7 +172,7 @@ def test_a_plan_needs_a_third_of_the_frames_of_random_attitudes() -> None:
 
 @pytest.mark.slow
 def test_a_plan_continues_from_the_frames_at_hand() -> None:
-    """Of the same candidates the next choices are of LEDs that the first half of the dome does not show."""
+    """From the same candidates the next choices show LEDs outside of the first half of the dome."""
     true = model(200)
     candidates = attitudes(np.random.default_rng(4), 300)
     shown = true.visible(candidates)
@@ -196,7 +196,7 @@ def narrow_dome(sigma_px: float = NOISE_PX) -> SurveyModel:
 
 
 def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
-    """Otherwise the adjustment leaves frames out of which the plan has predicted LEDs."""
+    """Otherwise the adjustment would leave out frames that the plan counts on."""
     true = narrow_dome()
     candidates = attitudes(np.random.default_rng(3), 1000, 20.0)
     held = candidates[survey_plan.choose(true, candidates, true.visible(candidates), 12)]
@@ -210,7 +210,7 @@ def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
 
 @pytest.mark.parametrize(("arm_m", "least"), [(0.1, 20), (0.15, 25), (0.2, 15)])
 def test_a_plan_with_a_short_lever_still_connects_its_attitudes(arm_m: float, least: int) -> None:
-    """Few rays cross, so no attitude has as many as are wanted: LEDs that are only shared are better than none."""
+    """Few rays cross, so the requested number is not reached; LEDs that are only shared are used instead."""
     camera = Camera(640, 480, 2500.0, (319.5, 239.5))
     true = replace(model(400), camera=camera, lever_sigma_m=0.005, focal_sigma_px=9.0)
     true = replace(true, lever=replace(true.lever, camera_body_m=np.array([0.0, 0.0, arm_m])))

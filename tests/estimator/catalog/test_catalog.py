@@ -1,4 +1,4 @@
-"""The on-board catalog: apparent places against astropy, doubles and magnitudes worked by hand."""
+"""The on-board catalog: apparent places against astropy, doubles and magnitudes against hand calculations."""
 
 import datetime
 from pathlib import Path
@@ -52,7 +52,7 @@ def columns_of_the_file() -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def oracle() -> SkyCoord:
-    """The file as SkyCoord; a star without a measured parallax stands at 1e-6 arcsec."""
+    """The file as SkyCoord; a star without a measured parallax gets 1e-6 arcsec."""
     table = columns_of_the_file()
     return SkyCoord(
         ra=table["ra_deg"] * u.deg,

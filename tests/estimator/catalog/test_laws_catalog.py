@@ -253,6 +253,6 @@ def test_the_shipped_catalog_is_brightest_first() -> None:
 
 @given(place=ANY, last=some.integers(0, 1000))
 def test_a_position_s_cell_is_the_nearest_one(place: float, last: int) -> None:
-    """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
+    """This holds for any number, including NaN and 1e300, whose casts once led beyond a table's end."""
     expected = 0 if np.isnan(place) else min(max(place, 0), last)
     assert sky_index.cell_of(float(place), last) == int(expected)

@@ -14,7 +14,7 @@ build_pair_catalog = PLAIN.build_pair_catalog
 
 
 def in_a_cap(rng: np.random.Generator, count: int, radius_rad: float) -> Floats:
-    """Unit vectors evenly over a cap about z."""
+    """Unit vectors uniform over a cap about z."""
     z = rng.uniform(np.cos(radius_rad), 1, count)
     about = rng.uniform(0, 2 * np.pi, count)
     across = np.sqrt(1 - z**2)
@@ -29,7 +29,7 @@ def all_pairs(vectors: Floats) -> tuple[Floats, Floats]:
 
 
 def names(pair: Floats) -> Floats:
-    """Sorted numbers, one a pair, the same either way round."""
+    """Sorted numbers of pairs, independent of the order within a pair."""
     low, high = np.sort(pair, axis=1).astype(int).T
     return np.sort(low * 10_000 + high)
 

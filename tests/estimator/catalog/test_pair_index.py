@@ -14,13 +14,13 @@ def uniform_sky(count: int, seed: int) -> np.ndarray:
 
 
 def angles(vectors: np.ndarray) -> np.ndarray:
-    """All angles between rows, by the cross product, another formula than the index's."""
+    """All angles between rows by the cross product, a formula that the index does not use."""
     cross = np.linalg.norm(np.cross(vectors[:, None], vectors[None]), axis=2)
     return np.arctan2(cross, vectors @ vectors.T)
 
 
 def of_angles(angle_rad: np.ndarray) -> pair_index.PairIndex:
-    """An index whose sorted angles are these; its stars are no matter."""
+    """An index with these sorted angles and arbitrary stars."""
     count, slope, offset = pair_index.k_vector(angle_rad)
     any_sky = pair_index.build(np.eye(3), 2.0)
     return any_sky._replace(angle_rad=angle_rad, kvector=count, slope_rad=slope, offset_rad=offset)
@@ -42,11 +42,11 @@ def test_the_pairs_match_brute_force(sky: pair_index.PairIndex) -> None:
     )
 
 
-def test_the_pairs_come_by_growing_angle(sky: pair_index.PairIndex) -> None:
+def test_the_pairs_are_sorted_by_angle(sky: pair_index.PairIndex) -> None:
     assert np.all(np.diff(sky.angle_rad) >= 0)
 
 
-def test_every_star_s_neighbors_are_all_of_them_by_growing_angle(sky: pair_index.PairIndex) -> None:
+def test_every_star_has_all_its_neighbors_sorted_by_angle(sky: pair_index.PairIndex) -> None:
     every = angles(sky.vectors)
     np.fill_diagonal(every, np.inf)
     for star in range(len(sky.vectors)):

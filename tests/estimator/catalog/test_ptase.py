@@ -1,4 +1,4 @@
-"""PTASE's READCAT and PROC_CAT: published counts, the epoch by erfa, light that merging keeps, the log."""
+"""PTASE's READCAT and PROC_CAT: published counts, the epoch against erfa, merged light, and the log."""
 
 from pathlib import Path
 

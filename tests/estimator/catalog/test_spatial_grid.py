@@ -1,4 +1,4 @@
-"""Stars near a direction: cells against brute force, wherever on the sphere and however near."""
+"""Stars near a direction: cells against brute force anywhere on the sphere and at any radius."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Centroids: against our own rendering by erf, and the Cramér-Rao bound from its numerical derivatives."""
+"""Centroids against images by erf and against the Cramér-Rao bound from their numerical derivatives."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ CELLS = 12
 def gaussian(
     shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA_PX
 ) -> np.ndarray:
-    """Light of a Gaussian integrated over each pixel, whose middle is the integer."""
+    """Light of a Gaussian integrated over each pixel; pixel centers are integers."""
 
     def share(count: int, at: float) -> np.ndarray:
         return np.diff(erf((np.arange(count + 1) - 0.5 - at) / (sigma * 2**0.5))) / 2
@@ -31,7 +31,7 @@ def gaussian(
 
 
 def disk(shape: tuple[int, int], x: float, y: float, radius: float) -> np.ndarray:
-    """A uniform disk: 200 chords a row of pixels, each cut exactly into pixels."""
+    """A uniform disk from 200 chords per row of pixels, each divided exactly among pixels."""
     chords = np.add.outer(np.arange(shape[0]), (np.arange(200) + 0.5) / 200 - 0.5).ravel()
     half = np.sqrt(np.maximum(radius**2 - (chords - y) ** 2, 0))[:, None]
     edges = np.arange(shape[1] + 1) - 0.5
@@ -144,7 +144,7 @@ def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
 
 @pytest.mark.parametrize("light", [0.5, 1.0, 2.0, -1.0])
 def test_any_nonzero_light_has_a_center_of_gravity(light: float) -> None:
-    """A quarter and three quarters of it in two pixels, on a sky of zero; none at all is of no place."""
+    """One and three quarters of the light in two pixels on a sky of zero; no light has no center."""
     moments = interpreted("estimator.centroiding.moments")
     image = np.zeros((9, 9))
     sky = np.zeros((3, 3))
@@ -265,7 +265,7 @@ def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
 
 
 def test_a_large_saturated_star_is_placed_by_its_wings() -> None:
-    """In the largest window, of 21 px; by the interpreter, which refuses an index beyond an array."""
+    """In the largest window, of 21 px; run by the interpreter, which checks array indices."""
     plain = interpreted("estimator.centroiding.gaussian_fit")
     image = gaussian((41, 41), 20.3, 19.8, 1e5, 1.2)
     level = np.zeros((1, 1))
@@ -374,7 +374,7 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
 
 
 def test_the_disk_fit_gives_position_flux_and_radius_of_a_blurred_disk() -> None:
-    """Without noise, on a sky of 50; by the interpreter, which refuses what is beyond an array."""
+    """Without noise, on a sky of 50; run by the interpreter, which checks array indices."""
     fit = interpreted("estimator.centroiding.disk_fit")
     radius = 4.0
     x = 15.3

@@ -1,4 +1,4 @@
-"""Every centroider refuses what is no image, no blobs of it, or no gain, before compiled code reads beyond."""
+"""Every centroider refuses invalid images, blobs and gains before compiled code could read outside of arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Smeared stars: found by a line filter, placed by a line fit, against frames drawn here and the Cramér-Rao bound."""
+"""Smeared stars: line filter and line fit against independently drawn frames and the Cramér-Rao bound."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def smeared(
     flux: float,
     sigma: float = SIGMA_PX,
 ) -> np.ndarray:
-    """A Gaussian integrated over each pixel, on its way from end to end in 80 steps."""
+    """A moving Gaussian integrated over each pixel in 80 steps from end to end."""
 
     def share(count: int, at: np.ndarray) -> np.ndarray:
         return (
@@ -58,7 +58,7 @@ def nearest(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def near(found: np.ndarray, wanted: np.ndarray) -> int:
-    """How many places have a blob within 2 px."""
+    """Number of places with a blob within 2 px."""
     return int((np.linalg.norm(found[None] - wanted[:, None], axis=2).min(axis=1) < 2).sum())
 
 
@@ -262,7 +262,7 @@ def test_round_stars_get_the_round_fit() -> None:
 def test_a_star_s_own_streak_has_its_claimed_covariance_for_any_frame_streak(
     stretch: float,
 ) -> None:
-    """The vector without priors has no bias and an honest covariance, also if the frame's streak is half too long."""
+    """The vector without priors is unbiased with a correct covariance, even if the frame's streak is 50 % too long."""
     true = np.array([6.0, 3.5])
     nees = []
     errors = []
@@ -315,7 +315,7 @@ def test_a_star_s_own_vector_excludes_the_priors(seed: int) -> None:
 
 
 def test_a_frame_s_short_streak_is_corrected_by_its_stars() -> None:
-    """Stars of a faint frame look too short by their moments; the median of the fits replaces it."""
+    """Moments underestimate the streak of a faint frame; the median of the fits replaces it."""
     image, _ = field(np.random.default_rng(70), 12.0, 4.0, np.full(30, 20_000.0))
     blobs = replace(detect.default(image), streak_px=(7.0, 2.3))
     found = streak(image, blobs)
@@ -408,7 +408,7 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
 def test_a_fit_that_starts_pixels_off_converges_to_the_truth(
     start: tuple[float, float, float, float],
 ) -> None:
-    """Of place, length and direction: where a first step would go too far it is shortened; almost without noise."""
+    """Position, length and direction start off; a first step that is too long is shortened; almost no noise."""
     plain = interpreted("estimator.centroiding.streak_fit")
     y, x = (grid.ravel().astype(float) for grid in np.mgrid[:31, :41])
     truth = np.array([20.3, 14.8, 50000.0, 9.0, 0.4, 0.8, 7.0])

@@ -1,4 +1,4 @@
-"""The believed calibration: against numbers worked by hand and OpenCV's Brown-Conrady."""
+"""The camera model against hand calculations and OpenCV's Brown-Conrady distortion."""
 
 import cv2
 import numpy as np
@@ -87,7 +87,7 @@ def test_rays_and_pixels_are_inverse_functions(lens: tuple[float, ...]) -> None:
 
 
 def test_without_distortion_tangents_are_linear_however_far_off() -> None:
-    """Also where the square of a tangent overflows, so that a distortion of zero would give NaN."""
+    """This holds even if the square of a tangent overflows, where zero distortion could give NaN."""
     xy_px = np.array([[10.0, 20.0], [1e200, -1e200], [810.5, 590.25]])
     found = undistorted(xy_px, 2000.0, 810.5, 590.25, (0.0, 0.0, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(found, (xy_px - [810.5, 590.25]) / 2000, rtol=1e-15)

@@ -1,4 +1,4 @@
-"""The door: what comes in is taken as it is meant or refused in one line, and compiled code sees one type of array."""
+"""Input checks: input is converted or refused in one line, and compiled code gets one type of array."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MATRICES = DTYPES.flatmap(
 
 
 def disguises(array: NDArray) -> list[NDArray]:
-    """The same numbers, laid out in every way that a user's library may: in columns, flipped, read-only, spread."""
+    """The same numbers in every layout that a library may produce: column-major, flipped, read-only, strided."""
     spread = np.empty((2 * len(array), *array.shape[1:]), array.dtype)[::2]
     spread[...] = array
     locked = array.copy()
@@ -59,7 +59,7 @@ def disguises(array: NDArray) -> list[NDArray]:
 
 
 def is_plain(array: NDArray, dtype: Any) -> bool:
-    """Whether compiled code takes it for the one type that it is compiled for."""
+    """Whether an array has the one type and layout that compiled code accepts."""
     flags = array.flags
     return (
         type(array) is np.ndarray
@@ -359,7 +359,7 @@ def test_settings_are_known_and_usable(word: str, value: Any) -> None:
         assert made is None or type(getattr(made, name)) is type(getattr(Settings(), name))
 
 
-def test_a_misspelt_setting_is_answered_with_the_nearest_name() -> None:
+def test_a_misspelled_setting_is_answered_with_the_nearest_name() -> None:
     with pytest.raises(
         ImageError, match="'centroid_sigma' is unknown; did you mean centroid_sigma_px"
     ):

@@ -1,4 +1,4 @@
-"""The robust fit finds SciPy's minimum, whatever the gross errors; its loss is SciPy's."""
+"""The robust fit finds SciPy's minimum for any gross errors, with SciPy's loss function."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small rotations and frames of compiled code, by the interpreter, against SciPy and the axioms of a frame."""
+"""Small rotations and frames of compiled code, run by the interpreter, against SciPy and the axioms of a frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Star or not: what the flags of a blob say, on frames drawn here."""
+"""Classification of blobs by flags, on independently drawn frames."""
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ def star(
 
 
 def sky_frame(rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE):
-    """Light of some stars of 4,000 to 40,000 electrons on a lattice, and where they are."""
+    """Light of stars of 4,000 to 40,000 electrons on a lattice, and their positions."""
     step = 80
     lattice = [
         (x, y) for y in range(60, shape[0] - 40, step) for x in range(60, shape[1] - 40, step)
@@ -162,7 +162,7 @@ def test_smeared_stars_are_no_tracks_and_give_the_frame_s_streak() -> None:
 def smeared_frame(
     rng: np.random.Generator, streak: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of 15 streaks, drawn in steps of less than half a pixel, and where their middles are."""
+    """A frame of 15 streaks, drawn in steps below half a pixel, and their centers."""
     steps = 4 * int(np.hypot(*streak)) + 1
     light = np.zeros(SHAPE)
     xy = sky_frame(rng, 15, 0.7)[1]
@@ -178,7 +178,7 @@ def smeared_frame(
 def test_a_short_streak_is_found_and_centered_without_a_gyro_as_with_one(
     streak: tuple[float, float],
 ) -> None:
-    """A round star in place of a streak of some pixels would double the error, and claim too little."""
+    """A round-star fit of a short streak would double the error and understate it."""
     image, xy = smeared_frame(np.random.default_rng(47), streak)
     alone, guided = (
         detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak)
@@ -200,7 +200,7 @@ def test_a_hot_pixel_in_a_smeared_frame_is_not_taken_for_a_star() -> None:
 
 
 def rolled_frame(seed: int, turn_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A frame of 15 stars while the camera turns by this (3,) about its axes, and their places at mid-exposure."""
+    """A frame of 15 stars while the camera rotates by this (3,) vector, and their positions at mid-exposure."""
     rng = np.random.default_rng(seed)
     light = np.zeros(SHAPE)
     xy = sky_frame(rng, 15, 0.7)[1]
@@ -294,7 +294,7 @@ def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
 
 
 def test_tracks_among_round_stars_are_not_taken_for_a_roll() -> None:
-    """Of three tracks and the sky, any two lines give a turn, but the stars are round."""
+    """Any two of three tracks would give a roll, but the stars are round."""
     rng = np.random.default_rng(50)
     light, _ = sky_frame(rng, 15, 0.7)
     for at, angle in (((20, 20), 0.4), ((560, 20), 2.0), ((20, 430), 1.2)):
@@ -306,7 +306,7 @@ def test_tracks_among_round_stars_are_not_taken_for_a_roll() -> None:
 
 
 def test_three_tracks_are_not_taken_for_a_roll() -> None:
-    """Any two lines agree with some field: five must."""
+    """Any two lines agree with some roll, so five are required."""
     light = np.zeros(SHAPE)
     for at, angle in (((100, 100), 0.4), ((500, 120), 2.0), ((220, 400), 1.2)):
         add_line(light, at, angle)
@@ -356,7 +356,7 @@ def test_long_streaks_that_differ_by_a_few_percent_are_stars() -> None:
 
 
 def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
-    """Ten of 15 trails are just above the noise of a pixel; the bright ones tell how long all are."""
+    """Ten of 15 trails are just above the noise of a pixel; the bright ones give the length of all."""
     image = trailed_frame(61, 60.0, 0.02)
     background = detect.estimate_background(image)
     pieces = detect.detect_blobs(

@@ -1,4 +1,4 @@
-"""The papers' scans: SHEFEX-2's sequential pass against its rival and scipy, the thesis's two thresholds."""
+"""The papers' component scans: SHEFEX-2's sequential pass against another and scipy, the thesis's two thresholds."""
 
 import numpy as np
 import pytest

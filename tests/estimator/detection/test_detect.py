@@ -1,4 +1,4 @@
-"""Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, refusals word by word."""
+"""Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, texts of refusals."""
 
 from dataclasses import replace
 
@@ -195,7 +195,7 @@ def test_compiled_code_gets_one_of_three_types_and_every_value(dtype: str) -> No
         np.testing.assert_array_equal(detect.to_native(image), image.astype(np.float64))
 
 
-def test_the_thesis_s_full_scale_is_that_of_the_given_pixels() -> None:
+def test_the_thesis_s_full_scale_is_that_of_the_pixel_type() -> None:
     image = np.random.default_rng(15).normal(20, 1, (120, 160))
     image[40:50, 40:50] += 60
     assert [len(detect.thesis(image.astype(dtype))) for dtype in ("u1", "u2")] == [1, 0]
@@ -209,7 +209,7 @@ def test_a_boolean_mask_is_a_valid_image() -> None:
     )  # rounding
 
 
-def test_blobs_come_brightest_first_and_the_faintest_are_dropped() -> None:
+def test_blobs_are_sorted_by_brightness_and_the_faintest_dropped() -> None:
     image = np.random.default_rng(11).normal(0, 1, (128, 128))
     for k, peak in enumerate((300, 900, 600)):
         image[20:23, 20 + 40 * k : 23 + 40 * k] += peak
@@ -332,7 +332,7 @@ def test_faint_streaks_are_found_at_full_length(length_px: float, angle_deg: flo
 
 
 def test_a_field_that_only_rolls_is_not_line_filtered() -> None:
-    """Its streaks are those of a turn, and that at the center has no length to grow from."""
+    """Its streaks are those of a roll, whose streak at the center has no length."""
     image, _ = field_of_stars(4)
     turning = replace(detect.default(image), streak_px=(0.0, 0.0), turn_rad=0.01)
     assert detect.in_full_length(image, turning, 5.0, 99, FramePriors()) is turning

@@ -61,7 +61,7 @@ def starry(
 
 
 def assert_inside(blobs: Blobs, most: int) -> None:
-    """Boxes within the frame, brightest first, no more than asked for, known flags."""
+    """Check that boxes are within the frame, sorted by brightness, at most `most`, with known flags."""
     assert len(blobs) <= most
     assert (blobs.box_px >= 0).all()
     assert (blobs.box_px[:, [0, 2]] < WIDTH).all()

@@ -83,7 +83,7 @@ def squared(
 @pytest.mark.slow
 @pytest.mark.parametrize("tracker", [MOUNTED, WALKING], ids=["constant", "walking"])
 @pytest.mark.parametrize("considered", [(), ("mounting",)], ids=["estimated", "considered"])
-def test_errors_of_two_mountings_are_what_the_covariance_says(
+def test_errors_of_two_mountings_match_the_covariance(
     tracker: TrackerModel, considered: tuple[str, ...]
 ) -> None:
     attitude, every, states = squared(tracker, considered, runs=150)
@@ -93,7 +93,7 @@ def test_errors_of_two_mountings_are_what_the_covariance_says(
 
 @pytest.mark.slow
 def test_a_constant_model_does_not_claim_a_walk() -> None:
-    """The same flights as above with mountings that walk: the filter without the walk is wrong about them."""
+    """The same flights with mountings that drift: a filter without the random walk understates their errors."""
     rng = np.random.default_rng(3)
     truth = Rotation.identity()
     mekf = AttitudeFilter(GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, MOUNTED, considered=(), heads=2)
@@ -116,7 +116,7 @@ def test_a_constant_model_does_not_claim_a_walk() -> None:
 
 
 def test_the_second_mounting_tends_to_its_rotation_relative_to_the_first() -> None:
-    """The first is considered and off by 100 arcsec as well: only the difference can be seen at rest."""
+    """The first mounting is considered and off by 100 arcsec, too: at rest only the difference is observable."""
     first, second = np.array([[100.0, 0.0, -50.0], [-40.0, 30.0, 80.0]]) * ARCSEC_RAD
     mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), 1.0, 0.0, tracker=MOUNTED, heads=2)
     for k in range(400):

@@ -1,4 +1,4 @@
-"""Jumps: what the gyros could have missed against solutions that are wrong and agree."""
+"""Jumps: missed rotation against wrong solutions that agree with each other."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Vehicle:
     def update(
         self, attitude: Rotation, turn: np.ndarray | None = None, saturated: slice = slice(0)
     ) -> Update:
-        """One second on: the turn (100, 3) that the gyro measures, and a solution of the attitude."""
+        """Advance one second with gyro increments (100, 3) and a solution of the attitude."""
         t_s = self.second + np.arange(1, 101) / 100
         flags = np.zeros(100, bool)
         flags[saturated] = True
@@ -66,7 +66,7 @@ class Vehicle:
 
 
 def statuses(updates: list[Update]) -> list[tuple[str, int]]:
-    """Each status with the number of times that it follows itself."""
+    """Each status with its number of successive repetitions."""
     return [
         (status, len(list(group))) for status, group in groupby(update.status for update in updates)
     ]
@@ -89,7 +89,7 @@ def test_wrong_solutions_that_agree_do_not_pull_a_filter_with_a_quiet_gyro(
 
 
 def test_the_filter_adopts_a_persistently_wrong_tracker_after_half_a_minute() -> None:
-    """Nothing that the filter knows distinguishes it then from a gyro that failed without a flag."""
+    """The filter cannot distinguish this from a gyro that failed without a flag."""
     vehicle = Vehicle(2)
     vehicle.updates(HOME, 60)
     runs = statuses(vehicle.updates(WRONG, 60))
@@ -124,7 +124,7 @@ def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> Non
 
 
 @pytest.mark.parametrize("wrong", [1, 3])
-def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong: int) -> None:
+def test_a_wrong_first_answer_is_abandoned_once_outnumbered_by_right_ones(wrong: int) -> None:
     vehicle = Vehicle(4, sigma_rad=2.0)  # knows nothing at the start
     assert statuses(vehicle.updates(WRONG, wrong)) == [(USED, wrong)]
     runs = statuses(vehicle.updates(HOME, 30))
@@ -138,7 +138,7 @@ def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong
 
 
 def knock(rate_rad_s: float, samples: int) -> tuple[np.ndarray, Rotation]:
-    """(100, 3) a turn about x as a gyro with a limit measures it, and the attitude after it."""
+    """(100, 3) increments of a limited gyro in a rotation about x, and the attitude after it."""
     rate = np.zeros((100, 3))
     rate[40 : 40 + samples, 0] = rate_rad_s
     after = Rotation.from_rotvec([-rate_rad_s * samples / 100, 0, 0])
@@ -234,7 +234,7 @@ def test_the_odds_match_the_docstring_s_formula() -> None:
     assert math.isfinite(log_odds(jump(since_s=0.0, support=10**6), model))
 
 
-def test_a_small_jump_is_put_to_the_filter_s_own_model_at_the_third_solution() -> None:
+def test_a_small_jump_is_attributed_to_the_filter_s_model_at_the_third_solution() -> None:
     assert log_odds(jump(distance=20.0, agreeing=CONFIRMATIONS), JumpModel()) > ENOUGH
     assert log_odds(jump(distance=40.0, agreeing=CONFIRMATIONS), JumpModel()) < ENOUGH
 

@@ -59,7 +59,7 @@ def assert_sound(state: FilterState) -> None:
     AttitudeFilter.bias_rad_s,
 )
 @given(rng=SEEDS, angle=arrays("f8", (7, 3), elements=some.floats(-10, 10)), full=arrays(bool, 7))
-def test_any_finite_turns_leave_a_unit_attitude_and_a_covariance(
+def test_any_finite_rotation_keeps_a_unit_attitude_and_a_valid_covariance(
     rng: np.random.Generator, angle: NDArray, full: NDArray
 ) -> None:
     mekf = filtering(rng)

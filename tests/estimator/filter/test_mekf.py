@@ -32,14 +32,14 @@ TRACKER_RAD2 = np.diag([10.0, 10.0, 60.0]) ** 2 * ARCSEC_RAD**2
 
 
 def error_rad(state: FilterState, body_from_ref: Rotation) -> np.ndarray:
-    """The small turn in body axes from the filter's attitude to the true one."""
+    """Small rotation in body axes from the filter's attitude to the true one."""
     return (state.body_from_ref * body_from_ref.inv()).as_rotvec()
 
 
 def measured(
     body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.random.Generator | None
 ) -> Rotation:
-    """A solution whose small turn in body axes has that covariance; exact without a generator."""
+    """A solution whose error in body axes has this covariance; exact without a generator."""
     if rng is None:
         return body_from_ref
     noise = np.linalg.cholesky(covariance_rad2) @ rng.normal(size=3)
@@ -201,7 +201,7 @@ def test_after_a_large_correction_the_covariance_is_the_solution_s() -> None:
 
 @dataclass(frozen=True)
 class World:
-    """One draw of a tumble with a wandering bias: what the gyro says, and the truth."""
+    """One draw of a tumble with a random-walk bias: gyro samples and the truth."""
 
     t_s: np.ndarray
     angle_rad: np.ndarray
@@ -466,7 +466,7 @@ class Blow:
         return np.where(blow, 3 * self.limit_rad_s, 0.0)[:, None] * [1.0, 0, 0] + [0.0, 0.02, -0.03]
 
     def body_from_ref(self, t_s: float) -> Rotation:
-        """Three turns at constant rates."""
+        """Attitude of three phases at constant rates."""
         attitude = HOME
         for a, b in ((0.0, 20.4), (20.4, 20.6), (20.6, 40.0)):
             rate = self.rate_rad_s(np.array([(a + b) / 2]))[0]
@@ -476,7 +476,7 @@ class Blow:
     def fly(
         self, mekf: AttitudeFilter, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator
     ) -> list[str]:
-        """A second at a time, with a solution at the end of each; what became of them."""
+        """Fly second by second with a solution after each; return their statuses."""
         statuses = []
         for k in range(from_s, to_s):
             middle_s = k + (np.arange(400) + 0.5) / 400
@@ -551,7 +551,7 @@ def test_saturation_spreads_in_proportion_to_its_time(rate_hz: int) -> None:
 
 
 def turning() -> AttitudeFilter:
-    """A filter that has had three solutions of a steady turn of 0.1 rad/s about z."""
+    """A filter after three solutions of a constant rate of 0.1 rad/s about z."""
     mekf = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
     for k in range(3):
         assert after_turning(mekf, k).status == USED
@@ -561,7 +561,7 @@ def turning() -> AttitudeFilter:
 def after_turning(
     mekf: AttitudeFilter, second: int, jump: Rotation = HOME, outage: int = 0
 ) -> Update:
-    """One second on, and an exact solution; jump * the vehicle's true body_from_ref.
+    """Advance one second and update with jump * the true body_from_ref.
 
     outage : number of gyro samples that are missing at its end
     """
@@ -574,7 +574,7 @@ def after_turning(
 
 
 def true(t_s: float, jump: Rotation = HOME) -> Rotation:
-    """body_from_ref of the steady turn, with a jump of the reference side, which the turn carries along."""
+    """body_from_ref at the constant rate, with a jump on the reference side that rotates along."""
     return Rotation.from_rotvec([0.0, 0.0, -0.1 * t_s]) * jump
 
 
@@ -621,7 +621,7 @@ def test_outliers_that_disagree_are_always_rejected() -> None:
     assert after_turning(mekf, 15).status == USED
 
 
-def test_solutions_that_stand_still_while_the_vehicle_turns_do_not_agree() -> None:
+def test_constant_solutions_of_a_rotating_vehicle_do_not_agree() -> None:
     mekf = turning()
     for k in range(3, 9):
         still = true(k + 1).inv() * wild(0.5, 0, 0)
@@ -700,7 +700,7 @@ def test_an_earlier_residual_is_rotated_with_the_body_before_comparison(
 def test_solutions_confirm_each_other_within_what_the_bias_turns(
     sigmas: float, status: str
 ) -> None:
-    """A bias of b turns the prediction by 3 b in 3 s; the solutions themselves err by less than 1% of that."""
+    """A bias b rotates the prediction by 3 b in 3 s; the solutions err by less than 1 % of that."""
     sigma_bias = 1e-3
     gap_s = 3.0
     drift = [wild(0.0, 0.0, sigmas * sigma_bias * gap_s * k) for k in range(3)]

@@ -215,7 +215,7 @@ def test_a_rotation_decorrelates_the_slow_error_of_the_tracker() -> None:
 def turning_about(
     axis: int, seconds: int, gyro: GyroModel, considered: tuple[str, ...] = ()
 ) -> FilterState:
-    """A turn of 0.3 rad/s about one axis; the gyro has a scale factor of 800 ppm there and no other error."""
+    """State after rotation at 0.3 rad/s about one axis, with a gyro scale factor error of 800 ppm on it alone."""
     mekf = AttitudeFilter(
         gyro, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, considered=considered
     )

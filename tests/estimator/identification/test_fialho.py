@@ -1,4 +1,4 @@
-"""Fialho's triangle: triplets against brute force and theory, its four versions apart, PTASE's success explained."""
+"""Fialho's triangles: triplets against brute force and theory, differences of the four versions, PTASE's success."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ NEVER = 2.0  # a share of the stars that no match has: every triplet is tried
 
 
 def uniform_sky(count: int, seed: int) -> pair_index.PairIndex:
-    """Stars anywhere, their magnitudes as real ones are: three times as many for each magnitude."""
+    """Uniform random stars, three times as many for each magnitude."""
     rng = np.random.default_rng(seed)
     vectors = catalog.unit(rng.normal(size=(count, 3)))
     return pair_index.build(
@@ -57,7 +57,7 @@ def field(
 def counted(
     seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: float, gate: float, optimized: bool
 ) -> int:
-    """How many catalog triplets are like a triangle of three stars, by the module's own search."""
+    """Number of catalog triplets similar to a triangle of three stars, by the module's search."""
     settings = Options(epsilon_mag=gate / MAG_GATE_SIGMA, max_checks=10**12)
     parameters = search_options(eps / np.sqrt(2), settings, NEVER, optimized, False)
     tried = np.zeros(2, np.int64)
@@ -237,7 +237,9 @@ def test_the_fourth_version_measures_the_camera_s_magnitudes(sky: pair_index.Pai
     )
 
 
-def test_without_magnitudes_the_fourth_version_says_so(sky: pair_index.PairIndex) -> None:
+def test_without_magnitudes_the_fourth_version_has_no_magnitude_offset(
+    sky: pair_index.PairIndex,
+) -> None:
     seen, _, _, _ = field(np.random.default_rng(110), sky)
     match = fialho_4(seen, sky, 5 * SIGMA_RAD)
     assert match is not None

@@ -1,4 +1,4 @@
-"""The papers' identifiers on the real sky: what every one of them must do, and must refuse to do."""
+"""The papers' identifiers on the real sky: common requirements and refusals."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -75,7 +75,7 @@ def identify(
 def fields(
     sky: pair_index.PairIndex, count: int, seed: int, least: int = 8, false: int = 0
 ) -> list[Field]:
-    """Random fields with so many true stars at least."""
+    """Random fields with at least this number of true stars."""
     rng = np.random.default_rng(seed)
     out = []
     while len(out) < count:

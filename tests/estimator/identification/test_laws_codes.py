@@ -27,7 +27,7 @@ LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
 def test_a_template_is_the_mean_level_of_an_exposure(
     rng: np.random.Generator, begin_s: float, length_s: float
 ) -> None:
-    """Against two thousand moments of it; a frame of a triggered code shows its bit."""
+    """Against two thousand samples of the exposure; a frame of a triggered code shows its bit."""
     levels = rng.random((5, 7))
     free = LedCode(levels, 0.3)
     triggered = LedCode(levels)
@@ -123,7 +123,7 @@ def field(sphere: led_naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, F
 @law(led_naming.identify)
 @given(rng=SEEDS, known=some.floats(0, 40), lied=some.integers(0, 1))
 def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied: int) -> None:
-    """Codes that know each LED by `known`, and in some cases one that claims another: then no attitude is wrong."""
+    """Codes that identify each LED by `known`, in some cases one of them wrongly: no attitude is wrong."""
     sphere = dome(100)
     truth = turn(rng, 0.3)
     seen, xy_px = field(sphere, truth)

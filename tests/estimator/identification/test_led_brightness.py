@@ -1,4 +1,4 @@
-"""Brightness as evidence for an LED: a fair Bayes factor, and a regular dome that only brightness can tell apart."""
+"""Brightness as evidence for an LED: its Bayes factor, and a regular dome identified by brightness alone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LEVELS = np.array([1.0, 0.5, 0.25])
 
 
 def grid(levels: Floats | None, pitch_m: float = 0.03, side: int = 21) -> LedMap:
-    """LEDs on a square grid on a flat panel, which looks the same everywhere; with fluxes at random levels."""
+    """LEDs on a square grid on a flat panel with random flux levels; positions alone are ambiguous."""
     axis = pitch_m * (np.arange(side) - side // 2)
     place_m = np.column_stack(
         [*(one.ravel() for one in np.meshgrid(axis, axis)), np.full(side**2, 1.2192)]

@@ -34,7 +34,7 @@ ERROR_M = 0.2e-3
 
 
 def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0) -> LedMap:
-    """So many LEDs on a surface, anywhere but never near one another."""
+    """This number of LEDs at random places on a surface with a minimum distance."""
     rng = np.random.default_rng(seed)
     z = 1 - rng.random(40 * count) * (1 - np.cos(np.radians(cap_deg)))
     azimuth = rng.uniform(0, 2 * np.pi, len(z))
@@ -54,7 +54,7 @@ def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float
 
 
 def surveyed(leds: LedMap, seed: int) -> LedMap:
-    """The map in the tracker's head: every LED out of place by ERROR_M along each axis."""
+    """The tracker's map: every LED is displaced by ERROR_M along each axis."""
     error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
     return LedMap(
         leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M
@@ -62,7 +62,7 @@ def surveyed(leds: LedMap, seed: int) -> LedMap:
 
 
 def pose(rng: np.random.Generator, tilt_deg: float = 28.0) -> Rotation:
-    """body_from_lab: any yaw, tilts to tilt_deg."""
+    """Random body_from_lab with any yaw and tilts up to tilt_deg."""
     tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(tilt_deg))))
     about, yaw = rng.uniform(0, 2 * np.pi, 2)
     tilt_rotation = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0]))
@@ -76,7 +76,7 @@ def lights(
     dead: float = 0.0,
     false: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Pixels in any order, and which LED each is; -1 for a reflection."""
+    """Pixels in random order and the LED of each; -1 for a reflection."""
     xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
     seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9), 12))
     seen = seen[rng.random(len(seen)) >= dead]
@@ -92,7 +92,7 @@ def identified(pixels: Floats, dome: DomeIndex) -> StarMatch | str:
 
 
 def names_right(match: StarMatch, names: Floats) -> bool:
-    """A reflection beside a dead LED may pass for it; no light may bear another LED's name."""
+    """Whether no light has another LED's name; a reflection beside a dead LED may have its name."""
     named = names[match.observed]
     return bool(np.all((named == match.star) | (named < 0)) and np.any(named >= 0))
 
@@ -125,7 +125,7 @@ def test_equal_leds_are_identified_and_never_wrongly(surface, dead, false, least
 
 
 def test_an_accurate_survey_identifies_leds_of_which_half_are_dead():
-    """What limits that is how many false attitudes fit: the square of an LED's error for each light."""
+    """The number of fitting false attitudes sets the limit: it scales with the square of an LED's error per light."""
     truth = spread(1400, OVAL, 4)
     dome = build_dome_index(truth, LEVER, CAMERA)
     rng = np.random.default_rng(5)
@@ -139,7 +139,7 @@ def test_an_accurate_survey_identifies_leds_of_which_half_are_dead():
 
 @pytest.mark.long
 def test_random_lights_give_no_attitude():
-    """And evidence of x powers of ten is met in one such frame of 10^x at most (Markov): x = 1, 200 frames."""
+    """Evidence of x powers of ten occurs in at most one of 10^x such frames (Markov): x = 1, 200 frames."""
     leds = surveyed(spread(1400, OVAL, 6), 7)
     dome = build_dome_index(leds, LEVER, CAMERA)
     rng = np.random.default_rng(8)
@@ -156,7 +156,7 @@ def test_random_lights_give_no_attitude():
 
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
 def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
-    """By which a pair is looked up: both rays carried to the one sphere, against the index's angle."""
+    """The lookup angle of a pair, with both rays extended to one sphere, against the index's angle."""
     leds = spread(600, surface, 9)
     dome = build_dome_index(leds, LEVER, CAMERA)
     rng = np.random.default_rng(10)
@@ -181,7 +181,7 @@ def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
 
 
 def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
-    """Patch boards of 3x3 LEDs around the apex, one at each azimuth, all alike; and perhaps one LED more."""
+    """Equal patch boards of 3x3 LEDs around the apex, one per azimuth, with an optional single LED."""
     lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
     places = [
         Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
@@ -231,7 +231,7 @@ def test_too_few_lights_give_no_attitude():
 
 
 @pytest.mark.long
-def test_the_covariance_holds_the_map_s_own_errors():
+def test_the_covariance_includes_the_map_s_errors():
     """NEES over maps drawn anew: chi-square of three degrees, mean 3 +- sqrt(6 / 100)."""
     rng = np.random.default_rng(14)
     nees = []
@@ -251,7 +251,7 @@ def test_the_covariance_holds_the_map_s_own_errors():
 
 
 def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
-    """One blob between them, nearer to the brighter: in neither's place by 10 px, where the others are to .05 px."""
+    """One blob between them is 10 px from both, while the others are accurate to 0.05 px."""
     lone = spread(1400, OVAL, 16)
     beside = lone.position_m + np.array([0.0025, 0, 0])  # 26 px
     leds = LedMap(np.arange(2800), np.concatenate([lone.position_m, beside]), *OVAL)
@@ -279,8 +279,8 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
 
 
 @pytest.mark.long
-def test_the_covariance_holds_a_lever_s_error():
-    """A pupil believed aside by 1 mm: .047 deg at 48 in, far beyond the lights' own noise, and as it is claimed."""
+def test_the_covariance_includes_the_lever_s_error():
+    """A pupil position error of 1 mm is 0.047 deg at 48 in, far beyond the lights' noise, and is claimed."""
     truth = spread(1400, OVAL, 18)
     rng = np.random.default_rng(19)
     nees = []
@@ -300,7 +300,7 @@ def test_the_covariance_holds_a_lever_s_error():
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
 
 
-def test_the_index_knows_the_errors_and_the_field_as_angles() -> None:
+def test_the_index_converts_errors_and_field_to_angles() -> None:
     """Errors of LEDs and pupil over the least distance from the camera; the sensor's area in tangents squared."""
     leds = spread(60, OVAL, seed=1)
     lever = Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)
@@ -473,7 +473,7 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
 
 
 def uncalibrated(leds: LedMap, ratio: float) -> DomeTracker:
-    """A tracker that assumes a focal length `ratio` times too short, and knows no better."""
+    """A tracker whose assumed focal length is `ratio` times too short, with no uncertainty."""
     settings = Settings(
         identifier="non_dimensional", solver="rotation_only", centroid_sigma_px=NOISE_PX
     )
@@ -530,7 +530,7 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
 
 @pytest.mark.slow
 def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() -> None:
-    """What the search with a free focal length is for: the angles of all pairs are wrong."""
+    """All pair angles are wrong, which only the search with a free focal length handles."""
     truth = spread(1400, OVAL, 21)
     rng = np.random.default_rng(22)
     leds = surveyed(truth, 23)
@@ -552,7 +552,7 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
 
 @pytest.mark.long
 def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
-    """As for a calibrated camera: evidence of x powers of ten is met in one frame of 10^x at most."""
+    """As for a calibrated camera, evidence of x powers of ten occurs in at most one of 10^x frames."""
     dome = build_dome_index(surveyed(spread(1400, OVAL, 6), 7), LEVER, CAMERA.zoomed(0.88))
     rng = np.random.default_rng(8)
     dex = []

@@ -125,7 +125,7 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
 
 
 def test_the_tail_of_chance_matches_is_binomial_down_to_the_least_number() -> None:
-    """Beyond 1e-300, which doubles hardly hold, it stays there: a finite evidence."""
+    """Probabilities below 1e-300 are clipped, so that the evidence is finite."""
     chance = interpreted("estimator.identification.chance")
     for trials, hits, p in ((10, 4, 0.01), (30, 12, 1e-4), (5, 5, 0.3), (40, 1, 1e-3)):
         wanted = stats.binom.logsf(hits - 1, trials, p) / np.log(10)
@@ -198,7 +198,7 @@ def test_the_sides_of_a_triangle_must_agree_on_one_focal_length(
 @pytest.mark.parametrize(("share", "hypotheses"), [(0.9, 1), (1.1, 0)])
 @pytest.mark.parametrize("side", range(3))
 @pytest.mark.parametrize("unknown", [False, True])
-def test_a_side_may_be_off_by_both_directions_errors_and_its_stretch(
+def test_a_side_s_tolerance_includes_both_direction_errors_and_its_stretch(
     unknown: bool, side: int, share: float, hypotheses: int
 ) -> None:
     """sqrt(2) tolerances beyond the stretch; a third of the stretch after one factor for the whole perimeter."""
@@ -280,7 +280,7 @@ def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
 def crossing_area_sr(
     center: Floats, rings: list[tuple[Floats, float]], step: float = 2e-5
 ) -> float:
-    """Area where rings about stars cross: each of directions as far from its star as `center`, to a half-width."""
+    """Area of the intersection of rings about stars, each with the radius of `center` and a half-width."""
     steps = np.arange(-150, 151) * step
     across, down = np.linalg.svd(center[None])[2][1:]
     places = center + steps[:, None, None] * across + steps[:, None] * down
@@ -345,7 +345,7 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
 
 
 def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
-    """Among many stars and with wide gates, by all of them: angles, side of the base, least sum of differences."""
+    """Against a search of all stars with wide gates: angles, side of the base, least sum of differences."""
     rng = np.random.default_rng(9)
     found = 0
     for _ in range(20):
@@ -447,7 +447,7 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
         assert primary.area_sr[k] == pytest.approx(np.pi * primary.radius_rad[k] ** 2, rel=1e-12)
 
 
-def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
+def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
     """Catalog stars in the field and about the pair, of about the magnitude, over the area that they share."""
     rng = np.random.default_rng(7)
     seen = FIVE[:4]
@@ -565,7 +565,7 @@ def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -
 
 
 @pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
-def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(
+def test_saa_s_best_match_must_be_1e5_times_as_likely_as_contradicting_ones(
     ratio: float, accepted: bool
 ) -> None:
     """A cost is a squared number of standard deviations: the likelihood is exp(-cost / 2)."""
@@ -620,7 +620,7 @@ def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(
 def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(
     share: float, matched: bool
 ) -> None:
-    """Of twice as many lights as there are stars, all stars match."""
+    """All stars match among twice as many lights."""
     rays, _, rows, index, _ = field(1)
     strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
     options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)

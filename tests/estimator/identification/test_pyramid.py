@@ -1,4 +1,4 @@
-"""Lost in space: Monte Carlo over the real sky, with noise, false stars, mirrors and nothing but false stars."""
+"""Lost in space: Monte Carlo over the real sky with noise, false stars, mirror images and false stars alone."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ UPSIDE_DOWN = np.array([-1.0, 1.0, 1.0])
 
 
 def sky_index(stars_a_field: float) -> pair_index.PairIndex:
-    """The real sky's brightest, so many a field on average, doubles merged."""
+    """Brightest stars of the real sky with this mean number per field, doubles merged."""
     stars = catalog.read(FILE)
     bright = catalog.brighter_than(stars, catalog.limit_for_density(stars, FIELD_SR, stars_a_field))
     merged = catalog.merge_doubles(bright, 3 / CAMERA.focal_px)
@@ -41,7 +41,7 @@ def bright_sky() -> pair_index.PairIndex:
 
 
 class Field:
-    """What a camera sees: pixels, brightest first, and the catalog row of each (-1: a false star)."""
+    """Observed pixels, brightest first, with the catalog row of each (-1: a false star)."""
 
     def __init__(
         self, rng: np.random.Generator, vectors: Floats, noise_px: float, false: float
@@ -62,12 +62,12 @@ class Field:
         self.star = self.star[order]
 
     def off_px(self, match: StarMatch) -> float:
-        """How far the match's boresight is from the true one."""
+        """Distance, px, of the match's boresight from the true one."""
         sights = [r.inv().apply([0, 0, 1]) for r in (match.cam_from_ref, self.cam_from_icrs)]
         return float(np.linalg.norm(sights[0] - sights[1]) * CAMERA.focal_px)
 
     def right(self, match: StarMatch) -> float:
-        """Share of the matched true stars that were given their own name."""
+        """Share of the matched true stars with the right name."""
         named = self.star[match.observed]
         return float(np.mean((match.star == named)[named >= 0]))
 

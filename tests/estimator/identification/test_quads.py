@@ -31,7 +31,7 @@ HEIGHT_RAD = np.radians(8.0)
 
 @functools.cache
 def all_quads() -> quad_index.QuadIndex:
-    """The quads of the sky: built in a test, as each worker would compile them during the collection."""
+    """The quads of the sky; a fixture, so that workers do not compile them during collection."""
     return quad_index.build(SKY, HEIGHT_RAD)
 
 

@@ -35,7 +35,7 @@ SKY = sky_index.build_without_pairs(TRUTH.inv().apply(RAYS), np.arange(1.0, 9.0)
 
 
 def seen(tangent: np.ndarray) -> star_evidence.Detections:
-    """Detections without magnitudes, as accurate along as across."""
+    """Detections without magnitudes and with isotropic errors."""
     sigma = np.full(len(tangent), SIGMA)
     weight = np.column_stack([sigma**-2, sigma**-2, 0 * sigma])
     return star_evidence.Detections(
@@ -44,7 +44,7 @@ def seen(tangent: np.ndarray) -> star_evidence.Detections:
 
 
 def evaluated(tangent: np.ndarray) -> star_evidence.Hypothesis:
-    """The hypothesis of the true attitude; its evidence is not limited."""
+    """Hypothesis of the true attitude, without a limit of its evidence."""
     gates = np.full(len(tangent), 0.01)
     return star_evidence.evaluate(seen(tangent), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
 
@@ -156,7 +156,7 @@ def test_only_stars_within_three_and_a_half_sigma_match(sigmas: float, matched: 
     assert len(hypothesis.star) == matched
 
 
-def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
+def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     """A normal law of the smoothing about each star's magnitude; below and above all stars, that of the end."""
     rng = np.random.default_rng(2)
     vectors = rng.normal(size=(2000, 3))

@@ -82,7 +82,7 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
 def test_a_field_is_identified_if_its_brightest_lights_are_false(
     share: float, brighter: bool
 ) -> None:
-    """Half of the lights false and brighter than any star, or two in three: the search begins with false ones alone."""
+    """Half or two thirds of the lights are false and brighter than any star, so the search starts with false ones."""
     rng = np.random.default_rng(14)
     solved = 0
     for _ in range(40):
@@ -107,7 +107,7 @@ def test_a_field_is_identified_if_its_brightest_lights_are_false(
 
 
 def test_lights_with_elongated_errors_are_weighted_by_their_covariance() -> None:
-    """Smeared stars: about y, which errors along x turn, the attitude errs as it says, and about x too."""
+    """Smeared stars: the attitude errors about y (from errors along x) and about x match their covariance."""
     rng = np.random.default_rng(12)
     scaled = []
     along = 4 * SIGMA
@@ -187,7 +187,7 @@ def test_the_covariance_matches_the_scatter(zoom: float) -> None:
 
 
 def zoom_sigma(truth: Rotation, row, zoom: float) -> float:
-    """Of log zoom where the attitude is unknown too: least squares with slopes by differences."""
+    """Standard deviation of log zoom with unknown attitude: least squares with numerical derivatives."""
 
     def model(p):
         x, y, z = (Rotation.from_rotvec(p[:3]) * truth).apply(VECTORS[row]).T
@@ -218,7 +218,7 @@ def test_a_mirrored_sky_is_refused() -> None:
 
 
 def test_a_sky_that_repeats_is_ambiguous() -> None:
-    """Stars that stand twice in the catalog are two attitudes: beyond chance, not decisive, and refused."""
+    """Stars listed twice in the catalog give two attitudes: significant, ambiguous, and refused."""
     rng = np.random.default_rng(7)
     sparse, sparse_mag = random_sky(300, 8)
     once = sky_index.build(sparse, sparse_mag, WIDE_RAD)
@@ -238,7 +238,7 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
 
 
 def test_one_light_of_wrong_brightness_costs_little_evidence() -> None:
-    """A variable star, or a planet on a star: the others carry the answer, and it is matched all the same."""
+    """A variable star, or a planet in front of a star, is matched and does not prevent the answer."""
     rng = np.random.default_rng(9)
     for _ in range(20):
         truth = Rotation.random(rng=rng)
@@ -267,7 +267,7 @@ def test_the_normal_equations_are_solved(seed: int) -> None:
     st.sampled_from([None, [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]]),
 )
 def test_a_matrix_has_the_rotation_of_its_quaternion(seed: int, axis) -> None:
-    """Half turns, where the scalar part vanishes, as well."""
+    """This includes half turns, where the scalar part vanishes."""
     rotation = (
         Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
     )
@@ -347,7 +347,7 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
 
 
-def test_pairs_come_by_length_and_rarity_and_none_twice() -> None:
+def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
     detections = unequal()
     length = PLAIN._pair_lengths(detections)
     rarity = PLAIN._rarity(detections, SKY)
@@ -453,7 +453,7 @@ def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
     assert len(found.star) == matches
 
 
-def test_the_limiting_magnitude_is_that_of_the_median_light_of_all() -> None:
+def test_the_limiting_magnitude_is_taken_at_the_median_light() -> None:
     lens = Sensor(1000.0, (0.0, 0.0), (0.0,) * 5, FIELD, 20.0, 0.25)
     sigma_px = np.full(5, 0.1)
     flux = np.array([900.0, 500.0, 300.0, 200.0, 100.0])

@@ -1,4 +1,4 @@
-"""Exposure control: every branch of SHEFEX-2's chart, and the loop closed on rendered frames past a bright intruder."""
+"""Exposure control: every branch of SHEFEX-2's chart, and closed-loop frames with a bright intruder."""
 
 from dataclasses import replace
 
@@ -121,13 +121,13 @@ def test_boxes_beyond_the_image_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def lab() -> Lab:
-    """A field without bright stars, which a glare hides altogether."""
+    """A field without bright stars, fully hidden by glare."""
     coma = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}
     return build_lab(loader.load("shefex2", coma | {"exposure.frames": "34"}))
 
 
 def lit(lab: Lab, glare_e_s: float) -> Lab:
-    """The lab with light from a body at the baffle's edge on the whole chip."""
+    """The lab with stray light from a body at the baffle's edge on the whole chip."""
     glow = (UniformGlowConfig(kind="uniform", e_s=glare_e_s),) if glare_e_s else ()
     return lab.with_light(BackgroundLight(glow))
 
@@ -140,7 +140,7 @@ def exposed(lab: Lab, time_s: float) -> Lab:
 def flown(
     lab: Lab, glare_e_s: list[float], start_s: float, control: Control
 ) -> tuple[list[NextExposure], list[Observation]]:
-    """Frame after frame: taken with the exposure that the chart asked for, under the glare of its moment."""
+    """Frames exposed for the time that the chart commands, each under its glare."""
     state = NextExposure(start_s)
     states = []
     seen = []
@@ -189,7 +189,7 @@ def test_without_the_mean_the_same_intruder_would_lengthen_it(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_one_planet_shortens_nothing_and_four_do(lab: Lab) -> None:
+def test_one_planet_does_not_shorten_the_exposure_and_four_do(lab: Lab) -> None:
     # Strengths multiplied until the brightest stars of the field saturate: one of them, then many.
     truth = render_at_rest(lab.camera, lab.start)[1]
     inside = np.flatnonzero(np.isin(lab.camera.sources.id, truth.sources.id))

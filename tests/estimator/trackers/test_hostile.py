@@ -1,4 +1,4 @@
-"""Whatever array comes in: an answer or one line, and no attitude from what is no sky."""
+"""Any array gives an answer or one error line, and images without a sky give no attitude."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_any_pixels_and_lens_give_directions_of_their_shape(xy_px: NDArray, k1: 
 def test_hostile_pictures_are_refused(
     monkeypatch: pytest.MonkeyPatch, count: int, seed: int
 ) -> None:
-    """No attitude but a true one, no exception, no second over two a megapixel, no eleventh frame of memory."""
+    """No wrong attitude, no exception, at most two seconds per megapixel, and memory of at most ten frames."""
     monkeypatch.setattr(hostile, "SEARCHED", 0.0)  # at all focal lengths: see the benchmark
     verdicts = hostile.judged(count, seed)
     assert sum(one.looked for one in verdicts.values()) == count
@@ -143,7 +143,7 @@ def test_hostile_pictures_are_refused(
 
 @pytest.mark.parametrize("frames", [3, pytest.param(1000, marks=pytest.mark.long)])
 def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> None:
-    """The true sky of each is recognized, so that the mirror alone is what is refused."""
+    """The unmirrored sky of each is solved, so only the mirror image is the reason of the refusal."""
     camera = hostile.camera()
     eye = StarTracker(camera, stars, stars.vectors)
     right = 0

@@ -1,4 +1,4 @@
-"""Laws of the tracker of coded LEDs: names are right or refused, at rest and turning, with failed bits."""
+"""Laws of the tracker of coded LEDs: names are right or refused, at rest and rotating, with failed bits."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_lights_are_named_correctly_by_their_codes_or_not_at_all(
 def test_light_noisier_than_declared_gives_no_wrong_attitude(
     rng: np.random.Generator, bit_time_s: float | None, noise: float
 ) -> None:
-    """Two and three times `flux_sigma`, and up to seven lights that may be any LED's."""
+    """With two and three times `flux_sigma`, and up to seven random lights."""
     eye = tracker(0.5, bit_time_s)
     body_from_lab = turn(rng, 0.3)
     late_s = rng.uniform(0, 0.5)
@@ -106,7 +106,7 @@ def test_light_noisier_than_declared_gives_no_wrong_attitude(
 @law(CodedTracker.solve_centroids, slow=True)
 @given(rng=SEEDS)
 def test_a_code_of_other_leds_gives_no_attitude(rng: np.random.Generator) -> None:
-    """The lights blink words that no LED has."""
+    """The lights show code words that no LED has."""
     eye = tracker(0.5)
     body_from_lab = turn(rng, 0.3)
     others = rng.integers(0, 2, WORDS.shape)

@@ -1,4 +1,4 @@
-"""Double stars do not pull the attitude, and the covariance knows of them."""
+"""Double stars do not bias the attitude, and the covariance includes them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_information_matrix_has_the_weights_as_elements(seed: int) -> None:
 
 @law(misfit.prediction_by_others)
 @given(seed=some.integers(0, 10**6), count=some.integers(4, 12))
-def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int) -> None:
+def test_a_star_s_prediction_comes_from_a_fit_without_it(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     jacobian = rng.standard_normal((count, 2, 3))
     residual = rng.standard_normal((count, 2))

@@ -35,7 +35,7 @@ RAYS = arrays("f8", (5, 3), elements=ANY)
 
 
 def lever(rng: np.random.Generator) -> Lever:
-    """Up to 0.35 m out, nearly up, the camera nearly as the body."""
+    """A random lever of up to 0.35 m, nearly upward, with the camera nearly aligned to the body."""
     along = np.array([0.0, 0.0, rng.uniform(0.1, 0.35)]) + rng.normal(0, 0.01, 3)
     return Lever(along, turn(rng, 0.05))
 
@@ -43,7 +43,7 @@ def lever(rng: np.random.Generator) -> Lever:
 def seen_through(
     rng: np.random.Generator, surface: LedMap, arm: Lever, body_from_lab: Rotation, count: int
 ) -> tuple[LedMap, Floats]:
-    """Lights of a surface where a camera's rays to anywhere on its chip meet it, and those rays."""
+    """Lights where rays through random pixels meet a surface, and those rays."""
     rays = CAMERA.rays(rng.uniform(0, [639, 479], (count, 2)))
     lab_from_body = body_from_lab.inv()
     origin = lab_from_body.apply(arm.camera_body_m)
@@ -54,7 +54,7 @@ def seen_through(
 
 
 def even(count: int) -> LedMap:
-    """Lights all over the sphere's upper part, by a golden spiral with a wobble that repeats nowhere."""
+    """Lights over the sphere's upper part on a golden spiral with nonrepeating perturbations."""
     rng = np.random.default_rng(count)
     z = 1 - (np.arange(count) + 0.5) / count * 0.4
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
@@ -130,7 +130,7 @@ def test_exact_solves_find_the_truth(
 def test_a_focal_length_is_fitted_with_the_attitude(
     rng: np.random.Generator, count: int, ratio: float, sigma: float
 ) -> None:
-    """Exactly from exact rays, from 2 deg off, whatever the error that all rays have."""
+    """Exact rays give the exact attitude from a start 2 deg off for any assumed error."""
     arm = lever(rng)
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
@@ -372,7 +372,7 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
     scale=some.floats(0.1, 10),
     deviation=some.sampled_from([home_position.pooled, home_position.averaged]),
 )
-def test_a_spread_knows_scale_and_no_shift(
+def test_a_spread_scales_with_its_data_and_ignores_shifts(
     rng: np.random.Generator, shift: float, scale: float, deviation: Callable[..., Floats]
 ) -> None:
     value = rng.normal(size=40)

@@ -1,4 +1,4 @@
-"""The covariance is honest where the error model is wrong: NEES of centroids of random fields."""
+"""The covariance is correct under a wrong error model: NEES over centroids of random fields."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tracker() -> StarTracker:
 def field(
     tracker: StarTracker, seed: int, lens: Camera, claimed: float = 1.0
 ) -> tuple[Rotation, Centroids]:
-    """A random attitude and its stars' centroids through a lens, whose noise is claimed too small or too great."""
+    """A random attitude and its stars' centroids through a lens, with under- or overstated noise."""
     rng = np.random.default_rng([7, seed])
     truth = Rotation.random(rng=rng)
     stars = tracker.stars

@@ -1,4 +1,4 @@
-"""Laws of the trackers under a rolling shutter: stars and LEDs, with a gyro, with streaks, with neither."""
+"""Laws of the trackers under a rolling shutter: stars and LEDs, with a gyro, with streaks, and without both."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tracker() -> StarTracker:
 def star_frame(
     tracker: StarTracker, seed: int, rate_deg_s: Floats = RATE_DEG_S
 ) -> tuple[Moving, Centroids]:
-    """A field of the catalog before a turning camera, and its exact centroids."""
+    """A catalog field before a rotating camera and its exact centroids."""
     truth = Rotation.random(rng=np.random.default_rng(seed))
     _, xy_px = tracker.field_matcher.in_field(WIDE, truth)
     xy_px = xy_px[WIDE.contains(xy_px, 120.0)]
@@ -107,7 +107,7 @@ def test_an_uncorrected_shear_rotates_the_field_as_predicted(tracker: StarTracke
 def test_of_two_signs_the_one_with_more_evidence_is_kept(
     tracker: StarTracker, monkeypatch: pytest.MonkeyPatch, sign: int
 ) -> None:
-    """A part of the stars matches with the wrong sign, too, in whichever order the two are tried."""
+    """Some stars also match with the wrong sign; the result does not depend on the order of trials."""
     seen, found = star_frame(tracker, 1, sign * RATE_DEG_S)
     tried = []
 

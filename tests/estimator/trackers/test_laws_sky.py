@@ -56,7 +56,7 @@ RAYS = arrays("f8", some.tuples(some.integers(0, 12), some.just(3)), elements=AN
 
 
 class World:
-    """A sky with its index, and what a camera sees of it."""
+    """A sky with its index, and a camera's observations of it."""
 
     def __init__(self, rng: np.random.Generator, count: int = 800) -> None:
         self.vectors = units(rng, count)
@@ -90,7 +90,7 @@ class World:
 def test_identified_stars_are_the_true_stars(
     rng: np.random.Generator, name: str, false: int, with_magnitudes: bool
 ) -> None:
-    """Each star once, none of the false ones, the attitude that the stars have: or nothing."""
+    """Each star is matched once, false ones never, with the true attitude; or there is no match."""
     world = World(rng)
     tolerance_rad = 2e-4
     seen = np.concatenate([world.seen, CAMERA.rays(rng.uniform(0, [639, 479], (false, 2)))])
@@ -137,7 +137,7 @@ def test_random_directions_match_each_star_once_or_none(
 @law(candidates)
 @given(rng=SEEDS, steps=some.integers(-2, 2))
 def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, steps: int) -> None:
-    """The focal length is off by whole steps of the search, or known."""
+    """The focal length is known or off by whole steps of the search."""
     world = World(rng)
     light = 10 ** (-0.4 * world.mag[world.star])
     centroids = Centroids(CAMERA.pixels(world.seen), np.full(len(light), 0.05), light)
@@ -223,7 +223,7 @@ def eye() -> StarTracker:
 def seen_by(
     eye: StarTracker, rng: np.random.Generator, truth: Rotation
 ) -> tuple[Centroids, NDArray]:
-    """The field's stars, brightest first, each a tenth of a pixel off, and their rows."""
+    """The field's stars, brightest first, with errors of a tenth of a pixel, and their rows."""
     rows, xy = eye.field_matcher.in_field(CAMERA, truth)
     inside = CAMERA.contains(xy, 2)
     rows = rows[inside]

@@ -1,4 +1,4 @@
-"""The warm-up's frames: of every type of pixel that loops are compiled for, with spots where they belong."""
+"""The warm-up's frames: every compiled pixel type, with spots at their positions."""
 
 from __future__ import annotations
 

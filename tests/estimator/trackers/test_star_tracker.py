@@ -1,4 +1,4 @@
-"""The sequence of stages: fed with true centroids, with rendered frames, and with what must be refused."""
+"""The sequence of stages with true centroids, rendered frames, and input to be refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def tracker() -> StarTracker:
 
 @pytest.fixture(scope="module")
 def uncertain() -> StarTracker:
-    """One that knows its focal length to 5 % only, and believes it 3 % too long."""
+    """A tracker with a focal length assumed 3 % too long and uncertain to 5 %."""
     stars = catalog.read(FILE)
     believed = CAMERA.zoomed(1.03)
     return StarTracker(believed, stars, catalog.apparent(stars, OBSERVER), focal_uncertainty=0.05)
@@ -42,7 +42,7 @@ def uncertain() -> StarTracker:
 def starfield(
     tracker: StarTracker, rng: np.random.Generator, lens: Camera, limit_mag: float = 6.0
 ) -> tuple[Rotation, Floats, Floats]:
-    """A random attitude, the pixels of the stars to a magnitude, brightest first, and their light."""
+    """A random attitude, and pixels and light of the stars to a magnitude, brightest first."""
     truth = Rotation.random(rng=rng)
     bright = catalog.brighter_than(tracker.stars, limit_mag)
     pixels = np.nan_to_num(lens.pixels(truth.apply(bright.vectors)), nan=-1e9)
@@ -221,7 +221,7 @@ def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> N
 
 
 def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(uncertain: StarTracker) -> None:
-    """Where the lens may be off by as much as the lamp is from the star, its brightness alone tells them apart."""
+    """If the lens may be off by the distance of the lamp from the star, only brightness distinguishes them."""
     rng = np.random.default_rng(96)
     for _ in range(5):
         truth, pixels, light = starfield(uncertain, rng, CAMERA)
@@ -272,7 +272,7 @@ def test_the_residual_is_the_rms_of_the_coordinates(
 
 
 def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
-    """A rolling shutter shears the image of a turning camera: the stars of a part of the field fit an attitude."""
+    """A rolling shutter shears the image of a rotating camera, so stars of only a part of the field fit."""
     rng = np.random.default_rng(97)
     solved = 0
     for _ in range(20):
@@ -319,7 +319,7 @@ SHAPES = {
 
 
 def dome(shape: str, count: int = 2500) -> LedMap:
-    """Random LEDs on the roof of a dome, 40 degrees about the vertical, none nearer than 5 mm to another."""
+    """Random LEDs within 40 deg of the dome's apex, at least 5 mm apart."""
     rng = np.random.default_rng(94)
     z = rng.uniform(np.cos(np.radians(40)), 1, count)
     around = rng.uniform(0, 2 * np.pi, count)

@@ -1,4 +1,4 @@
-"""Tracking: it goes where the stars go, says how it is, and finds its way again when it is lost."""
+"""Tracking mode: following stars, health flags, and recovery after loss."""
 
 from pathlib import Path
 
@@ -173,9 +173,9 @@ def test_an_outdated_attitude_is_not_used_for_prediction(tracker: StarTracker) -
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
-    """Dark frames, frames that never come, knocks unseen by the gyros and stale predictions, one after the other.
+    """Successive dark frames, missing frames, knocks unseen by the gyros and outdated predictions.
 
-    Every frame with stars is solved, right; after a gap shorter than the memory the gyros' turn leads on.
+    Every frame with stars is solved correctly; after a short gap the gyros' rotation predicts the attitude.
     """
     rng = np.random.default_rng(seed)
     follower = TrackingMode(tracker)
@@ -216,7 +216,7 @@ def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
 
 
 def clouded(tracker: StarTracker, share: float) -> TrackedReport:
-    """The second frame in tracking mode, with a cloud over all but this share of the stars in the windows."""
+    """The second frame in tracking mode, with clouds over all but this share of the stars in windows."""
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)
     image = photograph(tracker, START, 1)
@@ -248,7 +248,7 @@ def test_saturated_and_smeared_stars_have_their_statuses(tracker: StarTracker) -
 
 
 def shifted(x_px: float) -> Rotation:
-    """The start, turned until the stars stand so much to the right."""
+    """The initial attitude rotated to shift the stars this far, px, to the right."""
     return Rotation.from_rotvec([0, x_px / CAMERA.focal_px, 0]) * START
 
 

@@ -1,4 +1,4 @@
-"""After the warm-up no frame compiles anything, however its array is laid out; nor do centroids."""
+"""After the warm-up neither frames of any array layout nor centroids compile anything."""
 
 from __future__ import annotations
 

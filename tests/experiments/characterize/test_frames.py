@@ -1,4 +1,4 @@
-"""Frames from files: exposures and temperatures wherever a lab keeps them, and one line for frames that do not tell."""
+"""Frames from files: sources of exposure and temperature, and one error line for uninformative frames."""
 
 from __future__ import annotations
 

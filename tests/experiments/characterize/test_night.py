@@ -1,4 +1,4 @@
-"""Star images over the field: fits of images that numpy draws, and frames that do not tell."""
+"""Star images over the field: fits of images drawn by numpy, and uninformative frames."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def gaussian(at: Floats, center: float, sigma: float) -> Floats:
 def drawn(
     rng: np.random.Generator, sigma: float, corner: float, trail_px: float = 0.0
 ) -> tuple[Floats, Floats]:
-    """A frame without black level of some 250 stars on a grid, and their places; a trail along the rows."""
+    """A frame without black level of some 250 stars on a grid, and their places; trails are along the rows."""
     places = np.stack(np.meshgrid(*(np.arange(22.0, SIDE_PX - 22, 42),) * 2), axis=-1).reshape(
         -1, 2
     )
@@ -193,7 +193,7 @@ def transfer() -> Transfer:
 
 
 def rendered(folder: Path, camera: dict[str, Any], seed: int) -> list[tuple[Frame, Truth]]:
-    """Frames at attitudes all over the sky, at rest; the camera's file is written into the folder."""
+    """Frames at rest at attitudes over the whole sky; the camera's file is written into the folder."""
     path = folder / f"camera_{seed}.yaml"
     path.write_text(yaml.safe_dump({"camera": camera}), encoding="utf-8")
     overrides = {

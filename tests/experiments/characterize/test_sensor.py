@@ -1,4 +1,4 @@
-"""A sensor from darks and flats: each estimator against a law written anew here, all against simulated chips."""
+"""A sensor from darks and flats: each estimator against an independent law, all against simulated chips."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
 
 
 def test_uneven_illumination_is_not_counted_as_prnu() -> None:
-    """A slope of 20 % over the flat, of which the polynomial leaves nothing."""
+    """A slope of 20 % over the flat is fully removed by the polynomial."""
     y, x = np.mgrid[0:96, 0:128]
     image = 500 * (1 + 0.1 * (x - 64) / 64 - 0.06 * ((y - 48) / 48) ** 2)
     trend = fixed_pattern.smooth(image, np.ones(image.shape, bool))

@@ -1,4 +1,4 @@
-"""Labels of a frame against the sky's own laws, and masks against frames without what they mask."""
+"""Labels of a frame against independent laws, and masks against frames without the masked effect."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def test_bright_sources_are_detected_where_their_light_is() -> None:
     assert checked >= 6
 
 
-def test_a_still_star_has_a_square_about_it() -> None:
-    """Also where rounding gives it a streak of 1e-14 pixels."""
+def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
+    """This holds even if rounding gives a streak of 1e-14 pixels."""
     rows = np.zeros(3, dataset_labels.SOURCE)
     rows["flux_x_px"] = 10
     rows["flux_y_px"] = 20
@@ -138,7 +138,7 @@ MOON: dict[str, object] = {
 def test_the_outline_of_the_moon_is_about_its_saturated_disc(
     shutter: dict[str, object], slack_px: float
 ) -> None:
-    """Half of it is lit. The lit limb is close to the outline, and no light of it is beyond."""
+    """Half of it is lit; the lit limb is close to the outline, with no light beyond."""
     setup = setup_with(
         MOON | shutter, {"near": {"body": "moon", "off_deg": [0, 0.3]}, "rate_deg_s": 10}
     )

@@ -1,4 +1,4 @@
-"""Draws of a dataset's factors, and what is refused."""
+"""Draws of a dataset's factors, and refusals."""
 
 from __future__ import annotations
 

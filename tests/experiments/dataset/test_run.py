@@ -1,4 +1,4 @@
-"""The files of a dataset: what they hold, and that they are the same on any engine, also after a kill."""
+"""The files of a dataset: contents, and equality on any engine and after a kill."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def vary(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(vary: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of five frames that one process made undisturbed."""
+    """A dataset of five frames made by one uninterrupted process."""
     folder = tmp_path_factory.mktemp("whole") / "frames"
     progress = dataset_run.run(small(vary), str(folder), engines.Serial())
     assert (progress.done, progress.failed) == (5, 0)
@@ -390,7 +390,7 @@ def test_an_unknown_url_is_refused(url: str) -> None:
         dataset_shards.Storage(url)
 
 
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"pip install 'skysim\[dataset\]'"):
         dataset_shards.Storage("out/frames")

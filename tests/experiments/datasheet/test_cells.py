@@ -1,4 +1,4 @@
-"""The cells of a datasheet: what each draws anew, and scenes that have none."""
+"""The cells of a datasheet: what each redraws, and scenes without cells."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_cell_is_different(scene):
 
 
 def test_the_total_cells_use_the_units_of_the_terms_in_turn():
-    """As often each, so that terms and total can agree with few units; the probabilities' frames are of others."""
+    """Each unit is used equally often, so that terms and total agree with few units; probabilities use other frames."""
     designer = Designer(load("afit_simsat", {}), FULL)
     cells = list(designer.cells())
     assert designer.seeds == [
@@ -84,7 +84,7 @@ def test_units_are_equal_without_a_pattern():
     assert Designer(load("shefex2", plain), QUICK).units == 1
 
 
-def test_thermal_states_are_those_of_the_scene():
+def test_thermal_states_match_the_scene():
     """A period of the sine of 3 K about 21 C in four steps; none without a section."""
     scene = load("thermal_drift", {})
     assert states_c(scene, 4) == pytest.approx([21, 24, 21, 18])

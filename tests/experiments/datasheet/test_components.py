@@ -1,4 +1,4 @@
-"""Variance components: terms of known size come back, and their sum is the total."""
+"""Variance components: terms of known size are recovered, and their sum is the total."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_injected_terms_are_recovered_to_five_percent():
 
 @pytest.mark.parametrize("name", ["bias", *Components._fields[2:]])
 def test_a_single_injected_term_is_recovered_alone(name):
-    """One large experiment for each: to 5 %, and nothing of it in the others."""
+    """One large experiment per term: recovered to 5 %, with no leakage into the others."""
     rng = np.random.default_rng(2)
     shape = (2000, 2, 1, 4, 2)
     drawn = {"bias": {}, "field": {"f": 2.0}, "pixel": {"fusp": 2.0}, "temporal": {"fuspt": 2.0}}

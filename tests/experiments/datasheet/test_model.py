@@ -1,4 +1,4 @@
-"""The error model: its processes follow their law, draws and steps agree, the module stands alone, the unit runs."""
+"""The error model: laws of its processes, agreement of draws and steps, independence of skysim, and the FMU."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def model() -> ErrorModel:
 
 
 def test_a_process_follows_its_recursion():
-    """Beside the loop over the times, with steps that change: the same numbers from the same draws."""
+    """Against a loop over times with changing steps: the same numbers from the same draws."""
     steps = np.random.default_rng(1).uniform(0, 0.5, 300)
     found = correlated(steps, np.array([0.7, -1.2]), np.random.default_rng(2))
     normal = np.random.default_rng(2).standard_normal((300, 2))
@@ -143,7 +143,7 @@ def test_more_than_a_hundred_thousand_errors_a_second(model):
 
 
 def test_the_error_model_runs_without_skysim(tmp_path: Path) -> None:
-    """Copied away it needs NumPy and its constants, and nothing of skysim."""
+    """A copy of the module needs only NumPy and its constants."""
     model_fit.write_model(tmp_path, CONSTANTS)
     code = (
         "import sys, numpy; from tracker_error import ErrorModel; m = ErrorModel.read('tracker_error.json');"
@@ -188,7 +188,7 @@ def test_the_fmu_gives_the_same_errors_in_another_tool(tmp_path: Path, model: Er
     assert found == pytest.approx(np.array(expected), rel=1e-6)
 
 
-def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
+def test_the_scatter_of_fields_is_computed_from_two_estimates_of_each():
     """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate."""
     rng = np.random.default_rng(9)
     variance = np.exp(0.7 * rng.standard_normal(60_000))
@@ -231,7 +231,7 @@ def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
 
 
 def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:
-    """The state after a turn."""
+    """The state after a rotation."""
     new = []
     for name in ("field", "pixel", "scale"):
         left = np.exp(-step_deg / model.constants[f"{name}_deg"])

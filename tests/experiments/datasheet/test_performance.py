@@ -1,4 +1,4 @@
-"""Probabilities with exact bounds, runs that a claim needs, and limits."""
+"""Probabilities with exact bounds, the number of runs for a claim, and limits."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_noise_is_separated_from_errors_that_two_frames_share():
     assert math.isnan(noise_equivalent_angle(first[:3], second[:3]))
 
 
-def test_a_limit_lies_between_what_is_shown_above_and_below():
+def test_a_limit_is_between_the_nearest_levels_shown_above_and_below():
     rows = [
         {"rate": n, "counts": Counts(200, right, 200 - right, 0)}
         for n, right in enumerate([200, 199, 190, 150, 3])

@@ -1,4 +1,4 @@
-"""A whole datasheet from rendered frames: it goes on where it was stopped, and finds what was put in."""
+"""A whole datasheet from rendered frames: it resumes after a stop and recovers injected errors."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def stop_after(batches: int) -> Callable[[int], Any]:
 
 
 def untimed(statement: Statement) -> str:
-    """All numbers but the times of this machine."""
+    """All numbers except the times of this machine."""
     return json.dumps(numbers(statement._replace(times_s=[])))
 
 

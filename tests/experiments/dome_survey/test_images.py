@@ -1,4 +1,4 @@
-"""A survey from images on disk: of a dome that differs from its list, with faults; and what is refused."""
+"""A survey from images on disk of a dome that differs from its list, with faults; and refusals."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ tracker: {{min_area_px: 9{lever}}}
 
 
 def command(*words: object) -> tuple[int, str, str]:
-    """Exit code, what was printed, and what was complained of."""
+    """Exit code, standard output and error output."""
     out = std_io.StringIO()
     err = std_io.StringIO()
     argv = sys.argv
@@ -78,7 +78,7 @@ def write_leds(path: Path, ids: list[int], place_m: Floats, level: Floats) -> No
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`design.yaml` as the lab believes the dome, and `built.yaml` as it is."""
+    """`design.yaml` with the assumed dome, and `built.yaml` with the true one."""
     made = tmp_path_factory.mktemp("dome")
     text = (
         "schema: 1\nbase: afit_simsat_ideal\ntitle: places\nlight:\n"
@@ -150,7 +150,7 @@ def result(folder: Path, frames: Path) -> dict[str, Any]:
 def test_a_folder_of_images_alone_gives_the_dome_as_built(
     result: dict[str, Any], folder: Path, built: Lab
 ) -> None:
-    """Only here is the truth known: places, focal length and lever within their errors, and better than the list."""
+    """Against the truth: places, focal length and lever are within their errors and better than the list."""
     found = Table.read(folder / "by_imu" / "leds.ecsv", format="ascii.ecsv")
     assert len(found) > 0.7 * len(built.camera.sources)
     row = np.searchsorted(built.camera.sources.id, found["id"])
@@ -250,7 +250,7 @@ def test_a_watch_ends_with_the_survey_of_the_images_at_hand(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A thread drops the images in; Ctrl-C comes when all are read. The survey is that of the folder at rest."""
+    """A thread adds images; Ctrl-C follows when all are read. The survey equals that of the complete folder."""
     arriving = tmp_path / "arriving"
     arriving.mkdir()
 

@@ -1,4 +1,4 @@
-"""Surveys that fail: one of several that are repeated, and one that contradicts what was assumed."""
+"""Failing surveys: one of several repeated ones, and one that contradicts its assumptions."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
     share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
 
     def moved(frames_sigma: float, before_sigma: float) -> tuple[float, float]:
-        """By how much the mean moves for frames that are off by `share`, and its standard deviation."""
+        """Shift of the mean for frames with an error of `share`, and its standard deviation."""
         both = math.hypot(frames_sigma, before_sigma)
         return share * both * (before_sigma / both) ** 2, frames_sigma * before_sigma / both
 

@@ -1,4 +1,4 @@
-"""A dome measured from its own rendered frames: against the truth, by chi-square, and by trying every name."""
+"""A dome surveyed from its own rendered frames, against the truth, by chi-square, and by trying every name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ UNCERTAINTY = survey_prior.survey_uncertainty("0.5 deg", "2 mm", "5 mm", "1%")
 
 
 def command(*words: object) -> tuple[int, str, str]:
-    """Exit code, what was printed, and what was complained of."""
+    """Exit code, standard output and error output."""
     out = std_io.StringIO()
     err = std_io.StringIO()
     argv = sys.argv
@@ -99,7 +99,7 @@ def statistics(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def lab(folder: Path) -> Lab:
-    """The small dome as it is believed before the survey."""
+    """The small dome as assumed before the survey."""
     return build_lab(
         survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY)
     )
@@ -225,7 +225,7 @@ def test_stops_tilt_uniformly_over_the_cap_with_any_yaw(lab: Lab) -> None:
         assert np.mean(uniform**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / 2000))
 
 
-def test_the_imu_errs_by_its_sigma_about_each_axis(lab: Lab) -> None:
+def test_the_imu_error_about_each_axis_has_its_sigma(lab: Lab) -> None:
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 500, 25.0)
     off = (survey_frames.imu_attitudes(lab.scene, stops, 0.01) * stops).as_rotvec() / 0.01
     for axis in off.T:
@@ -441,7 +441,7 @@ def test_a_map_with_a_wrong_led_is_refused_in_one_line(
 
 
 def refusal(folder: Path, tmp_path: Path, text: str) -> str:
-    """What the tracker of the small scene says of a map of that text."""
+    """Error text of the small scene's tracker for a map with this text."""
     path = tmp_path / "leds.ecsv"
     path.write_text(text)
     lab = build_lab(loader.load(folder / "small.yaml", {"tracker.map": str(path)}))

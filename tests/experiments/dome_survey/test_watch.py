@@ -1,4 +1,4 @@
-"""A folder that is followed while images arrive: every image once, bad ones in a line each."""
+"""A folder that is watched while images arrive: every image is read once, each bad one is one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""AFIT's LED tests: angles, magnitudes and thresholds against geometry, arithmetic and the pulses' own sum."""
+"""AFIT's LED tests: angles, magnitudes and thresholds against geometry, arithmetic and the sum of pulses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""AFIT's Test 3 done again: the figures against the thesis's own calibration, and against theory by hand."""
+"""AFIT's Test 3 reproduced: figures against the thesis's calibration and hand calculations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lab() -> Lab:
 
 @pytest.fixture(scope="module")
 def sightings(lab: Lab) -> list[Sighting]:
-    """Two images at each position, the IMU a little wrong at the last."""
+    """Two images at each position, with a small IMU error at the last."""
     seen = test3.photograph_positions(lab, 2, np.random.default_rng(70))
     return test3.ImageSeries(lab, seen).sightings
 

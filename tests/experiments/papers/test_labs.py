@@ -1,4 +1,4 @@
-"""The other labs' experiments: APL's angles, NPS's distances and the OLED dome's law against geometry and theory."""
+"""Experiments of other labs: APL's angles, NPS's distances and the OLED dome's law against geometry and theory."""
 
 from __future__ import annotations
 

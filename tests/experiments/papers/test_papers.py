@@ -1,4 +1,4 @@
-"""`skysim reproduce`: the verdict's law, the published data, the command, the pages; and every experiment, quickly."""
+"""`skysim reproduce`: verdicts, published data, the command, the pages, and shortened runs of every experiment."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_every_published_row_has_one_answer() -> None:
 def covered(
     interval: Callable[[np.ndarray], Summary], target: Callable[[np.random.Generator], float]
 ) -> float:
-    """How often the interval of four normal draws, of mean 3 and deviation 2, holds what it is of."""
+    """Coverage of the interval of four normal draws of mean 3 and standard deviation 2."""
     hits = 0
     for n in range(TRIED):
         rng = np.random.default_rng([7, n])

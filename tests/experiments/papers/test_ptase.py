@@ -1,4 +1,4 @@
-"""PTASE's experiments: the paper's error measures, its Earth and its roll, against theory and SOFA's arithmetic."""
+"""PTASE's experiments: error measures, Earth rotation and roll against theory and SOFA."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_the_paper_s_angles_match_its_matrix() -> None:
 
 
 def test_a_catalog_s_json_describes_it() -> None:
-    """It raised: its path is none of JSON's kinds."""
+    """The path of the catalog is not JSON-serializable and once raised an error."""
     done = CliRunner().invoke(app, ["catalog", "info", "--json"])
     assert done.exit_code == 0
     assert '"stars"' in done.stdout

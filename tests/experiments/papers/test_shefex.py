@@ -1,4 +1,4 @@
-"""SHEFEX-2's experiments: their tools against geometry, counting and theory."""
+"""Tools of SHEFEX-2's experiments against geometry, counting and theory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
 
 
 def test_the_bootstrap_of_means_matches_theory_and_skips_missing_values() -> None:
-    """A mean's 95 % interval is 1.96 sigma / sqrt(N) to either side; a NaN is as if it had not been."""
+    """A mean's 95 % interval is +-1.96 sigma / sqrt(N); NaN values are skipped."""
     values = np.random.default_rng(1).normal(3.0, 2.0, 4000)
     found = bootstrap_of_means(values[:, None], lambda m: m[..., 0])
     half = 1.96 * values.std() / np.sqrt(len(values))
@@ -104,7 +104,7 @@ def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
     assert shefex_nights.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
 
 
-def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
+def test_the_chip_s_fields_follow_from_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
     field_deg = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     np.testing.assert_allclose(field_deg, np.degrees(2 * np.arctan(half)), rtol=1e-9)
@@ -132,7 +132,7 @@ def test_both_scans_have_the_same_objects() -> None:
 
 
 def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
-    """Every pixel holds the offset: no star, and nothing too bright."""
+    """Every pixel equals the offset: no star, and nothing too bright."""
     controller = ExposureController(load("shefex2", {"tracker.exposure_control": "{mean_dn: 9}"}))
     controller.update(Frame(0, np.full((493, 659), 4, np.uint16), 0.0, 0.04, 255.0))
     assert controller.exposure_s == pytest.approx(0.042, abs=1e-12)
@@ -160,6 +160,6 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
 
 
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
-    """What the shutter lets in for 50 ms there, it lets in for 35 here."""
+    """The light of 35 ms without air equals that of 50 ms under the air."""
     on_ground = shefex_nights.star_image(shefex_nights.ground_lab(), 0.05).sum()
     assert on_ground == pytest.approx(shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)

@@ -1,4 +1,4 @@
-"""The answers of a study in words, and what its report begins with."""
+"""The answers of a study in words, and the start of its report."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_ambiguity_is_located_and_the_rest_has_a_confidence() -> None:
 
 
 def test_refusals_are_named_where_they_are_most_frequent() -> None:
-    """None is ambiguous, and yet 4 of 200 attitudes are not solved at 500 LEDs."""
+    """No attitude is ambiguous, but 4 of 200 are not solved at 500 LEDs."""
     lines = [line(0, 500, 200, refused=4), line(1, 900, 400)]
     interval = metrics.proportion(4, 200)
     texts = answer.headline(study(), lines, True, "skysim study worst leds.yaml")
@@ -359,7 +359,7 @@ def test_findings_of_many_levels_are_summarized(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: Path) -> None:
-    """A level of another factor is checked at the first number of LEDs, which its name did not say."""
+    """Levels of other factors are checked at the first number of LEDs, which the finding names."""
     factors = {
         "leds": {"key": "light.layout.count", "values": [60, 900]},
         "disk": {"levels": {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}},

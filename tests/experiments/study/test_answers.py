@@ -1,4 +1,4 @@
-"""What many trials come to: responses against theory, Sobol indices against a function whose own are known, exports."""
+"""Results of many trials: responses against theory, Sobol indices against known ones, exports."""
 
 import csv
 import math
@@ -32,7 +32,7 @@ responses: [identified, cross_arcsec_p95]
 
 
 def columns(**given):
-    """Columns of trials, what is not given NaN."""
+    """Columns of trials; columns that are not given are NaN."""
     count = len(next(iter(given.values())))
     empty = {name: np.full(count, np.nan) for name in (*FIELDS, "time_ms")}
     return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
@@ -169,7 +169,7 @@ def test_a_budget_without_trials_is_nan_and_no_error(tmp_path):
 
 
 def done(folder, text):
-    """A study's plan, and its finished store to be opened."""
+    """A study's plan and its finished store."""
     path = folder / "question.yaml"
     path.write_text(text)
     study_plan = study_file.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
@@ -180,7 +180,7 @@ def done(folder, text):
 
 
 def loaded_with_a_fault(path):
-    """A plan with a level that makes no scene, which `load` would refuse before the first trial."""
+    """A plan with a level of an invalid scene, which `load` would refuse before the first trial."""
     good = path.with_name("good.yaml")
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
     study_plan = study_file.load(good)

@@ -1,4 +1,4 @@
-"""Clusters as the page describes them: the job of SLURM and the pods of Kubernetes, run here without either."""
+"""The page's SLURM job and Kubernetes pods, run here without either."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SMALL = ("replicates: 150", "replicates: 20")
 
 
 def block(begin: str) -> str:
-    """The code block of the page that begins so."""
+    """The page's code block that starts with this text."""
     (found,) = re.findall(rf"```\w+\n({re.escape(begin)}.*?)```", PAGE, re.S)
     return str(found)
 
@@ -48,7 +48,7 @@ def serial_contents(plan_: plan.Plan, tmp_path_factory: pytest.TempPathFactory) 
 
 @contextmanager
 def processes(*commands: list[str], **options: Any) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Commands that run meanwhile, in an environment without this one's numbers of threads."""
+    """Commands that run in the background, without this environment's thread limits."""
     environment = {
         key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD
     }
@@ -159,7 +159,7 @@ def test_the_commands_of_the_pods_run_a_study(
 def test_a_hanging_worker_is_abandoned(
     plan_: plan.Plan, serial_contents: str, tmp_path: Path
 ) -> None:
-    """Stopped by a signal it answers no more; its trials are repeated by the other one, and none is stored twice."""
+    """A worker stopped by a signal does not answer; another repeats its trials, and none is stored twice."""
     patience = {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "3s"}
     for cluster in cluster_of(tmp_path, "--no-nanny", count=2, environment=patience):
         engine = on_dask(cluster, 2)
@@ -181,14 +181,14 @@ class Replies:
         self.replies = replies
 
     def wait_for_workers(self, *_: Any) -> None:
-        """They are there."""
+        """Return at once: the workers are present."""
 
     def run(self, *_: Any, **__: Any) -> dict[str, Any]:
         return self.replies
 
 
 def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
-    """But one of another version does, and none that replies."""
+    """A worker of another version ends the run, as does a run without replying workers."""
     pytest.importorskip("distributed")
     from distributed.comm import CommClosedError
 

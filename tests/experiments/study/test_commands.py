@@ -24,7 +24,7 @@ responses: [identified, cross_arcsec_p95]
 
 @pytest.fixture
 def typed(tmp_path, monkeypatch, capsys):
-    """Type a command in a fresh folder with a study in it: its exit code, what it printed, what it complained of."""
+    """Run a command in a new folder with a study; return exit code, standard output and error output."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "question.yaml").write_text(STUDY)
 

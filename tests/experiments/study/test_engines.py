@@ -107,7 +107,7 @@ def begin_trivial(spec):
 
 @pytest.fixture
 def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The module, where this process and its workers find it."""
+    """The stub module on the import path of this process and its workers."""
     (tmp_path / "study_stubs.py").write_text(STUBS)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "study_stubs", raising=False)
@@ -115,7 +115,7 @@ def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def deaths(plan_: plan.Plan) -> list[int]:
-    """The trials that `deadly` dies of."""
+    """The trials that kill a process running `deadly`."""
     bad = [n for n in range(plan_.trials) if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5]
     assert 1 <= len(bad) <= 3
     return bad
@@ -139,7 +139,7 @@ def test_a_trial_that_kills_its_worker_fails_and_no_other(
 
 
 class FakePool:
-    """Stands in for a pool of processes: nothing is done until the engine waits, and a death loses all in flight.
+    """Substitute for a pool of processes: work is done when the engine waits; a death loses all chunks in flight.
 
     deaths  : how many more times trial 2 kills its worker
     retries : number of chunks in flight, itself among them, when a trial was submitted again
@@ -162,7 +162,7 @@ class FakePool:
         return future
 
     def wait(self, *_: Any, **__: Any) -> Any:
-        """One chunk is done, or a worker dies of trial 2."""
+        """Finish one chunk, or let a worker die of trial 2."""
         if self.deaths and any(2 in chunk for chunk in self.pending.values()):
             self.deaths -= 1
             for future in self.pending:
@@ -202,7 +202,7 @@ def test_trials_lost_with_a_worker_are_retried_one_by_one(
 
 
 class Run:
-    """A pool's run in a process of its own, with a process group of its own as a shell would make it."""
+    """A pool's run in a separate process and process group, as started by a shell."""
 
     def __init__(self, plan_: plan.Plan, path: Path, workers: int) -> None:
         command = [sys.executable, "-c", DRIVER, str(plan_.path), str(path), str(workers)]
@@ -217,7 +217,7 @@ class Run:
         self.family: list[psutil.Process] = []
 
     def reach(self, count: int) -> bool:
-        """Wait until so many trials are in the store; whether it came so far."""
+        """Wait until this number of trials is in the store; return whether it was reached."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self.family = psutil.Process(self.process.pid).children(recursive=True) or self.family
@@ -226,7 +226,7 @@ class Run:
         return False
 
     def end(self, by: signal.Signals) -> int:
-        """Signal it, to the group where the signal is the keyboard's; its status, once it and its family are gone."""
+        """Send a signal (to the group for SIGINT); return the status once the process and its children have ended."""
         os.killpg(self.process.pid, by) if by == signal.SIGINT else self.process.send_signal(by)
         status = self.process.wait(20)
         assert self.family, "it had no workers"
@@ -367,7 +367,7 @@ def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
 
 
 def change_code(version: str) -> None:
-    """Make a worker think that it has other code."""
+    """Make a worker report another code version."""
     setups.code_version = lambda: version  # type: ignore[assignment]
 
 
@@ -415,7 +415,7 @@ def test_an_address_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.long
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(
         sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False

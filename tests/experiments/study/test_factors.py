@@ -1,4 +1,4 @@
-"""What a study varies: levels, ranges, distributions, and the designs that combine them."""
+"""Factors of a study: levels, ranges, distributions, and designs that combine them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Hardware that every replicate draws anew: LED places and surveys, pooled over the replicates."""
+"""Hardware redrawn for every replicate: LED places and surveys, pooled over the replicates."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ def test_an_impossible_map_is_refused(
 
 
 def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
-    """One of 20 values exceeds the 95 % quantile: of fewer it would be the largest. A median takes 5."""
+    """A 95 % quantile needs 20 values, as it would be the largest of fewer. A median needs 5."""
     few = maps.direction_map("", columns(40), "roll_arcsec_p95")
     assert max(cell.values for cell in few.cells) < 20
     assert not any(cell.shown for cell in few.cells)

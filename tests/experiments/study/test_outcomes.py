@@ -1,4 +1,4 @@
-"""A row names its misidentified lights, its noise and its attitude: against the scene, and by planted mistakes."""
+"""Rows have misidentified lights, noise and attitude: against the scene and injected errors."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def test_frames_of_a_closed_loop_have_the_streaks_of_their_lights_in_the_true_mo
 
 
 def median_path_px(flight: Flight, index: int) -> float:
-    """Median way of the images of a frame's lights in its exposure."""
+    """Median path length, px, of a frame's lights during its exposure."""
     camera = flight.lab.camera
     seen = np.isin(camera.sources.id, flight.render(index)[1].sources.id)
     window = exposure_window(camera.scene, index)

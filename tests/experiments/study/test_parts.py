@@ -1,4 +1,4 @@
-"""Rows beyond a million: in Parquet parts and SQLite together they are the same table, whenever a run is killed."""
+"""Rows beyond a million: Parquet parts and SQLite together are one table, also after a kill at any time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
-    """A row with a number, or none, in every column, and directions all over the sky."""
+    """A row with a number or no value in every column, and directions over the whole sky."""
     point, replicate = divmod(trial, each)
     rng = np.random.default_rng([point, replicate])
     if failed:
@@ -251,7 +251,7 @@ def test_tables_and_worst_trials_do_not_depend_on_parts(both: tuple[Path, Path])
 
 
 class Killer:
-    """Ends this process by SIGKILL in the step of a move that is named."""
+    """Kill this process by SIGKILL in the named step of a move."""
 
     def __init__(self, step: str) -> None:
         self.step = step
@@ -296,7 +296,7 @@ def die_in_step(path: Path, step: str) -> None:
 
 
 def forked(does: Callable[[], object]) -> int:
-    """The status of a process of its own that does something."""
+    """Exit status of a forked process that calls a function."""
     pid = os.fork()
     if pid == 0:
         try:
@@ -404,7 +404,7 @@ def test_files_that_are_not_listed_are_removed(tmp_path: Path) -> None:
 
 
 def test_a_study_with_parts_grows(tmp_path: Path) -> None:
-    """Trials get new numbers, those in parts too."""
+    """Trials get new numbers, including those in parts."""
     rows = [row(point * 50 + n, each=50) for point in range(POINTS) for n in range(50)]
     with begun(tmp_path / "whole.sqlite", 50) as kept:
         add_all(kept, rows)
@@ -440,7 +440,7 @@ def test_failed_trials_stay_in_the_store(tmp_path: Path) -> None:
 
 
 def test_a_reader_sees_one_consistent_state(tmp_path: Path) -> None:
-    """Rows that move while it reads are seen once: neither twice nor not at all."""
+    """Rows that are moved during a read are seen exactly once."""
     path = filled(tmp_path / "s.sqlite", ALL[:50])
     with store.writing(path) as kept, store.open_store(path) as reader:
 
@@ -550,7 +550,7 @@ def test_a_part_with_invalid_values_is_refused_in_one_line(
 
 
 def test_an_earlier_skysim_refuses_a_store_with_parts(tmp_path: Path) -> None:
-    """It would not see their rows; a store without parts stays what it was, also without the table of the parts."""
+    """It would not see their rows; a store without parts is unchanged and has no table of parts."""
     with store.open_store(filled(tmp_path / "s.sqlite", ALL)) as kept:
         assert kept.meta("format") == "5"
     with store.writing(filled(tmp_path / "few.sqlite", ALL[:20])) as kept:

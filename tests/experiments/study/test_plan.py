@@ -1,4 +1,4 @@
-"""A study file: what it may say, what is refused before the first trial, and the studies that come with skysim."""
+"""Study files: allowed contents, refusals before the first trial, and the shipped studies."""
 
 import pytest
 
@@ -218,7 +218,7 @@ def test_led_codes_without_a_flight_are_refused(tmp_path):
         ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
     ],
 )
-def test_a_random_start_is_allowed_by_the_scene(scene, start, complaint, tmp_path):
+def test_a_random_start_must_be_possible_in_the_scene(scene, start, complaint, tmp_path):
     path = written(tmp_path, FLIGHT.format(scene=scene, start=start))
     if complaint is None:
         assert study_file.load(path).trials == 2

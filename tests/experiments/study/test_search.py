@@ -1,4 +1,4 @@
-"""The search of studies: what it finds where the answer is known, and that a kill changes nothing in its store."""
+"""The search of studies: known optima are found, and a kill does not change its store."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ class Law:
 
 
 def angle(arcsec: float, solved: bool = True) -> Outcome:
-    """A trial with that error about the boresight."""
+    """A trial with this error about the boresight."""
     return Outcome("solved", 1, 1, 0, 0.0, 0.0, arcsec) if solved else Outcome("none", 1)
 
 
 def bowl(settings: Settings) -> Outcome:
-    """Least, 1, at x = 0.7, y = 0.2."""
+    """An error whose minimum is 1 at x = 0.7, y = 0.2."""
     x = settings["trial.noise_px"]
     y = settings["trial.magnitude_sigma"]
     return angle(1 + (x - 0.7) ** 2 + (y - 0.2) ** 2)
@@ -95,7 +95,7 @@ def bowl(settings: Settings) -> Outcome:
 
 @pytest.fixture(autouse=True)
 def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A law has no scene, whose hash a run that goes on would compare."""
+    """Disable the check of the scene's hash on resume, as a law has no scene."""
     monkeypatch.setattr(runner, "check_scene", lambda *_: None)
 
 
@@ -174,7 +174,7 @@ def test_the_front_holds_the_nondominated_candidates(tmp_path: Path) -> None:
 
 
 def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
-    """The bowl's bottom answers too seldom: the best is on the border x = 0.5, at a height of 1.04."""
+    """The bowl's minimum is identified too rarely; the best candidate is on the border x = 0.5 at 1.04."""
 
     def law(settings: Settings) -> Outcome:
         return bowl(settings) if settings["trial.noise_px"] <= 0.5 else angle(0, solved=False)
@@ -193,8 +193,8 @@ def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
         assert one.feasible or one.why.startswith("identified")
 
 
-def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) -> None:
-    """Its trials fail after one was tried, and do not count as failures of the budget."""
+def test_a_refused_candidate_is_infeasible_and_the_search_continues(tmp_path: Path) -> None:
+    """Its trials fail after the first and do not count as failures of the budget."""
     asked = []
 
     def law(settings: Settings) -> Outcome:
@@ -219,7 +219,7 @@ def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) 
 
 
 def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
-    """Not even where all that is asked is its price, which it has."""
+    """This holds even if cost, which it has, is the only objective."""
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.noise_px"] < 0.5:
@@ -256,11 +256,11 @@ def test_a_search_ends_at_its_limit_of_time(tmp_path: Path) -> None:
 
 
 class Killed(Exception):
-    """In the middle."""
+    """A kill during a search."""
 
 
 def killer(after: int) -> Callable[[Any], None]:
-    """A watch that raises at its nth call."""
+    """A callback that raises at its nth call."""
     calls = itertools.count(1)
 
     def watch(progress: runner.Progress) -> None:
@@ -271,7 +271,7 @@ def killer(after: int) -> Callable[[Any], None]:
 
 
 def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
-    """Kill a search at every nth batch until it ends by itself; how often it was."""
+    """Kill a search at every nth batch until it ends normally; return the number of kills."""
     for kills in itertools.count():
         try:
             searched(study_plan, out, engine, killer(every))
@@ -284,7 +284,7 @@ def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine,
 @pytest.mark.long
 @pytest.mark.parametrize("every", [2, 9])
 def test_a_search_killed_and_resumed_leaves_the_same_store(tmp_path: Path, every: int) -> None:
-    """Two objectives, a constraint, levels and a refusal: all that the sampler hears of comes back from the store."""
+    """Two objectives, a constraint, levels and a refusal: the sampler's whole input is restored from the store."""
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.magnitude_sigma"] > 0.9:
@@ -431,7 +431,7 @@ def test_bad_prices_are_reported_as_errors_of_the_study(tmp_path: Path) -> None:
 def test_the_terminal_s_front_has_levels_error_and_cost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The two of three candidates that no other beats, as a table."""
+    """A table of the two nondominated candidates of three."""
     study = loaded(
         tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])
     ).study
@@ -513,7 +513,9 @@ def test_a_distribution_cannot_be_searched() -> None:
         search.check(plan.Study.model_validate(STUDY | {"factors": {"x": drawn}}))
 
 
-def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_optuna_one_line_names_the_extra_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"^[^\n]*pip install 'skysim\[optuna\]'$"):
         search.create_sampler(plan.Study.model_validate(STUDY))

@@ -1,4 +1,4 @@
-"""The store of a study and how work is dealt out: whatever stops a run, what it leaves is whole and goes on."""
+"""The store of a study and the distribution of work: a stopped run leaves a complete store that resumes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def other(study_plan: plan.Plan, **overrides: str) -> plan.Plan:
 
 
 def child(does: Callable[[], object]) -> int:
-    """A process of its own that does something; its exit status tells whether it raised, 2 of KeyboardInterrupt."""
+    """Fork a process that calls a function; its exit status is 0, 1 for an exception or 2 for KeyboardInterrupt."""
     pid = os.fork()
     if pid:
         return pid
@@ -63,7 +63,7 @@ def child(does: Callable[[], object]) -> int:
 
 
 def until(path: Path, count: int) -> None:
-    """Wait until a store holds so many trials."""
+    """Wait until a store holds this number of trials."""
     end = time.monotonic() + 20
     while time.monotonic() < end:
         if path.is_file():
@@ -164,7 +164,7 @@ def test_another_study_or_other_code_is_refused(
 
 
 @pytest.mark.slow
-def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(
+def test_a_study_with_more_replicates_keeps_existing_trials(
     study_plan: plan.Plan, tmp_path: Path
 ) -> None:
     more = other(study_plan, replicates="5")
@@ -252,7 +252,7 @@ def test_a_resumed_store_with_text_for_a_number_is_refused(tmp_path: Path) -> No
 
 
 def taken(folder: Path) -> Path:
-    """A store's path whose lock cannot be made."""
+    """Path of a store whose lock file cannot be created."""
     (folder / "taken.lock").mkdir()
     return folder / "taken.sqlite"
 

@@ -1,4 +1,4 @@
-"""The report of a study: what it says is the store's, what it shows is where it belongs."""
+"""The report of a study: its numbers are the store's, and each figure is in its section."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def points(asked: Study) -> list[Point]:
 
 
 def outcome(point: int, replicate: int) -> Outcome:
-    """Known by hand: at point p the first p of each ten replicates are refused, the others off by p + 1 arcsec."""
+    """A known outcome: at point p the first p of each ten replicates are refused, the others err by p + 1 arcsec."""
     if replicate % 10 < point % 10:
         return Outcome("refused", 1, stars=4)
     return Outcome("solved", 1, 1, 0, 0.6 * (point + 1), 0.8 * (point + 1), 5.0, 3.0, 9)
@@ -167,7 +167,7 @@ def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages without figures, which take the time."""
+    """Pages without figures, to save time."""
     monkeypatch.setattr(study_report, "study_figures", lambda *_: [])
 
 

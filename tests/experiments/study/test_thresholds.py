@@ -1,4 +1,4 @@
-"""Where a proportion crosses a limit: against curves that are known, and how often the interval holds the truth."""
+"""Where a proportion crosses a limit: against known curves, and coverage of the interval."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def test_a_limit_needs_as_many_trials_as_its_exact_bound(
 
 
 def test_no_number_of_trials_closes_an_interval_at_a_level_on_the_wrong_side() -> None:
-    """All levels are above: nothing is said to be needed at the last one, however many trials there are."""
+    """All levels are above, so no number of trials is requested at the last one."""
     assert counted([60] * 8, trials=60).needs == ((0, 72),)
     assert counted([400] * 8).needs == ()
     both = counted([78, 77, 77, 77, 77, 76, 75, 75], trials=80)

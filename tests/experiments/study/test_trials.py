@@ -1,4 +1,4 @@
-"""One trial: of its own seed alone, with the physics that the frames have."""
+"""A trial depends on its seed alone and has the physics of rendered frames."""
 
 import math
 from dataclasses import replace
@@ -258,7 +258,7 @@ def test_a_coded_trial_is_a_sequence_of_frames():
 
 @pytest.mark.slow
 def test_unreadable_codes_give_no_wrong_attitude():
-    """Half of all bits fail: no word can be read."""
+    """Half of all bits fail, so that no word can be read."""
     outcomes = coded({"light.led.code": {"kind": "gray", "dropout": 0.49, "depth": 0.1}}, 60)
     assert sum(one.solved for one in outcomes) < 30
     assert not any(one.wrong for one in outcomes)
@@ -369,7 +369,7 @@ FRAMES = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames", "rate_deg_s": 2.0},
         ({"body": [1, 2, -2]}, "body", [1 / 3, 2 / 3, -2 / 3]),
     ],
 )
-def test_a_frame_turns_about_the_axis_that_is_named(axis, frame, expected):
+def test_a_frame_rotates_about_the_named_axis(axis, frame, expected):
     """The truth's rate at mid-exposure, in that frame; the attitude and the noise are those of any other axis."""
     usual = setups.prepared_setup(FRAMES, {})
     ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": axis})
@@ -383,7 +383,7 @@ def test_a_frame_turns_about_the_axis_that_is_named(axis, frame, expected):
     assert abs(before.rate_cam_rad_s[2]) < 1e-12  # perpendicular to the boresight
 
 
-def test_a_turn_about_the_boresight_leaves_its_star_where_it_is():
+def test_a_rotation_about_the_boresight_keeps_its_star_in_place():
     """Streaks grow with the distance from the image's center: rate x exposure x distance."""
     ready = setups.prepared_setup(
         FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0}
@@ -403,7 +403,7 @@ def test_a_turn_about_the_boresight_leaves_its_star_where_it_is():
 
 @pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
 def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
-    """As evenly as the other trials' attitudes: drawn from the same stream."""
+    """Start attitudes are uniform, drawn from the same stream as those of other trials."""
     trial = {"kind": "flight", "start": "random"}
     ready = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {})
     kind = {"kind": "frames"}
@@ -419,7 +419,7 @@ def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
 
 
 @pytest.mark.slow
-def test_a_flight_from_a_random_start_is_flown_from_there():
+def test_a_flight_with_a_random_start_starts_there():
     changes = {"exposure.frames": 2, "exposure.first": "0.2 s"}
     trial = {"kind": "flight", "start": {"tilt_deg": [5, 12]}}
     spec = TrialSpec("afit_simsat", ".", 1, changes, trial, True)
@@ -441,7 +441,7 @@ def rendered(settings: dict[str, Any], seed: int = 5) -> Any:
 AT_REST = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames"}, True)
 
 
-def test_a_turn_is_about_the_rates_axis():
+def test_a_frame_rotates_about_the_axis_of_its_rate():
     """By this angle across the boresight, the same axis at every angle; other attitudes have another seed."""
     first, small, large = (rendered({"trial.turn_deg": turn}) for turn in (0.0, 0.5, 2.0))
     turns = [
